@@ -1,0 +1,24 @@
+"""The few exceptions mapctl raises on purpose; each message is one line: what was wrong, where, what is allowed."""
+
+from os import PathLike
+
+
+class MapctlError(Exception):
+    """Base of everything the command line reports with exit status 2."""
+
+
+class FileFormatError(MapctlError):
+    """A file that cannot be read for what it claims to be."""
+
+    def __init__(self, path: str | PathLike[str], message: str, line: int | None = None):
+        where = f"{path}, line {line}" if line is not None else f"{path}"
+        super().__init__(f"{where}: {message}")
+        self.path, self.line = path, line
+
+
+class RequestError(MapctlError):
+    """A wish, option or argument that cannot be."""
+
+
+class CheckpointError(MapctlError):
+    """Weights or a training run that do not fit this code."""

@@ -1,0 +1,141 @@
+"""Motion: a skeleton moving through time. Immutable; every operation returns a new one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cached_property
+from os import PathLike
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.errors import MapctlError, RequestError
+from mapctl.skeleton import Skeleton, mirrored_name
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Frames of one skeleton, float64, metres, Y up."""
+
+    skeleton: Skeleton
+    """Whose joints these are."""
+    fps: Fraction
+    """Frames per second, exact."""
+    root_position: Float[Tensor, "frames 3"]
+    """Joint 0 in the world, metres."""
+    local_quat_xyzw: Float[Tensor, "frames joints 4"]
+    """Each joint's rotation in its parent's frame."""
+    moving_offsets: Mapping[int, Float[Tensor, "frames 3"]] = field(default_factory=dict)
+    """Joints below the root whose offset is animated, as Hips under a static root; metres."""
+    source: object | None = None
+    """What a format needs to write the file back as it came (channel layout, unit); formats own its meaning."""
+
+    def __post_init__(self):
+        frames, joints = self.root_position.shape[0], self.skeleton.num_joints
+        if self.root_position.shape != (frames, 3) or self.local_quat_xyzw.shape != (frames, joints, 4):
+            shapes = f"{tuple(self.root_position.shape)} and {tuple(self.local_quat_xyzw.shape)}"
+            raise MapctlError(f"a motion of {joints} joints needs (frames, 3) and (frames, {joints}, 4), got {shapes}")
+        if frames == 0 or self.fps <= 0:
+            raise MapctlError("a motion needs at least one frame and a positive frame rate")
+
+    @property
+    def num_frames(self) -> int:
+        """How many frames there are."""
+        return self.root_position.shape[0]
+
+    @property
+    def num_joints(self) -> int:
+        """How many joints the skeleton has."""
+        return self.skeleton.num_joints
+
+    @property
+    def seconds(self) -> float:
+        """Duration: frames over frame rate."""
+        return float(self.num_frames / self.fps)
+
+    @cached_property
+    def _world(self) -> tuple[Tensor, Tensor]:
+        offsets = self.skeleton.offsets
+        if self.moving_offsets:
+            offsets = offsets.expand(self.num_frames, -1, -1).clone()
+            for joint, values in self.moving_offsets.items():
+                offsets[:, joint] = values
+        return kinematics.forward_kinematics(
+            offsets, self.skeleton.parents, self.root_position, self.local_quat_xyzw
+        )
+
+    def joint_positions(self) -> Float[Tensor, "frames joints 3"]:
+        """World positions in metres, joints in file order."""
+        return self._world[0]
+
+    def joint_rotations(self) -> Float[Tensor, "frames joints 4"]:
+        """World rotations (xyzw), joints in file order."""
+        return self._world[1]
+
+    def slice(self, start: int, stop: int) -> "Motion":
+        """Frames start to stop (half-open); RequestError if they are not all there."""
+        if not 0 <= start < stop <= self.num_frames:
+            raise RequestError(f"frames {start}:{stop} are not within 0:{self.num_frames}")
+        return self._with_frames(lambda values: values[start:stop])
+
+    def join(self, other: "Motion") -> "Motion":
+        """This motion followed by `other`, which must have the same skeleton and frame rate; nothing is moved."""
+        if not self.skeleton.matches(other.skeleton) or self.fps != other.fps:
+            raise MapctlError("only motions of one skeleton and frame rate can be joined")
+        moving = {j: torch.cat([v, other.moving_offsets[j]]) for j, v in self.moving_offsets.items()}
+        root = torch.cat([self.root_position, other.root_position])
+        return replace(self, root_position=root, moving_offsets=moving,
+                       local_quat_xyzw=torch.cat([self.local_quat_xyzw, other.local_quat_xyzw]))  # fmt: skip
+
+    def resample(self, fps: Fraction | float) -> "Motion":
+        """The motion at another frame rate: positions linear, rotations slerp; the first frame stays.
+
+        Going down, a short moving average would blur contacts, so frames are interpolated, not filtered.
+        """
+        fps = Fraction(fps).limit_denominator(100_000)
+        if fps <= 0:
+            raise RequestError(f"the frame rate must be positive, got {float(fps):g}")
+        if fps == self.fps:
+            return self
+        count = int((self.num_frames - 1) * fps / self.fps) + 1
+        at = torch.arange(count, dtype=torch.float64) * float(self.fps / fps)
+        low = at.floor().long().clamp(max=self.num_frames - 1)
+        high, weight = (low + 1).clamp(max=self.num_frames - 1), at - low
+
+        def linear(values: Tensor) -> Tensor:
+            return torch.lerp(values[low], values[high], weight.unsqueeze(-1))
+
+        quat = self.local_quat_xyzw
+        joint_weight = weight.unsqueeze(-1).expand(count, self.num_joints)
+        return replace(self, fps=fps, root_position=linear(self.root_position),
+                       local_quat_xyzw=rotations.slerp(quat[low], quat[high], joint_weight),
+                       moving_offsets={j: linear(v) for j, v in self.moving_offsets.items()})  # fmt: skip
+
+    def mirror(self) -> "Motion":
+        """Left and right exchanged through the plane x = 0; for skeletons named as the canonical one.
+
+        Bones are exchanged too. Raises MapctlError where a side's joint has no partner.
+        """
+        names = self.skeleton.names
+        swap = [self.skeleton.index(mirrored_name(name)) for name in names]
+        flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+        # A reflection through x = 0 keeps rotation about x and reverses rotation about y and z.
+        flip_quat = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+        ends = {mirrored_name(n): (-x, y, z) for n, (x, y, z) in self.skeleton.end_offsets.items()}
+        skeleton = Skeleton(names, self.skeleton.parents, self.skeleton.offsets[swap] * flip, ends)
+        moving = {swap[j]: v * flip for j, v in self.moving_offsets.items()}
+        return replace(self, skeleton=skeleton, root_position=self.root_position * flip, moving_offsets=moving,
+                       local_quat_xyzw=self.local_quat_xyzw[:, swap] * flip_quat, source=None)  # fmt: skip
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the motion in the format that the path's ending names."""
+        from mapctl import formats
+
+        formats.save(self, path)
+
+    def _with_frames(self, pick) -> "Motion":
+        moving = {j: pick(v) for j, v in self.moving_offsets.items()}
+        return replace(self, root_position=pick(self.root_position), moving_offsets=moving,
+                       local_quat_xyzw=pick(self.local_quat_xyzw))  # fmt: skip

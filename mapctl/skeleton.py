@@ -1,0 +1,89 @@
+"""Skeletons: joint names, the tree, and bone offsets; and the canonical one that priors speak."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import MapctlError
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A tree of joints. Joint 0 is the root and every parent precedes its children."""
+
+    names: tuple[str, ...]
+    """Joint names, unique."""
+    parents: tuple[int, ...]
+    """Index of each joint's parent; -1 for the root."""
+    offsets: Float[Tensor, "joints 3"]
+    """Each joint in its parent's frame, metres, float64."""
+    end_offsets: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """End Sites: joint name to the site's offset in that joint's frame, metres."""
+
+    def __post_init__(self):
+        if len(set(self.names)) != len(self.names):
+            raise MapctlError(f"joint names must be unique, got {', '.join(self.names)}")
+        if self.parents[0] != -1 or any(not 0 <= p < j for j, p in enumerate(self.parents) if j):
+            raise MapctlError("joint 0 must be the root and every parent must precede its children")
+        if tuple(self.offsets.shape) != (len(self.names), 3):
+            raise MapctlError(f"{len(self.names)} joints need offsets of shape ({len(self.names)}, 3)")
+
+    @property
+    def num_joints(self) -> int:
+        """How many joints there are."""
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """The joint's index; MapctlError names the known joints if there is none."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise MapctlError(f"no joint {name!r}; the skeleton has {', '.join(self.names)}") from None
+
+    def matches(self, other: "Skeleton", tolerance: float = 1e-6) -> bool:
+        """Same joints, tree and bone offsets (within `tolerance` metres)."""
+        same_tree = self.names == other.names and self.parents == other.parents
+        return same_tree and bool(torch.allclose(self.offsets, other.offsets, atol=tolerance, rtol=0))
+
+    def children(self, joint: int) -> list[int]:
+        """Indices of the joint's children."""
+        return [j for j, parent in enumerate(self.parents) if parent == joint]
+
+
+# Bones of the canonical skeleton: joint, parent, offset in centimetres in the T-pose, facing +Z, left toward +X.
+# The lengths are those of the Bandai Namco performer, so that the bundled prior needs no rescaling; the foot's
+# slope is the one that `python -m mapctl.rigs.derive` measured while the foot stands flat.
+_LEFT_ARM = (("Shoulder", "chest", (4.98, 12.99, -0.24)), ("UpperArm", "Shoulder", (5.35, 0, 0)),
+             ("LowerArm", "UpperArm", (24.33, 0, 0)), ("Hand", "LowerArm", (22.29, 0, 0)))  # fmt: skip
+_LEFT_LEG = (("UpperLeg", "hips", (6.47, -2.19, 0)), ("LowerLeg", "UpperLeg", (0, -39.08, 0)),
+             ("Foot", "LowerLeg", (0, -40.99, 0)), ("Toes", "Foot", (0, -6.4, 9.86)))  # fmt: skip
+_SPINE = (("hips", "", (0, 0, 0)), ("spine", "hips", (0, 15.74, 0)), ("chest", "spine", (0, 8.98, -0.41)),
+          ("neck", "chest", (0, 16.38, 0)), ("head", "neck", (0, 6.46, 0)))  # fmt: skip
+_ENDS = {"head": (0.0, 0.17, 0.0), "leftHand": (0.17, 0.0, 0.0), "rightHand": (-0.17, 0.0, 0.0),
+         "leftToes": (0.0, -0.01, 0.07), "rightToes": (0.0, -0.01, 0.07)}  # fmt: skip
+
+
+def _canonical() -> Skeleton:
+    bones = list(_SPINE)
+    for side, sign in (("left", 1), ("right", -1)):
+        for limb in (_LEFT_ARM, _LEFT_LEG):
+            for name, parent, (x, y, z) in limb:
+                bones.append((side + name, parent if parent in ("hips", "chest") else side + parent, (sign * x, y, z)))
+    names = tuple(name for name, _, _ in bones)
+    parents = tuple(names.index(parent) if parent else -1 for _, parent, _ in bones)
+    offsets = torch.tensor([offset for _, _, offset in bones], dtype=torch.float64) / 100
+    return Skeleton(names, parents, offsets, _ENDS)
+
+
+CANONICAL = _canonical()
+
+
+def mirrored_name(name: str) -> str:
+    """The joint of the other side: `leftHand` for `rightHand`; other names are their own mirror image."""
+    for side, other in (("left", "right"), ("right", "left")):
+        if name.startswith(side):
+            return other + name[len(side):]
+    return name
