@@ -1,0 +1,166 @@
+"""State features of the prior: what of a motion is left when place and heading are taken away.
+
+rnn paper, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change, the root
+height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation vectors
+about the canonical T-pose stand in for the paper's Euler angles, whose wraps real rigs sit near.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from hashlib import sha256
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import contacts, rotations
+from mapctl.errors import MapctlError
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
+
+
+@dataclass(frozen=True)
+class FeatureLayout:
+    """Named blocks of a feature vector, in order."""
+
+    blocks: tuple[tuple[str, int], ...]
+    """Name and width of each block."""
+
+    @cached_property
+    def slices(self) -> Mapping[str, slice]:
+        """Where each block lies."""
+        places, start = {}, 0
+        for name, width in self.blocks:
+            places[name] = slice(start, start + width)
+            start += width
+        return places
+
+    @property
+    def size(self) -> int:
+        """Width of the whole vector."""
+        return sum(width for _, width in self.blocks)
+
+    @property
+    def continuous(self) -> int:
+        """Width without the contact bits, which are the last block."""
+        return self.size - self.blocks[-1][1]
+
+    def fingerprint(self) -> str:
+        """Short hash of the blocks; a card holds it so that weights meet only the features they were trained on."""
+        return sha256(repr(self.blocks).encode()).hexdigest()[:12]
+
+    def pick(self, features: Float[Tensor, "*batch size"], block: str) -> Float[Tensor, "*batch width"]:
+        """The named block of a feature tensor."""
+        return features[..., self.slices[block]]
+
+
+LAYOUT = FeatureLayout((
+    ("root_displacement_heading", 2),  # x and z, metres per frame, in the previous frame's heading frame
+    ("heading_change", 1),  # radians per frame
+    ("root_height", 1),  # metres
+    ("root_tilt", 2),  # rotation vector (x, z) of what remains of the hips' rotation without its heading
+    ("joint_rotations", 3 * (CANONICAL.num_joints - 1)),  # rotation vectors in the parent's frame
+    ("contacts", 2),  # left and right toe planted, 0 or 1
+))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where the root stands on the ground and which way it faces."""
+
+    position_xz: Float[Tensor, "*batch 2"]
+    """Ground projection of the root, metres."""
+    heading: Float[Tensor, "*batch"]
+    """Radians about +Y; 0 faces +Z."""
+
+    def moved(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "Place":
+        """One step of Eq. 4: displaced in its own heading frame, then turned."""
+        step = rotations.rotate_ground(displacement_heading, self.heading)
+        return Place(self.position_xz + step, self.heading + turn)
+
+    @staticmethod
+    def origin(dtype: torch.dtype = torch.float32) -> "Place":
+        """At the origin, facing +Z."""
+        return Place(torch.zeros(2, dtype=dtype), torch.zeros((), dtype=dtype))
+
+
+def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], Place]:
+    """Features of a canonical motion (float64) and the place from which `decode` leads back to it.
+
+    The first frame has no past: it repeats the second frame's displacement, and the place returned lies that much
+    before it. Raises MapctlError for other skeletons or fewer than two frames.
+    """
+    if motion.skeleton.names != CANONICAL.names:
+        raise MapctlError("features are of canonical motion; use retarget.to_canonical first")
+    if motion.num_frames < 2:
+        raise MapctlError("features need at least two frames")
+    heading, tilt = rotations.split_heading(motion.local_quat_xyzw[:, 0])
+    ground = motion.root_position[:, [0, 2]]
+    turn = rotations.wrap_angle(torch.diff(heading))
+    step = rotations.rotate_ground(torch.diff(ground, dim=0), -heading[:-1])
+    step, turn = torch.cat([step[:1], step]), torch.cat([turn[:1], turn])
+    tilt_vector = rotations.to_rotation_vector(_upper_half(tilt))
+    joints = rotations.to_rotation_vector(_upper_half(motion.local_quat_xyzw[:, 1:])).flatten(1)
+    planted = contacts.planted_feet(motion).to(step.dtype)
+    height = motion.root_position[:, 1:2]
+    features = torch.cat([step, turn[:, None], height, tilt_vector[:, [0, 2]], joints, planted], dim=-1)
+    before = heading[0] - turn[0]
+    return features, Place(ground[0] - rotations.rotate_ground(step[0], before), before)
+
+
+def root_places(
+    features: Float[Tensor, "*batch frames size"], start: Place
+) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames"]]:
+    """Root ground positions (world, metres) and headings (radians, not wrapped) by Eq. 4. The one root integration."""
+    turns = LAYOUT.pick(features, "heading_change")[..., 0]
+    heading = start.heading.unsqueeze(-1) + torch.cumsum(turns, dim=-1)
+    steps = rotations.rotate_ground(LAYOUT.pick(features, "root_displacement_heading"), heading - turns)
+    return start.position_xz.unsqueeze(-2) + torch.cumsum(steps, dim=-2), heading
+
+
+def local_rotations(
+    features: Float[Tensor, "*batch frames size"], heading: Float[Tensor, "*batch frames"]
+) -> Float[Tensor, "*batch frames joints 4"]:
+    """Local rotations (xyzw) of all joints; the hips' is its heading times its tilt."""
+    tilt_xz = LAYOUT.pick(features, "root_tilt")
+    tilt = torch.stack([tilt_xz[..., 0], torch.zeros_like(heading), tilt_xz[..., 1]], dim=-1)
+    vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))
+    quats = rotations.from_rotation_vector(torch.cat([tilt.unsqueeze(-2), vectors], dim=-2))
+    hips = rotations.multiply(rotations.about_y(heading), quats[..., 0, :])
+    return torch.cat([hips.unsqueeze(-2), quats[..., 1:, :]], dim=-2)
+
+
+def decode(
+    features: Float[Tensor, "frames size"], start: Place, *, skeleton: Skeleton = CANONICAL, fps: int | Fraction = 30
+) -> Motion:
+    """The canonical motion that the features describe from `start`; inverse of `encode`."""
+    features = features.detach().double()
+    ground, heading = root_places(features, Place(start.position_xz.double(), start.heading.double()))
+    height = LAYOUT.pick(features, "root_height")
+    root = torch.cat([ground[:, :1], height, ground[:, 1:]], dim=-1)
+    quats = rotations.sign_continuous(local_rotations(features, heading))
+    return Motion(skeleton, Fraction(fps), root, quats)
+
+
+def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
+    """Features of the motion mirrored left to right."""
+    from mapctl.skeleton import mirrored_name
+
+    swap = [CANONICAL.index(mirrored_name(name)) - 1 for name in CANONICAL.names[1:]]
+    vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))[..., swap, :]
+    flip = features.new_tensor
+    return torch.cat([
+        LAYOUT.pick(features, "root_displacement_heading") * flip([-1.0, 1.0]),
+        -LAYOUT.pick(features, "heading_change"),
+        LAYOUT.pick(features, "root_height"),
+        LAYOUT.pick(features, "root_tilt") * flip([1.0, -1.0]),
+        (vectors * flip([1.0, -1.0, -1.0])).flatten(-2),
+        LAYOUT.pick(features, "contacts").flip(-1),
+    ], dim=-1)  # fmt: skip
+
+
+def _upper_half(quat_xyzw: Tensor) -> Tensor:
+    """The sign with w >= 0, so that the rotation vector is the short one."""
+    return torch.where(quat_xyzw[..., 3:] < 0, -quat_xyzw, quat_xyzw)
