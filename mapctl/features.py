@@ -103,7 +103,8 @@ def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], Place]:
     step, turn = torch.cat([step[:1], step]), torch.cat([turn[:1], turn])
     tilt_vector = rotations.to_rotation_vector(_upper_half(tilt))
     joints = rotations.to_rotation_vector(_upper_half(motion.local_quat_xyzw[:, 1:])).flatten(1)
-    planted = contacts.planted_feet(motion).to(step.dtype)
+    toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+    planted = torch.as_tensor(contacts.planted(motion.joint_positions()[:, toes], float(motion.fps))).to(step.dtype)
     height = motion.root_position[:, 1:2]
     features = torch.cat([step, turn[:, None], height, tilt_vector[:, [0, 2]], joints, planted], dim=-1)
     before = heading[0] - turn[0]

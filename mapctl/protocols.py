@@ -1,0 +1,66 @@
+"""What the core asks of learned models. A model has the roles it can fill; none is given a fake one."""
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+State = TypeVar("State")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The discrete choices along a rollout, fixed while its noise is optimised."""
+
+    component: Int[Tensor, "batch frames"]
+    """Mixture component of each frame."""
+    contacts: Bool[Tensor, "batch frames 2"]
+    """Left and right toe planted."""
+
+
+class Density(Protocol[State]):
+    """A density over next frames with explicit state: what was seen so far, batch first."""
+
+    def log_prob(self, features: Float[Tensor, "batch frames size"], state: State) -> Float[Tensor, "batch frames"]:
+        """Log density (nats, normalised units) of each frame given those before it."""
+        ...
+
+    def sample(
+        self, state: State, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+    ) -> tuple[Float[Tensor, "batch frames size"], State]:
+        """Frames drawn one after the other, and the state after them."""
+        ...
+
+    def advance(self, state: State, committed: Float[Tensor, "batch frames size"]) -> State:
+        """The state after the committed frames were seen."""
+        ...
+
+    def plan(self, state: State, noise: Float[Tensor, "batch frames continuous"]) -> Plan:
+        """The likeliest discrete choices along the rollout that the noise gives."""
+        ...
+
+    def rollout(
+        self, state: State, noise: Float[Tensor, "batch frames continuous"], plan: Plan
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """Features x = mu_k + sigma_k noise with the plan's components k, and their log density; differentiable."""
+        ...
+
+
+class Inbetweener(Protocol):
+    """Proposes the frames between known ones."""
+
+    def propose(
+        self, features: Float[Tensor, "batch frames size"], known: Bool[Tensor, "batch frames"], generator: torch.Generator
+    ) -> Float[Tensor, "batch frames size"]:
+        """The frames with unknown ones filled in; known ones may move."""
+        ...
+
+
+class Refiner(Protocol):
+    """Makes a synthesised motion look captured without changing what it does."""
+
+    def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
+        """The refined frames."""
+        ...
