@@ -1,0 +1,46 @@
+# make demo and make test alone bring a bare machine with Python 3.11+ to a result.
+VENV := .venv/bin
+READY := .venv/.ready
+
+.PHONY: help setup demo test test-all bench check clean
+
+help:
+	@echo "make setup     create .venv and install everything (CPU build of torch where there is no GPU)"
+	@echo "make demo      a character walks along curves: motion, film and report in demo-out/"
+	@echo "make test      the quick tests"
+	@echo "make test-all  every test"
+	@echo "make bench     cost of the solver on this machine"
+	@echo "make check     ruff and basedpyright"
+	@echo "make clean     remove what these commands made, .venv included"
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt .ci/setup
+	@.ci/setup
+	@touch $@
+
+demo: $(READY)
+	$(VENV)/mapctl demo -o demo-out
+
+# Two threads on small matrices fight each other: one is faster.
+test test-all bench: export OMP_NUM_THREADS = 1
+test test-all bench: export MKL_NUM_THREADS = 1
+test test-all bench: export OPENBLAS_NUM_THREADS = 1
+
+test: $(READY)
+	$(VENV)/python -m pytest -m "not slow"
+
+test-all: $(READY)
+	$(VENV)/python -m pytest
+
+bench: $(READY)
+	$(VENV)/mapctl bench
+
+check: $(READY)
+	$(VENV)/ruff check .
+	$(VENV)/ruff format --check .
+	$(VENV)/basedpyright
+
+clean:
+	rm -rf .venv build dist *.egg-info demo-out bench-out .pytest_cache .ruff_cache .hypothesis .benchmarks
+	find mapctl priors controllers scenes tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,151 @@
+"""The shape of the project: who imports whom, and what no file may hold."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+# `mapctl` is the core; the other three know it and never each other.
+MAY_IMPORT = {
+    "mapctl": {"mapctl"},
+    "priors": {"priors", "mapctl"},
+    "controllers": {"controllers", "mapctl"},
+    "scenes": {"scenes", "mapctl"},
+}
+CLI = Path("mapctl/cli.py")
+FOLDERS = (*MAY_IMPORT, "tests")
+FILES = sorted(file.relative_to(ROOT) for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
+PACKAGE_FILES = [file for file in FILES if file.parts[0] in MAY_IMPORT]
+UNPICKLERS = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal", "joblib"}
+LATE_IMPORTERS = {"import_module", "__import__", "find_spec"}
+MAX_LINES = 400
+
+
+def tree_of(file: Path) -> ast.Module:
+    return ast.parse((ROOT / file).read_text("utf-8"), str(file))
+
+
+def absolute(file: Path, node: ast.ImportFrom) -> str:
+    """The module a `from` import names, dots resolved."""
+    if not node.level:
+        return node.module or ""
+    package = file.with_suffix("").parts[: -node.level]
+    return ".".join([*package, *filter(None, [node.module])])
+
+
+def called_name(node: ast.Call) -> str:
+    return ast.unparse(node.func).rpartition(".")[2]
+
+
+def imports(file: Path, tree: ast.Module) -> set[str]:
+    """Every dotted name the file imports, at its top or late, by statement or by name."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            module = absolute(file, node)
+            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and called_name(node) in LATE_IMPORTERS:
+            found |= {
+                arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
+            }
+    return found
+
+
+def direction_faults(file: Path, tree: ast.Module) -> set[str]:
+    """The imports that point the wrong way."""
+    if file == CLI:
+        return set()
+    allowed = MAY_IMPORT[file.parts[0]]
+    others = {name for name in imports(file, tree) if name.partition(".")[0] in MAY_IMPORT.keys() - allowed}
+    return others | {name for name in imports(file, tree) if re.match(r"mapctl\.cli(\.|$)", name)}
+
+
+def content_faults(tree: ast.Module) -> list[str]:
+    """Bare excepts and everything that unpickles, with lines."""
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ExceptHandler) and node.type is None:
+            faults.append(f"line {node.lineno}: bare except")
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load":
+            faults.append(f"line {node.lineno}: torch.load unpickles")
+        elif (
+            isinstance(node, ast.keyword)
+            and node.arg == "allow_pickle"
+            and ast.unparse(node.value) != "False"
+        ):
+            faults.append(f"line {node.value.lineno}: allow_pickle")
+    return faults
+
+
+@pytest.mark.parametrize("file", PACKAGE_FILES, ids=str)
+def test_imports_point_one_way(file):
+    assert direction_faults(file, tree_of(file)) == set()
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_file_is_short_and_safe(file):
+    tree = tree_of(file)
+    assert len((ROOT / file).read_text("utf-8").splitlines()) <= MAX_LINES
+    assert content_faults(tree) == []
+    assert {name for name in imports(file, tree) if name.partition(".")[0] in UNPICKLERS} == set()
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("mapctl/solver/window.py", "import priors.lstm_gmm"),
+        ("mapctl/formats/bvh.py", "def late():\n    from controllers import follow"),
+        ("mapctl/motion.py", "from importlib import import_module\nimport_module('scenes.film')"),
+        ("priors/layers.py", "from controllers.follow import follow"),
+        ("scenes/live.py", "from mapctl import cli"),
+        ("controllers/follow.py", "import mapctl.cli as cli"),
+        ("mapctl/terms/path.py", "from ..cli import main"),
+        ("mapctl/terms/__init__.py", "from ...priors import load"),
+    ],
+)
+def test_wrong_imports_are_seen(file, source):
+    assert direction_faults(Path(file), ast.parse(source))
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("mapctl/cli.py", "import priors, controllers, scenes"),
+        ("mapctl/terms/path.py", "from ..curves import Curve\nfrom . import noise"),
+        ("scenes/film.py", "import scenes.body\nfrom mapctl.motion import Motion\nimport numpy"),
+    ],
+)
+def test_right_imports_pass(file, source):
+    assert direction_faults(Path(file), ast.parse(source)) == set()
+
+
+def test_unsafe_lines_are_seen():
+    source = "try:\n    torch.load(p)\nexcept:\n    np.load(p, allow_pickle=True)"
+    assert {fault.split(":")[0] for fault in content_faults(ast.parse(source))} == {
+        "line 2",
+        "line 3",
+        "line 4",
+    }
+
+
+def requirements() -> dict[str, list[str]]:
+    """Distribution names by extra; the base ones under ''."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    groups = {"": project["dependencies"], **project["optional-dependencies"]}
+    return {extra: [re.split(r"[^\w.-]", line)[0] for line in lines] for extra, lines in groups.items()}
+
+
+def test_what_setup_installs_is_pinned():
+    lines = (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    needed = {name for extra in ("", "render", "dev") for name in requirements()[extra]}
+    assert needed == pins.keys()
+
+
+def test_pyopengl_is_left_to_pyrender():
+    assert "pyopengl" not in {name.lower() for names in requirements().values() for name in names}
