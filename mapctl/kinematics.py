@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.skeleton import Skeleton
 
 
 def forward_kinematics(
@@ -43,3 +44,25 @@ def local_from_world(
 def heading(hips_world_quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
     """Facing angle about +Y in radians: 0 along +Z, +pi/2 along +X (canonical joint frames)."""
     return rotations.split_heading(hips_world_quat_xyzw)[0]
+
+
+def positions_from_matrices(
+    skeleton: Skeleton, local_matrix: Float[Tensor, "*batch joints 3 3"]
+) -> Float[Tensor, "*batch joints 3"]:
+    """Joint positions (metres) relative to the root at the origin, from local rotation matrices.
+
+    All joints of one depth are multiplied at once: a window of frames then takes a dozen tensor operations.
+    """
+    offsets = skeleton.offsets.to(local_matrix.dtype)
+    order, world, places = [0], local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, 0])
+    above_world, above_places, above = world, places, [0]
+    collected = [places]
+    while level := [j for j, parent in enumerate(skeleton.parents) if parent in above]:
+        rows = [above.index(skeleton.parents[j]) for j in level]
+        parent_world = above_world[..., rows, :, :]
+        above_places = above_places[..., rows, :] + (parent_world @ offsets[level].unsqueeze(-1)).squeeze(-1)
+        above_world = parent_world @ local_matrix[..., level, :, :]
+        collected.append(above_places)
+        order, above = order + level, level
+    inverse = torch.argsort(torch.tensor(order))
+    return torch.cat(collected, dim=-2)[..., inverse, :]

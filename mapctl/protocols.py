@@ -23,8 +23,10 @@ class Plan:
 class Density(Protocol[State]):
     """A density over next frames with explicit state: what was seen so far, batch first."""
 
-    def log_prob(self, features: Float[Tensor, "batch frames size"], state: State) -> Float[Tensor, "batch frames"]:
-        """Log density (nats, normalised units) of each frame given those before it."""
+    def log_prob(
+        self, features: Float[Tensor, "batch frames size"], state: State, *, inputs: Tensor | None = None
+    ) -> Float[Tensor, "batch frames"]:
+        """Log density (nats, normalised units) of each frame given those before it, or given noisy `inputs` of them."""
         ...
 
     def sample(

@@ -45,6 +45,11 @@ class LstmState:
     cell: Float[Tensor, "2 batch width"]
     """C of both layers."""
 
+    @property
+    def batch(self) -> int:
+        """How many independent states."""
+        return self.previous.shape[0]
+
     def repeat(self, count: int) -> "LstmState":
         """A batch of one, `count` times."""
         return LstmState(self.previous.expand(count, -1), self.hidden.expand(-1, count, -1).contiguous(),
@@ -93,7 +98,7 @@ class LstmGmm(nn.Module):
         self.fc3, self.out = nn.Linear(width, width), nn.Linear(width, outputs)
 
     def normalise(self, features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
-        """Physical to normalised units; contact bits become -1 and 1 halves by their mean and std in the card."""
+        """Physical to normalised units; contact bits become -1 and 1, since their mean and spread are set to a half."""
         return (features - self.mean) / self.std
 
     def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
@@ -120,9 +125,16 @@ class LstmGmm(nn.Module):
         log_sigma = low + (high - low) * torch.sigmoid(4 * log_sigma / (high - low) - 1.0)
         return Mixture(torch.log_softmax(weight, dim=-1), mean + carried.unsqueeze(-2), log_sigma, contact)
 
-    def log_prob(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> Float[Tensor, "batch frames"]:
-        """Log density (nats, normalised units) of each frame given those before it (Eq. 5-8)."""
-        before = torch.cat([state.previous.unsqueeze(1), features[:, :-1]], dim=1)
+    def log_prob(
+        self, features: Float[Tensor, "batch frames size"], state: LstmState, *,
+        inputs: Float[Tensor, "batch frames size"] | None = None,
+    ) -> Float[Tensor, "batch frames"]:  # fmt: skip
+        """Log density (nats, normalised units) of each frame given those before it (Eq. 5-8).
+
+        `inputs` is what the network sees of the frames where that differs from them: the noisy inputs of Eq. 15.
+        """
+        seen = features if inputs is None else inputs
+        before = torch.cat([state.previous.unsqueeze(1), seen[:, :-1]], dim=1)
         mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
         return mixture.log_prob(self._target(features))
 

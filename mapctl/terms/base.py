@@ -1,0 +1,25 @@
+"""What a term is: an energy for every frame of every candidate, and what it measures in physical units."""
+
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.trial import Trial
+
+
+class Term(Protocol):
+    """Sigmas in physical units are a term's only weights; energies are negative log likelihoods (nats)."""
+
+    name: str
+    """In the ledger."""
+    unit: str
+    """Of the residual."""
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Energies, nats."""
+        ...
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """How far the wish is missed, in the term's unit."""
+        ...

@@ -1,0 +1,139 @@
+"""A folder of motion files as training features: read once, cached, split by clip."""
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+from hashlib import sha256
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from mapctl import retarget
+from mapctl.errors import MapctlError, RequestError
+from mapctl.features import LAYOUT, encode
+from mapctl.formats import load
+from mapctl.formats.atomic import writing
+
+TRAINING_FPS = Fraction(30)
+LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
+"""Names of the clips that the bundled `locomotion` prior is trained on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corpus:
+    """Features of many clips, one after the other."""
+
+    names: tuple[str, ...]
+    """Clip names: the files' paths below the data folder."""
+    lengths: tuple[int, ...]
+    """Frames of each clip."""
+    features: Float[Tensor, "frames size"]
+    """All frames, float32, physical units."""
+
+    def clips(self) -> list[Float[Tensor, "frames size"]]:
+        """The features of each clip."""
+        return list(self.features.split(list(self.lengths)))
+
+    def subset(self, picked: Iterable[int]) -> "Corpus":
+        """The corpus of some clips."""
+        picked, clips = list(picked), self.clips()
+        return Corpus(tuple(self.names[i] for i in picked), tuple(self.lengths[i] for i in picked),
+                      torch.cat([clips[i] for i in picked]))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Disjoint parts of a corpus."""
+
+    train: Corpus
+    """90 % of the clips."""
+    validation: Corpus
+    """5 %, for choosing the checkpoint."""
+    test: Corpus
+    """5 %, for the measures of the card."""
+
+
+def split(corpus: Corpus, seed: int) -> Split:
+    """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part."""
+    count = len(corpus.names)
+    if count < 3:
+        raise RequestError(f"training needs at least 3 clips, got {count}")
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+    held = max(1, round(0.05 * count))
+    parts = order[2 * held :], order[:held], order[held : 2 * held]
+    return Split(*(corpus.subset(sorted(part)) for part in parts))
+
+
+def read(
+    data: Path, *, match: str, cache: Path, skip_first: bool = False, progress: Callable[[int, int], None] | None = None
+) -> Corpus:
+    """Every BVH below `data` whose path matches the pattern, as features at 30 fps; from the cache where it is fresh.
+
+    Clips that cannot be read or fit no known rig raise, naming the file. `skip_first` drops frame 0 (the T-pose of
+    CMU takes).
+    """
+    files = [f for f in sorted(data.rglob("*.bvh")) if re.search(match, f.relative_to(data).as_posix())]
+    if not files:
+        raise RequestError(f"no .bvh below {data} matches {match!r}")
+    key = _fingerprint(data, files, skip_first)
+    stored = cache / f"corpus-{key}.safetensors"
+    if stored.exists():
+        return _read_cache(stored)
+    clips, names = [], []
+    for number, file in enumerate(files):
+        clips.append(clip_features(file, skip_first=skip_first))
+        names.append(file.relative_to(data).as_posix())
+        if progress is not None:
+            progress(number + 1, len(files))
+    corpus = Corpus(tuple(names), tuple(len(c) for c in clips), torch.cat(clips).float())
+    cache.mkdir(parents=True, exist_ok=True)
+    _write_cache(corpus, stored)
+    return corpus
+
+
+def clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size"]:
+    """One file as features at 30 fps on the canonical joints."""
+    motion = load(file)
+    if skip_first and motion.num_frames > 2:
+        motion = motion.slice(1, motion.num_frames)
+    canonical, _ = retarget.to_canonical(motion)
+    try:
+        return encode(canonical.resample(TRAINING_FPS))[0].float()
+    except MapctlError as error:
+        raise MapctlError(f"{file}: {error}") from error
+
+
+def window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts"]:
+    """Index into the joined frames of every window that lies within one clip."""
+    starts, first = [], 0
+    for length in lengths:
+        starts.append(torch.arange(first, first + max(0, length - window + 1)))
+        first += length
+    starts = torch.cat(starts)
+    if len(starts) == 0:
+        raise RequestError(f"no clip is as long as the window of {window} frames")
+    return starts
+
+
+def _fingerprint(data: Path, files: list[Path], skip_first: bool) -> str:
+    parts = [LAYOUT.fingerprint(), str(skip_first)]
+    parts += [f"{f.relative_to(data)} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files]
+    return sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _read_cache(stored: Path) -> Corpus:
+    with safe_open(stored, framework="pt") as file:
+        index = json.loads(file.metadata()["index"])
+        return Corpus(tuple(index["names"]), tuple(index["lengths"]), file.get_tensor("features"))
+
+
+def _write_cache(corpus: Corpus, stored: Path) -> None:
+    index = json.dumps({"names": corpus.names, "lengths": corpus.lengths})
+    with writing(stored) as beside:
+        save_file({"features": corpus.features}, beside, metadata={"index": index})
