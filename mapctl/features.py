@@ -80,6 +80,11 @@ class Place:
         step = rotations.rotate_ground(displacement_heading, self.heading)
         return Place(self.position_xz + step, self.heading + turn)
 
+    def before(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "Place":
+        """The place from which one such step leads here."""
+        heading = self.heading - turn
+        return Place(self.position_xz - rotations.rotate_ground(displacement_heading, heading), heading)
+
     @staticmethod
     def origin(dtype: torch.dtype = torch.float32) -> "Place":
         """At the origin, facing +Z."""
@@ -107,8 +112,7 @@ def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], Place]:
     planted = torch.as_tensor(contacts.planted(motion.joint_positions()[:, toes], float(motion.fps))).to(step.dtype)
     height = motion.root_position[:, 1:2]
     features = torch.cat([step, turn[:, None], height, tilt_vector[:, [0, 2]], joints, planted], dim=-1)
-    before = heading[0] - turn[0]
-    return features, Place(ground[0] - rotations.rotate_ground(step[0], before), before)
+    return features, Place(ground[0], heading[0]).before(step[0], turn[0])
 
 
 def root_places(

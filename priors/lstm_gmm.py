@@ -50,6 +50,10 @@ class LstmState:
         """How many independent states."""
         return self.previous.shape[0]
 
+    def pick(self, rows: Int[Tensor, " picked"]) -> "LstmState":
+        """The states of some batch rows."""
+        return LstmState(self.previous[rows], self.hidden[:, rows].contiguous(), self.cell[:, rows].contiguous())
+
     def repeat(self, count: int) -> "LstmState":
         """A batch of one, `count` times."""
         return LstmState(self.previous.expand(count, -1), self.hidden.expand(-1, count, -1).contiguous(),

@@ -18,7 +18,7 @@ from mapctl import retarget
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, encode
 from mapctl.formats import load
-from mapctl.formats.atomic import writing
+from mapctl.formats.atomic import atomic_path
 
 TRAINING_FPS = Fraction(30)
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
@@ -135,5 +135,5 @@ def _read_cache(stored: Path) -> Corpus:
 
 def _write_cache(corpus: Corpus, stored: Path) -> None:
     index = json.dumps({"names": corpus.names, "lengths": corpus.lengths})
-    with writing(stored) as beside:
+    with atomic_path(stored) as beside:
         save_file({"features": corpus.features}, beside, metadata={"index": index})

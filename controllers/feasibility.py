@@ -1,0 +1,58 @@
+"""Wishes that cannot hold, named with numbers: before the solve from what the data show, after it from what was missed."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.curves import Curve
+from mapctl.intent import Follow
+from mapctl.motion import Motion
+from mapctl.protocols import Abilities
+from mapctl.roles import find_hips
+
+_TOLERATED_CM = 15.0
+_CORNER_SECONDS = 1.0
+
+
+def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
+    """Sentences about speeds and corners beyond the prior's data, and about a curve that ends too soon."""
+    notes = []
+    fastest, slowest = max(request.profile.speeds), min(request.profile.speeds)
+    if fastest > abilities.fastest:
+        notes.append(f"{fastest:.2f} m/s is faster than the prior's data, which reach {abilities.fastest:.2f} m/s")
+    if slowest < abilities.slowest:
+        notes.append(f"{slowest:.2f} m/s is slower than the prior's data, which begin at {abilities.slowest:.2f} m/s")
+    notes += _corners(request, arcs, abilities)
+    if not request.curve.closed and float(arcs[-1]) > request.curve.length + 0.05:
+        over = float(arcs[-1]) - request.curve.length
+        notes.append(f"the curve is {request.curve.length:.1f} m long; the last {over:.1f} m go straight on beyond its end")
+    return notes
+
+
+def after_the_fact(motion: Motion, curve: Curve, arcs: Float[Tensor, " frames"], fps: float) -> list[str]:
+    """The worst stretch that leaves the curve by more than 15 cm, if there is one."""
+    hips = motion.joint_positions()[:, find_hips(motion.skeleton)]
+    places = hips[:, ::2] if curve.dims == 2 else hips
+    wanted = arcs[: len(places)]
+    error = (places - curve.point(curve.nearest(places, around=wanted, reach=1.0))).norm(dim=-1)
+    if float(error.max()) * 100 <= _TOLERATED_CM:
+        return []
+    off = (error * 100 > _TOLERATED_CM).nonzero()[:, 0]
+    first, last = int(off[0]), int(off[-1])
+    return [f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first / fps:.1f} and {last / fps:.1f} s"]
+
+
+def _corners(request: Follow, arcs: Tensor, abilities: Abilities) -> list[str]:
+    """The sharpest turn over one second of the walk, if it is beyond the data."""
+    step = max(1, int((arcs <= arcs[0] + request.profile.speeds[0] * _CORNER_SECONDS).sum()))
+    if len(arcs) <= step:
+        return []
+    samples = request.curve.curvature(arcs) * torch.gradient(arcs)[0]
+    turned = torch.nn.functional.pad(samples.cumsum(0), (1, 0))
+    turned = (turned[step:] - turned[:-step]).abs()
+    worst = int(turned.argmax())
+    if float(turned[worst]) <= abilities.turn_rate:
+        return []
+    degrees, able = (torch.rad2deg(torch.tensor(v)).item() for v in (float(turned[worst]), abilities.turn_rate))
+    return [f"the curve turns {degrees:.0f} degrees within a second at {float(arcs[worst]):.1f} m; "
+            f"the prior's data turn at most {able:.0f}"]  # fmt: skip

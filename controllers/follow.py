@@ -1,0 +1,91 @@
+"""Walk a drawn curve (rnn paper, section 5.2): choose a start, then solve window after window."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.feasibility import after_the_fact, in_advance
+from controllers.starting import Start, choose_start
+from mapctl.curves import Curve
+from mapctl.features import decode
+from mapctl.intent import Follow, SpeedProfile
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.solver.result import Outcome, Solution, Status
+from mapctl.solver.window import Committed, WindowSettings, WindowSolver
+from mapctl.solver.proposals import Proposal, zero_start
+from mapctl.terms import Footing, Noise, Path, Term
+
+
+@dataclass(frozen=True)
+class FollowSettings:
+    """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
+
+    path_sigma_slow: float = 0.01
+    """Sideways offset after its slow part is taken, metres."""
+    path_sigma_raw: float = 0.06
+    """Sideways offset itself, metres."""
+    path_sigma_progress: float = 0.08
+    """Arc missing or too much, metres."""
+    footing: Footing = field(default_factory=Footing)
+    """Planted feet."""
+    noise: Noise = field(default_factory=Noise)
+    """The prior, in the latents of its rollout."""
+    window: WindowSettings = field(default_factory=WindowSettings)
+    """Windows and budgets."""
+    proposal: Proposal = zero_start
+    """Where L-BFGS starts in each window."""
+    joint: str = "hips"
+    """Which joint follows the curve."""
+
+
+def follow(
+    prior: Any, curve: Curve, *, seconds: float | None = None, speed: float | SpeedProfile = 1.2,
+    generator: torch.Generator | None = None, settings: FollowSettings | None = None, skeleton: Skeleton = CANONICAL,
+    fps: float = 30.0, progress: Callable[[int, int], None] | None = None, deadline_seconds: float | None = None,
+) -> Solution:  # fmt: skip
+    """A character walks the curve from its first point, facing along it.
+
+    `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the arc;
+    without `seconds` the curve is walked once. The first frame is the start pose. RequestError for wishes that
+    make no sense; wishes that cannot hold are named with numbers in the solution's status.
+    """
+    profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
+    request, settings = Follow(curve, profile, seconds), settings or FollowSettings()
+    generator = generator or torch.Generator().manual_seed(0)
+    frames = request.frames(fps)
+    # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
+    arcs = request.arcs(frames + settings.window.frames, fps)
+    terms_of = _terms_of(curve, arcs, settings)
+    start = choose_start(prior, curve, arcs, terms_of, skeleton=skeleton, fps=fps, generator=generator)
+    solver = WindowSolver(prior, settings.window, skeleton, fps, settings.proposal)
+    deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
+    done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
+                                 deadline=deadline)  # fmt: skip
+    return _solution(done, outcome, start, request, prior, arcs, skeleton, fps)
+
+
+def _terms_of(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings):
+    path = Path(curve, arcs, joint=settings.joint, sigma_slow=settings.path_sigma_slow,
+                sigma_raw=settings.path_sigma_raw, sigma_progress=settings.path_sigma_progress)  # fmt: skip
+
+    def terms(first: int, frames: int) -> Sequence[Term]:
+        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing
+
+    return terms
+
+
+def _solution(
+    done: Committed, outcome: Outcome, start: Start, request: Follow, prior: Any, arcs: Tensor, skeleton: Skeleton,
+    fps: float,
+) -> Solution:  # fmt: skip
+    motion = decode(done.features, start.before_first, skeleton=skeleton, fps=round(fps))
+    status = Status(outcome).with_notes(start.notes)
+    ahead = in_advance(request, arcs[: len(done.features)], prior.abilities)
+    missed = after_the_fact(motion, request.curve, arcs, fps)
+    status = status.with_notes((*ahead, *missed), infeasible=bool(ahead or missed))
+    return Solution(motion, status, done.ledger, done.windows, done.features)

@@ -1,0 +1,105 @@
+"""What a person asks for, before it becomes terms."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.curves import Curve
+from mapctl.errors import RequestError
+
+_FINE = 10  # integration steps a frame
+
+
+@dataclass(frozen=True)
+class SpeedProfile:
+    """Speed along a curve, m/s, linear between the given arcs and constant beyond them."""
+
+    arcs: tuple[float, ...]
+    """Metres from the curve's start, rising."""
+    speeds: tuple[float, ...]
+    """At those arcs, m/s, positive."""
+
+    def __post_init__(self):
+        if len(self.arcs) != len(self.speeds) or not self.arcs:
+            raise RequestError("a speed profile needs one speed for each arc")
+        if any(b <= a for a, b in zip(self.arcs, self.arcs[1:], strict=False)):
+            raise RequestError(f"the arcs of a speed profile must rise, got {self.arcs}")
+        for speed in self.speeds:
+            if not 0 < speed < float("inf"):
+                raise RequestError(f"speed must be positive, got {speed:g} m/s")
+
+    @staticmethod
+    def constant(speed: float) -> "SpeedProfile":
+        """The same speed everywhere."""
+        return SpeedProfile((0.0,), (float(speed),))
+
+    @staticmethod
+    def parse(text: str) -> "SpeedProfile":
+        """`1.2`, or `0:1.0,5:2.5` for 1 m/s at the start rising to 2.5 m/s at 5 m."""
+        try:
+            if ":" not in text:
+                return SpeedProfile.constant(float(text))
+            pairs = [part.split(":") for part in text.split(",")]
+            return SpeedProfile(tuple(float(a) for a, _ in pairs), tuple(float(v) for _, v in pairs))
+        except ValueError:
+            raise RequestError(f"a speed is a number or ARC:SPEED,ARC:SPEED, got {text!r}") from None
+
+    def at(self, arc: float) -> float:
+        """Speed at an arc, m/s."""
+        arcs, speeds = self.arcs, self.speeds
+        if arc <= arcs[0]:
+            return speeds[0]
+        for (a, v), (b, w) in zip(zip(arcs, speeds, strict=True), zip(arcs[1:], speeds[1:], strict=True), strict=False):
+            if arc <= b:
+                return v + (w - v) * (arc - a) / (b - a)
+        return speeds[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Follow:
+    """Walk a curve from its first point at given speeds."""
+
+    curve: Curve
+    """On the ground, or in space."""
+    profile: SpeedProfile
+    """Speed along it."""
+    seconds: float | None = None
+    """Duration; None walks the curve once."""
+
+    def __post_init__(self):
+        if self.seconds is not None and not 0 < self.seconds < float("inf"):
+            raise RequestError(f"seconds must be positive, got {self.seconds:g}")
+
+    def frames(self, fps: float, *, most: int = 3_600_000) -> int:
+        """How many frames it takes, at least two; RequestError beyond `most`."""
+        if self.seconds is not None:
+            count = round(self.seconds * fps)
+        else:
+            count = 1 + _steps_until(self.profile, self.curve.length, fps)
+        if count > most:
+            raise RequestError(f"{count} frames are more than the {most} allowed; ask for fewer seconds")
+        return max(2, count)
+
+    def arcs(self, frames: int, fps: float) -> Float[Tensor, " frames"]:
+        """Wanted arc at each frame, metres, the first 0: the integral of speed."""
+        arcs = [0.0]
+        for _ in range(frames - 1):
+            arcs.append(_advance(self.profile, arcs[-1], 1 / fps))
+        return torch.tensor(arcs, dtype=torch.float64)
+
+
+def _advance(profile: SpeedProfile, arc: float, seconds: float) -> float:
+    for _ in range(_FINE):
+        arc += profile.at(arc) * seconds / _FINE
+    return arc
+
+
+def _steps_until(profile: SpeedProfile, length: float, fps: float) -> int:
+    if len(profile.speeds) == 1:
+        return max(1, round(length / profile.speeds[0] * fps))
+    arc, steps = 0.0, 0
+    while arc < length:
+        arc, steps = _advance(profile, arc, 1 / fps), steps + 1
+    return steps

@@ -1,0 +1,104 @@
+"""Weights on disk: safetensors with a JSON card beside them. Nothing is ever unpickled.
+
+The card holds the configuration, the fingerprint of the feature layout, seed, data and licence, the training curve and
+the measured quality. A card that does not fit the code is refused with both layouts printed.
+"""
+
+import json
+from dataclasses import dataclass, field
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from mapctl.errors import CheckpointError
+from mapctl.features import LAYOUT
+from mapctl.formats.atomic import atomic_path
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a set of weights is."""
+
+    kind: str
+    """`lstm-gmm` and so on."""
+    config: dict[str, Any]
+    """The network's settings."""
+    layout: list[list[Any]]
+    """Blocks of the feature vector: name and width."""
+    fingerprint: str
+    """Of the layout."""
+    licence: str
+    """Of the weights."""
+    data: dict[str, Any] = field(default_factory=dict)
+    """What it was trained on: clips, frames, attribution, split seed."""
+    training: dict[str, Any] = field(default_factory=dict)
+    """Recipe, seed, steps, command and curve."""
+    quality: dict[str, Any] = field(default_factory=dict)
+    """Measured figures and the command that printed them."""
+    abilities: dict[str, float] = field(default_factory=dict)
+    """Speeds and turning that the data show."""
+
+    @staticmethod
+    def of_layout() -> dict[str, Any]:
+        """The two layout fields for the features of this code."""
+        return {"layout": [list(block) for block in LAYOUT.blocks], "fingerprint": LAYOUT.fingerprint()}
+
+
+def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = True) -> None:
+    """Write `path` (.safetensors) and its card (.json beside it); float16 unless `half` is false."""
+    kept = {name: (t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t).contiguous()
+            for name, t in tensors.items()}  # fmt: skip
+    with atomic_path(path) as scratch:
+        save_file(kept, scratch)
+    with atomic_path(path.with_suffix(".json")) as scratch:
+        scratch.write_text(json.dumps(vars(card), indent=1) + "\n", encoding="utf-8")
+
+
+def load(path: Path) -> tuple[dict[str, Tensor], Card]:
+    """Tensors in float32 and the card; CheckpointError if either is missing, broken or of another layout."""
+    card = read_card(path.with_suffix(".json"))
+    if card.fingerprint != LAYOUT.fingerprint():
+        ours = [list(block) for block in LAYOUT.blocks]
+        raise CheckpointError(f"{path}: its features are {card.layout}, this code's are {ours}")
+    try:
+        tensors = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path}: no readable safetensors file ({error})") from error
+    return {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, card
+
+
+def read_card(path: Path) -> Card:
+    """The card alone."""
+    try:
+        return Card(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise CheckpointError(f"{path}: no readable card ({error})") from error
+
+
+def bundled() -> list[str]:
+    """Names of the priors that come with the package."""
+    found = (p.name for p in files("priors.weights").iterdir())
+    return sorted(name.removesuffix(".safetensors") for name in found if name.endswith(".safetensors"))
+
+
+def locate(name: str) -> Path:
+    """The safetensors file of a bundled name, of a path, or of a training run's folder."""
+    path = Path(name)
+    for candidate in (path, path / "model.safetensors", path.with_suffix(".safetensors")):
+        if candidate.is_file() and candidate.suffix == ".safetensors":
+            return candidate
+    if name in bundled():
+        with as_file(files("priors.weights") / f"{name}.safetensors") as place:
+            return place
+    raise CheckpointError(f"no prior {name!r}: neither a file nor one of {', '.join(bundled()) or 'the bundled (none)'}")
+
+
+def half_precision_error(tensors: dict[str, Tensor]) -> float:
+    """Largest relative change that float16 storage makes to any tensor (a gate before weights ship)."""
+    return max(float((t - t.half().float()).norm() / t.norm().clamp_min(1e-12)) for t in tensors.values()
+               if t.dtype is torch.float32)  # fmt: skip

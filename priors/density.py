@@ -1,0 +1,103 @@
+"""A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its starts and its card."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import CheckpointError
+from mapctl.protocols import Abilities, Plan, Starts
+from priors import checkpoints
+from priors.lstm_gmm import LstmGmm, LstmGmmConfig, LstmState
+
+if TYPE_CHECKING:
+    from priors.fast_rollout import FastRollout
+
+
+@dataclass(frozen=True, eq=False)
+class LstmGmmDensity:
+    """A Density (see mapctl.protocols) that rolls out on the fast path unless told otherwise."""
+
+    name: str
+    """How it was asked for."""
+    reference: LstmGmm
+    """The torch network: the specification, and the only path on a GPU."""
+    starts: Starts
+    """Moments of mocap to begin from."""
+    card: checkpoints.Card
+    """What the weights are."""
+    use_fast: bool = True
+    """Whether rollouts and samples take the hand-written kernels."""
+
+    @cached_property
+    def fast(self) -> "FastRollout":
+        """The kernels, built on first use."""
+        from priors.fast_rollout import FastRollout
+
+        return FastRollout(self.reference)
+
+    @property
+    def _engine(self) -> "FastRollout | LstmGmm":
+        return self.fast if self.use_fast else self.reference
+
+    @property
+    def abilities(self) -> Abilities:
+        """What the training data show."""
+        return Abilities(**self.card.abilities)
+
+    @property
+    def feature_mean(self) -> Float[Tensor, " size"]:
+        """Mean of the training data."""
+        return self.reference.mean
+
+    @property
+    def feature_std(self) -> Float[Tensor, " size"]:
+        """Spread of the training data."""
+        return self.reference.std
+
+    def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
+        """A state with empty memory after one frame."""
+        return self.reference.initial_state(previous)
+
+    def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
+        """See Density."""
+        return self.reference.log_prob(features, state, inputs=inputs)
+
+    def advance(self, state: LstmState, committed: Tensor) -> LstmState:
+        """See Density."""
+        return self.reference.advance(state, committed)
+
+    def sample(
+        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+    ) -> tuple[Tensor, LstmState]:
+        """See Density."""
+        return self._engine.sample(state, frames, generator, temperature=temperature)
+
+    def plan(self, state: LstmState, noise: Tensor) -> Plan:
+        """See Density."""
+        return self._engine.plan(state, noise)
+
+    def rollout(self, state: LstmState, noise: Tensor, plan: Plan) -> tuple[Tensor, Tensor]:
+        """See Density."""
+        return self._engine.rollout(state, noise, plan)
+
+
+def load(name: str) -> LstmGmmDensity:
+    """A bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    path = checkpoints.locate(name)
+    tensors, card = checkpoints.load(path)
+    if card.kind != "lstm-gmm":
+        raise CheckpointError(f"{path}: a {card.kind} is no density")
+    starts = Starts(
+        LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
+        tensors.pop("starts.speed"), tuple(card.data["starts"]),
+    )  # fmt: skip
+    model = LstmGmm(LstmGmmConfig(**card.config), mean=tensors["mean"], std=tensors["std"])
+    try:
+        model.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise CheckpointError(f"{path}: its tensors do not fit its card ({error})") from error
+    return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)
