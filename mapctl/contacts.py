@@ -1,10 +1,14 @@
 """The one definition of "this foot is planted"."""
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import torch
 from jaxtyping import Bool, Float
+from numpy import ndarray
 from torch import Tensor
+
+from mapctl.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -16,32 +20,47 @@ class ContactSettings:
     slow: float = 0.35
     """And slower than this over the ground, m/s."""
     floor_percentile: float = 5.0
-    """The floor is this percentile of the toe's own height."""
+    """The floor is this percentile of the toe's own height in the clip."""
     shortest: float = 0.1
-    """Contacts shorter than this are dropped, seconds."""
+    """Contacts shorter than this are dropped, seconds: 3 frames at 30 fps."""
+    speed_step: float = 1 / 30
+    """Toe speed is the mean over about this time, seconds, or a fast camera's noise looks like motion."""
 
 
 def planted(
-    toe_positions: Float[Tensor, "frames 2 3"], fps: float, settings: ContactSettings = ContactSettings()
-) -> Bool[Tensor, "frames 2"]:
-    """Whether each toe stands on its floor in each frame; positions in metres, Y up."""
-    if len(toe_positions) < 2:
-        return torch.zeros(len(toe_positions), 2, dtype=torch.bool)
-    height = toe_positions[..., 1]
-    floor = torch.quantile(height, settings.floor_percentile / 100, dim=0)
-    speed = torch.diff(toe_positions[..., [0, 2]], dim=0).norm(dim=-1) * fps
-    speed = torch.cat([speed[:1], speed])
-    stands = (height < floor + settings.reach) & (speed < settings.slow)
-    return _drop_short(stands, round(settings.shortest * fps))
+    toe_positions: Float[Tensor, "frames feet 3"] | Float[ndarray, "frames feet 3"],
+    fps: float | Fraction,
+    settings: ContactSettings = ContactSettings(),
+) -> Bool[Tensor, "frames feet"]:
+    """Whether each toe stands on its floor in each frame; positions in metres, Y up.
+
+    A frame's speed is that of the way to it. The first frames, which have no such way, count as planted where
+    they are low and the first frame with one is planted. RequestError for other shapes and frame rates.
+    """
+    toes, fps = torch.as_tensor(toe_positions), float(fps)
+    if toes.dim() != 3 or toes.shape[-1] != 3 or len(toes) == 0 or not fps > 0:
+        shape = tuple(toes.shape)
+        raise RequestError(
+            f"contacts need toes (frames, feet, 3) and a positive fps, got {shape} and {fps:g}"
+        )
+    step = max(1, round(settings.speed_step * fps))
+    low = toes[..., 1] < floor_heights(toes, settings) + settings.reach
+    slow = (toes[step:] - toes[:-step])[..., ::2].norm(dim=-1) * (fps / step) < settings.slow
+    stands = _without_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
+    return torch.cat([low[:step] & (stands[:1] if len(stands) else False), stands])
 
 
-def _drop_short(stands: Tensor, shortest: int) -> Tensor:
-    """Runs of true shorter than `shortest` frames become false."""
-    kept = stands.clone()
-    for foot in range(stands.shape[1]):
-        padded = torch.nn.functional.pad(stands[:, foot].int(), (1, 1))
-        edges = torch.diff(padded).nonzero()[:, 0].tolist()
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
-            if stop - start < shortest:
-                kept[start:stop, foot] = False
-    return kept
+def floor_heights(
+    toe_positions: Float[Tensor, "frames feet 3"], settings: ContactSettings = ContactSettings()
+) -> Float[Tensor, "feet"]:
+    """Height of the floor under each toe joint, metres: a low percentile of the toe's own height."""
+    return torch.quantile(toe_positions[..., 1], settings.floor_percentile / 100, dim=0)
+
+
+def _without_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
+    """Runs of true shorter than `shortest` frames become false: a morphological opening."""
+    if len(stands) < shortest:
+        return torch.zeros_like(stands)
+    whole = stands.T.unfold(-1, shortest, 1).all(dim=-1)  # windows that are true throughout
+    spread = torch.nn.functional.pad(whole, (shortest - 1, shortest - 1))
+    return spread.unfold(-1, shortest, 1).any(dim=-1).T

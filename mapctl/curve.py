@@ -87,10 +87,7 @@ class Curve:
     def _segment(self, arc: Tensor) -> tuple[Tensor, Int[Tensor, "*batch"]]:
         """The arc within the tables, float64, and the segment it lies on."""
         arc = torch.remainder(arc.double(), self.length) if self.closed else arc.double()
-        knots = self._tables[0]
-        return arc, torch.searchsorted(knots, arc.detach().contiguous(), right=True).sub(1).clamp(
-            0, len(knots) - 2
-        )
+        return arc, _piece(self._tables[0], arc)
 
     def _at(self, arc: Tensor) -> Tensor:
         knots, points, directions = self._tables
@@ -127,7 +124,7 @@ class Curve:
         heading, slope = self._turning
         laps = torch.floor(arc.detach() / self.length) if self.closed else torch.zeros_like(arc)
         within = torch.remainder(arc, self.length) if self.closed else arc.clamp(0, self.length)
-        vertex = torch.searchsorted(self._arcs, within.detach(), right=True).sub(1).clamp(0, len(slope) - 1)
+        vertex = _piece(self._arcs, within)
         return (
             heading[vertex]
             + (within - self._arcs[vertex]) * slope[vertex]
@@ -154,8 +151,8 @@ class Curve:
         """Arc of the point nearest to each given one: (x, y, z), or (x, z) for a curve on the ground.
 
         With `around`, only arcs within `reach` metres of it are searched, so that a curve that crosses itself
-        is not left for its other branch; the result is not wrapped (it stays near `around`) and may lie beyond
-        the ends. Without, the whole curve is searched between its ends. Differentiable in the points.
+        is not left for its other branch; the result is not wrapped (it stays near `around`) and may lie
+        beyond the ends. Without, the whole curve is searched between its ends. Differentiable in the points.
         """
         points = self._of_curve(points_world)
         if around is None:
@@ -181,9 +178,7 @@ class Curve:
 
     def _nearest_anywhere(self, points: Tensor) -> Tensor:
         count = len(self.points)
-        vertices = self._tree.query(
-            points.detach().double().numpy(), k=range(1, min(_NEIGHBOURS, count) + 1)
-        )[1]
+        vertices = self._tree.query(points.detach().double().numpy(), k=min(_NEIGHBOURS, count))[1]
         vertices = torch.as_tensor(vertices, dtype=torch.long)
         segments = torch.cat([vertices - 1, vertices], dim=-1).clamp(0, count - 2)
         knots, corners, directions = (table[0 if self.closed else 1 :] for table in self._tables)
@@ -218,6 +213,11 @@ class Curve:
 
 def _tensor(arc: Arc) -> Tensor:
     return arc if torch.is_tensor(arc) else torch.tensor(arc, dtype=torch.float64)
+
+
+def _piece(knots: Tensor, arc: Tensor) -> Int[Tensor, "*batch"]:
+    """Index of the knot before each arc; the first or the last but one for arcs outside."""
+    return torch.searchsorted(knots, arc.detach().contiguous(), right=True).sub(1).clamp(0, len(knots) - 2)
 
 
 def _unit(vector: Tensor) -> Tensor:

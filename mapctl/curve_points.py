@@ -27,9 +27,9 @@ def dense_polyline(
     """The polyline through `points` (n, 2 or 3; metres), vertices about 1 cm apart, and whether it is closed.
 
     Straight pieces are divided evenly; of points denser than 1 cm the one that bends the curve most is kept
-    in each centimetre. Closed where `closed` says so, or by default where the ends lie within 1 mm, or half the
-    points' usual spacing, of each other; a closed polyline repeats its first point at the end. RequestError
-    gives the reason where points make no curve.
+    in each centimetre. Closed where `closed` says so, or by default where the ends lie within 1 mm, or half
+    the points' usual spacing, of each other; a closed polyline repeats its first point at the end. Raises
+    RequestError with the reason where points make no curve.
     """
     given = _checked(points)
     distinct = given[np.r_[True, _spans(given) > _SAME_PLACE]]

@@ -1,0 +1,112 @@
+"""Measures of a motion, exactly as the design's section 6 defines them; names carry their units.
+
+A measure that a clip cannot give (sway of one second, contact speed without a contact) is NaN.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.curve import Curve
+from mapctl.errors import RequestError
+from mapctl.metrics import body, feet, path
+from mapctl.motion import Motion
+from mapctl.roles import find_feet, find_hips, find_upper_legs
+
+_CM = 100.0
+
+
+def measure(
+    motion: Motion, curve: Curve | None = None, *, speed: float | None = None, joint: str | None = None
+) -> dict[str, float]:
+    """Measures of one motion by name.
+
+    Always: skate_cm_s, skate_ratio, contact_speed_cm_s, planted_share, penetration_cm, float_cm, jitter_m_s3,
+    speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm, and sway_cm: from the straight
+    line between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, the same as
+    path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s) wanted_m and progress_ratio too.
+    `joint` names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or
+    feet cannot be told, unknown joints and motions of one frame.
+    """
+    if motion.num_frames < 2:
+        raise RequestError("measures need a motion of at least 2 frames")
+    positions, fps, hips = motion.joint_positions(), float(motion.fps), find_hips(motion.skeleton)
+    measures = _feet(positions[:, list(find_feet(motion.skeleton))], fps)
+    measures |= _body(positions, hips, find_upper_legs(motion.skeleton), fps)
+    if curve is None:
+        return measures | {"sway_cm": path.sway(path.straight_offset(positions[:, hips, ::2]), fps) * _CM}
+    follower = hips if joint is None else motion.skeleton.index(joint)
+    return measures | _path(positions[:, follower], curve, speed, fps)
+
+
+def _feet(toe_positions: Float[Tensor, "frames 2 3"], fps: float) -> dict[str, float]:
+    toes = feet.Toes.of(toe_positions, fps)
+    return {
+        "skate_cm_s": feet.skate(toes) * _CM,
+        "skate_ratio": feet.skate_ratio(toes),
+        "contact_speed_cm_s": feet.contact_speed(toes) * _CM,
+        "planted_share": feet.planted_share(toes),
+        "penetration_cm": feet.penetration(toes) * _CM,
+        "float_cm": feet.floating(toes) * _CM,
+    }
+
+
+def _body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float) -> dict[str, float]:
+    left, right = upper_legs
+    angle = body.facing(positions[:, left], positions[:, right])
+    return {
+        "jitter_m_s3": body.jitter(positions, fps),
+        "speed_m_s": body.ground_speed(positions[:, hips], fps),
+        "turned_deg": float(torch.rad2deg(angle.max() - angle.min())),
+        "turn_rate_deg_s": float(torch.rad2deg(torch.tensor(body.turn_rate(angle, fps)))),
+        "hips_height_m": float(positions[:, hips, 1].mean()),
+        "pose_variation_cm": body.pose_variation(positions, positions[:, hips], angle) * _CM,
+    }
+
+
+def _path(
+    places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float
+) -> dict[str, float]:
+    arcs = curve.track(places)
+    travelled = float(arcs[-1] - arcs[0])
+    measures = _spread("path_error_{}_cm", path.path_error(places, curve))
+    measures |= _spread("path_error_low_passed_{}_cm", path.low_passed_error(places, curve, arcs, fps))
+    measures |= {"sway_cm": path.sway(curve.signed_offset(places, arcs), fps) * _CM, "travelled_m": travelled}
+    if speed is not None:
+        wanted = speed * (len(places) - 1) / fps
+        measures |= {"wanted_m": wanted, "progress_ratio": travelled / wanted if wanted else float("nan")}
+    return measures
+
+
+def _spread(name: str, error: Float[Tensor, "frames"]) -> dict[str, float]:
+    values = {"mean": error.mean(), "p95": error.quantile(0.95), "max": error.max()}
+    return {name.format(kind): float(value) * _CM for kind, value in values.items()}
+
+
+class Spread(NamedTuple):
+    """What a set of clips shows of one measure."""
+
+    mean: float
+    p2: float
+    p98: float
+
+
+def reference(motions: Iterable[Motion]) -> dict[str, Spread]:
+    """Mean, 2nd and 98th percentile of every measure over clips, to print beside ours.
+
+    NaN is left out: clips that cannot give a measure. RequestError for no clips at all.
+    """
+    rows = [measure(motion) for motion in motions]
+    if not rows:
+        raise RequestError("a reference needs at least one clip")
+    table = {name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]}
+    return {name: _spread_of(values[~values.isnan()]) for name, values in table.items()}
+
+
+def _spread_of(values: Tensor) -> Spread:
+    if len(values) == 0:
+        return Spread(float("nan"), float("nan"), float("nan"))
+    return Spread(float(values.mean()), *values.quantile(values.new_tensor([0.02, 0.98])).tolist())

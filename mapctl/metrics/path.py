@@ -1,0 +1,49 @@
+"""Path measures: distance to the curve, progress along it, and the sway that no rail has."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.curve import Curve
+from mapctl.metrics.smoothing import gaussian_kernel, slow_part, slow_part_inside
+
+LOW_PASS_SECONDS = 0.5
+"""Standard deviation of the Gaussian that takes natural sway out of the path error."""
+SWAY_SECONDS = 0.35
+"""Standard deviation of the Gaussian whose slow part is not sway."""
+
+
+def path_error(places: Float[Tensor, "frames axes"], curve: Curve) -> Float[Tensor, "frames"]:
+    """Distance of each place to the curve, between its ends, metres; without height for a ground curve."""
+    apart = curve.point(curve.nearest(places)) - (places[:, ::2] if places.shape[1] > curve.dims else places)
+    return apart.norm(dim=-1)
+
+
+def low_passed_error(
+    places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
+) -> Float[Tensor, "frames"]:
+    """Size of the sideways offset after a Gaussian of 0.5 s, metres.
+
+    The offset is smoothed and not the walk, which would shrink on every bend. `arcs` come from `track`.
+    """
+    return slow_part(curve.signed_offset(places, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
+
+
+def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECONDS) -> float:
+    """Root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
+    kernel = gaussian_kernel(seconds, fps)
+    reach = len(kernel) // 2
+    if len(offset) <= 2 * reach + 4:
+        return math.nan
+    return float((offset[reach:-reach] - slow_part_inside(offset, kernel)).square().mean().sqrt())
+
+
+def straight_offset(ground: Float[Tensor, "frames 2"]) -> Float[Tensor, "frames"]:
+    """Distance of a walk (x, z) from the line piece between its ends, metres; left is positive."""
+    along = ground[-1] - ground[0]
+    apart = ground - ground[0]
+    share = ((apart @ along) / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
+    side = torch.sign(along[1] * apart[:, 0] - along[0] * apart[:, 1])
+    return (apart - share[:, None] * along).norm(dim=-1) * side
