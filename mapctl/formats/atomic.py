@@ -1,0 +1,73 @@
+"""Output files appear whole or not at all: written beside their place, then renamed onto it."""
+
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from os import PathLike
+from pathlib import Path
+
+from mapctl.errors import RequestError
+
+
+@contextmanager
+def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
+    """Yield an empty scratch file beside `path`, which becomes `path` when the block ends well.
+
+    Whatever ends the block early (an error, Ctrl-C) removes the scratch file and leaves an older `path`
+    alone. RequestError if the place cannot be written, before the block runs where that can be known.
+    """
+    target = Path(os.path.realpath(path))
+    scratch = target.with_name(f".{secrets.token_hex(4)}{target.suffix}")
+    try:
+        _check_place(path, target)
+        scratch.touch(exist_ok=False)
+        yield scratch
+        _flush_to_disk(scratch)
+        scratch.replace(target)
+    except OSError as error:
+        raise RequestError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | PathLike[str], content: bytes) -> None:
+    """Write `content` as the whole file `path`; RequestError if that cannot be."""
+    with atomic_path(path) as scratch:
+        scratch.write_bytes(content)
+
+
+def write_text(path: str | PathLike[str], content: str) -> None:
+    """Write `content` as UTF-8 with line feeds as they are; RequestError if that cannot be."""
+    write_bytes(path, content.encode("utf-8"))
+
+
+def check_writable(path: str | PathLike[str]) -> None:
+    """RequestError if `path` cannot be written; leaves no trace. For use before long work."""
+    target = Path(os.path.realpath(path))
+    try:
+        _check_place(path, target)
+        with tempfile.NamedTemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise RequestError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _check_place(path: str | PathLike[str], target: Path) -> None:
+    """Renaming onto a folder or a device (/dev/null) would fail late or replace it, so refuse both early."""
+    if not os.fspath(path):
+        raise RequestError("cannot write a file with an empty name")
+    if not target.parent.is_dir():
+        raise RequestError(f"cannot write {path}: the folder {target.parent} does not exist")
+    if target.is_dir():
+        raise RequestError(f"cannot write {path}: it is a folder")
+    if target.exists() and not target.is_file():
+        raise RequestError(f"cannot write {path}: it is not a regular file")
+
+
+def _flush_to_disk(scratch: Path) -> None:
+    """Without this a power cut after the rename could leave an empty file under the final name."""
+    with scratch.open("rb+") as file:
+        os.fsync(file.fileno())

@@ -1,0 +1,145 @@
+"""BVH files to Motion and back, on the file's own skeleton and in its own channel layout.
+
+A position channel replaces its joint's OFFSET when read. Lengths are scaled to metres by the size of the body
+(see `units`), and scaled back when written.
+"""
+
+from os import PathLike
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.formats import bvh_euler, bvh_layout, bvh_text
+from mapctl.formats.atomic import write_bytes
+from mapctl.formats.bvh_hierarchy import Hierarchy
+from mapctl.formats.bvh_layout import BvhLayout
+from mapctl.formats.frame_rate import frame_rate
+from mapctl.formats.units import metres_per_unit, reach
+from mapctl.motion import Motion
+from mapctl.skeleton import Skeleton
+
+STILL = 1e-6
+"""A joint whose offset varies by less than this part of the body's reach stays still; files round to 1e-7."""
+
+
+def load(path: str | PathLike[str]) -> Motion:
+    """Read a BVH file of any Euler order, with 0 to 6 channels a joint, in any of the units of `units`.
+
+    The root's translation is `root_position` and its offset in the skeleton is zero. Another joint's
+    translation is its offset where it stays still, else `moving_offsets`. FileFormatError says what is
+    wrong, in which line.
+    """
+    text = bvh_text.read(path)
+    tree = text.hierarchy
+    travels = _translations(tree, text.values)
+    rest, moving = _settle(tree, travels)
+    scale = metres_per_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
+    layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding)
+    return Motion(
+        skeleton=_skeleton(tree, rest * scale, scale),
+        fps=layout.fps,
+        root_position=torch.from_numpy(travels[0] * scale),
+        local_quat_xyzw=_quaternions(tree, text.values),
+        moving_offsets={joint: torch.from_numpy(travels[joint] * scale) for joint in moving},
+        source=layout,
+    )
+
+
+def save(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write a BVH file, in the layout the motion was read in where its skeleton still has the same joints.
+
+    Else in centimetres with root OFFSET 0, six channels on the root and on joints that travel, three
+    elsewhere. A channel is added where the source's layout cannot hold the motion. Same motion, same bytes.
+    RequestError where the motion holds a NaN or the file cannot be written; then nothing is written.
+    """
+    _check_finite(motion, path)
+    layout = bvh_layout.of(motion, path)
+    order = [motion.skeleton.index(name) for name in layout.hierarchy.names]
+    quat_xyzw = _array(motion.local_quat_xyzw)[:, order]
+    translations = _all_translations(motion)[:, order] / layout.metres_per_unit
+    tree = bvh_layout.fitted(layout, translations, quat_xyzw)
+    values = _channel_values(tree, translations, quat_xyzw)
+    text = bvh_text.compose(tree, layout.frame_time, values, decimals=layout.decimals)
+    write_bytes(path, text.encode(layout.encoding))
+
+
+def _translations(tree: Hierarchy, values: np.ndarray) -> dict[int, np.ndarray]:
+    """(frames, 3) in the file's unit of the root and of every joint with position channels."""
+    travels = {}
+    for joint, columns in enumerate(tree.position_columns()):
+        if columns or joint == 0:
+            travels[joint] = np.tile(tree.offsets[joint], (len(values), 1))
+            travels[joint][:, list(columns)] = values[:, list(columns.values())]
+    return travels
+
+
+def _settle(tree: Hierarchy, travels: dict[int, np.ndarray]) -> tuple[np.ndarray, list[int]]:
+    """Rest offsets (joints, 3) in the file's unit, and which joints travel within their parent.
+
+    A channel that repeats OFFSET up to rounding is taken as OFFSET, so that clips of one rig agree.
+    """
+    rest = np.array(tree.offsets)
+    for joint, track in travels.items():
+        rest[joint] = track[0]
+    still, moving = STILL * reach(tree.parents, np.linalg.norm(rest, axis=1), {}), []
+    for joint, track in travels.items():
+        low, high, offset = track.min(0), track.max(0), np.array(tree.offsets[joint])
+        if joint == 0:
+            rest[joint] = 0.0
+        elif (np.maximum(high - offset, offset - low) <= still).all():
+            rest[joint] = offset
+        elif (high - low <= still).all():
+            rest[joint] = (low + high) / 2
+        else:
+            rest[joint] = offset
+            moving.append(joint)
+    return rest, moving
+
+
+def _skeleton(tree: Hierarchy, offsets: np.ndarray, scale: float) -> Skeleton:
+    ends = {tree.names[j]: (x * scale, y * scale, z * scale) for j, (x, y, z) in tree.end_offsets.items()}
+    return Skeleton(tree.names, tree.parents, torch.from_numpy(offsets), ends)
+
+
+def _quaternions(tree: Hierarchy, values: np.ndarray) -> Float[Tensor, "frames joints 4"]:
+    """Local rotations, continuous in sign over time; joints of one Euler order at once."""
+    quat_xyzw = np.empty((len(values), len(tree.names), 4))
+    for axes, joints, columns in tree.rotation_groups():
+        quat_xyzw[:, joints] = bvh_euler.to_quat_xyzw(np.deg2rad(values[:, columns]), axes)
+    return rotations.sign_continuous(torch.from_numpy(quat_xyzw))
+
+
+def _channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+    """The motion block (frames, channels), file unit and degrees."""
+    values = np.zeros((len(quat_xyzw), len(tree.labels())))
+    for joint, columns in enumerate(tree.position_columns()):
+        values[:, list(columns.values())] = translations[:, joint, list(columns)]
+    for axes, joints, columns in tree.rotation_groups():
+        values[:, columns] = np.rad2deg(bvh_euler.from_quat_xyzw(quat_xyzw[:, joints], axes))
+    return values
+
+
+def _all_translations(motion: Motion) -> np.ndarray:
+    """(frames, joints, 3) metres: each joint in its parent's frame, the root in the world."""
+    translations = np.tile(_array(motion.skeleton.offsets), (motion.num_frames, 1, 1))
+    translations[:, 0] = _array(motion.root_position)
+    for joint, track in motion.moving_offsets.items():
+        translations[:, joint] = _array(track)
+    return translations
+
+
+def _check_finite(motion: Motion, path: str | PathLike[str]) -> None:
+    length = np.linalg.norm(_array(motion.local_quat_xyzw), axis=-1)
+    bad = ~np.isfinite(_all_translations(motion)).all(-1) | ~(abs(length - 1) < 0.01)
+    if bad.any():
+        frame, joint = np.argwhere(bad)[0]
+        what = f"{motion.skeleton.names[joint]} at frame {frame}"
+        raise RequestError(f"cannot write {path}: {what} has no finite position and rotation")
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()

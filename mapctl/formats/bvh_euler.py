@@ -1,0 +1,132 @@
+"""Channels of rotations (degrees of any Euler order) to quaternions and back, for whole motions at once.
+
+A joint's matrix is the product of its channels' turns in file order, so the axes here are intrinsic. Going
+back, the angles are unwrapped over time and the closer of the two equivalent solutions is taken at every
+frame.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+W = 3
+"""Place of the scalar in xyzw."""
+_GIMBAL = 1e-7
+"""Below this length of a pair of quaternion parts its angle is noise; holding it costs at most 2e-7 rad."""
+
+
+def to_quat_xyzw(radians: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """Angles (..., channels) about `axes` (0, 1, 2 for X, Y, Z), one each, as unit quaternions (..., 4)."""
+    quat = np.zeros((*radians.shape[:-1], 4))
+    quat[..., W] = 1.0
+    for channel, i in enumerate(axes):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        cos, sin = np.cos(radians[..., channel] / 2), np.sin(radians[..., channel] / 2)
+        before = quat.copy()
+        quat *= cos[..., None]
+        # Times sin e_i from the right: e_j e_i = -e_k, e_k e_i = e_j.
+        quat[..., i] += before[..., W] * sin
+        quat[..., W] -= before[..., i] * sin
+        quat[..., j] += before[..., k] * sin
+        quat[..., k] -= before[..., j] * sin
+    return quat
+
+
+def from_quat_xyzw(quat_xyzw: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """Radians (frames, joints, channels), continuous over frames, of quaternions (frames, joints, 4).
+
+    With fewer than three axes the angles are those of the nearest rotation the axes can make.
+    """
+    quat = _sign_continuous(quat_xyzw)
+    if len(axes) == 3:
+        return _three_angles(quat, axes)
+    angles = _two_angles(quat, axes) if len(axes) == 2 else _one_angle(quat, axes)
+    return np.unwrap(angles, axis=0)
+
+
+def holds(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: float = 2e-6) -> bool:
+    """Whether turns about `axes` can make these rotations (frames, joints, 4), to `tolerance` radians."""
+    if len(axes) == 3:
+        return True
+    made = to_quat_xyzw(from_quat_xyzw(quat_xyzw, axes), axes)
+    nearest = np.minimum(abs(made - quat_xyzw).max(-1), abs(made + quat_xyzw).max(-1))
+    return bool((2 * nearest <= tolerance).all())
+
+
+def _one_angle(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    parts = [2 * np.arctan2(quat[..., axis], quat[..., W]) for axis in axes]
+    return np.stack(parts, axis=-1) if parts else np.zeros((*quat.shape[:-1], 0))
+
+
+def _two_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """(w, i) and (j, ek) are cos b/2 and sin b/2 times (cos a/2, sin a/2); e is the handedness."""
+    (i, j), k = axes, 3 - sum(axes)
+    q_w, q_i, q_j, q_k = quat[..., W], quat[..., i], quat[..., j], _handedness(i, j) * quat[..., k]
+    first = np.arctan2(2 * (q_w * q_i + q_j * q_k), q_w**2 + q_j**2 - q_i**2 - q_k**2)
+    second = np.arctan2(2 * (q_w * q_j + q_i * q_k), q_w**2 + q_i**2 - q_j**2 - q_k**2)
+    return np.stack([first, second], axis=-1)
+
+
+def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """Half sum and half difference of the outer angles are the arguments of two pairs of quaternion parts.
+
+    For distinct axes i, j, k these are (w + j, i + ek) and (w - j, i - ek), of lengths |cos b/2 +- sin
+    b/2|; for ZXZ and its like (w, i) and (j, ek), of lengths cos b/2 and sin b/2; e is the axes'
+    handedness. Where a length is zero (gimbal lock) only the other pair counts, and the lost angle keeps
+    its last value.
+    """
+    i, j, last = axes
+    proper, k, sign = i == last, 3 - i - j, _handedness(i, j)
+    q_w, q_i, q_j, q_k = quat[..., W], quat[..., i], quat[..., j], sign * quat[..., k]
+    real = (q_w, q_j) if proper else (q_w + q_j, q_w - q_j)
+    imaginary = (q_i, q_k) if proper else (q_i + q_k, q_i - q_k)
+    half_sum, sum_length = _held_angle(imaginary[0], real[0])
+    half_difference, difference_length = _held_angle(imaginary[1], real[1])
+    if proper:
+        middle, turn = 2 * np.arctan2(difference_length, sum_length), 1
+    else:
+        middle, turn = 2 * np.arctan2(sum_length - difference_length, sum_length + difference_length), sign
+    outer = half_sum + half_difference, turn * (half_sum - half_difference)
+    angles = np.stack([outer[0], middle, outer[1]], axis=-1)
+    twin = np.stack([outer[0] + np.pi, (0 if proper else np.pi) - middle, outer[1] + np.pi], axis=-1)
+    return _closest_path(angles, twin)
+
+
+def _held_angle(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Argument and length of a number over frames; where it vanishes the argument keeps its last value."""
+    length = np.hypot(imaginary, real)
+    known = length > _GIMBAL
+    frame = np.arange(len(length)).reshape(-1, *[1] * (length.ndim - 1))
+    latest = np.maximum.accumulate(np.where(known, frame, 0), axis=0)
+    angle = np.where(known, np.arctan2(imaginary, real), 0.0)
+    return np.take_along_axis(angle, latest, axis=0), length
+
+
+def _closest_path(angles: np.ndarray, twin: np.ndarray) -> np.ndarray:
+    """Of two equivalent solutions per frame, the path of least change.
+
+    Twinning twice is no change and keeps distances, so whether to switch does not depend on which is
+    followed.
+    """
+    stay = abs(_wrap(angles[1:] - angles[:-1])).sum(-1)
+    switch = abs(_wrap(twin[1:] - angles[:-1])).sum(-1) < stay - 1e-9
+    first = abs(_wrap(twin[:1])).sum(-1) < abs(_wrap(angles[:1])).sum(-1) - 1e-9
+    on_twin = np.cumsum(np.concatenate([first, switch]), axis=0) % 2 == 1
+    path = np.where(on_twin[..., None], twin, angles)
+    path[0] = _wrap(path[0])
+    return np.unwrap(path, axis=0)
+
+
+def _sign_continuous(quat: np.ndarray) -> np.ndarray:
+    flips = np.cumsum((quat[1:] * quat[:-1]).sum(-1) < 0, axis=0) % 2
+    return np.concatenate([quat[:1], quat[1:] * (1 - 2 * flips)[..., None]])
+
+
+def _wrap(angle: np.ndarray) -> np.ndarray:
+    """The same angle in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _handedness(i: int, j: int) -> int:
+    """1 if the third axis is i x j, else -1."""
+    return 1 if (j - i) % 3 == 1 else -1

@@ -1,0 +1,162 @@
+"""The text of a BVH file to plain arrays and back, in the file's own unit and degrees.
+
+Tolerant on syntax: case of keywords, tabs, CRLF, byte-order marks, braces anywhere, names with spaces or
+colons, missing End Sites, `Frames :`. Strict on data: every value must be there and be a finite number.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+
+from mapctl.errors import FileFormatError
+from mapctl.formats.bvh_hierarchy import (
+    LARGEST_VALUE,
+    NUMBER,
+    Hierarchy,
+    Scanner,
+    finite_number,
+    read_hierarchy,
+)
+from mapctl.formats.frame_rate import LONGEST_FRAME, SHORTEST_FRAME
+from mapctl.formats.reading import read_bytes, shorten
+
+_FRAMES = re.compile(r"\s*+frames[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
+_DATUM = re.compile(r"\S+", re.ASCII)  # a no-break space parts no numbers
+_FRAME_TIME = re.compile(r"\s*+frame[ \t]*+time[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class BvhText:
+    """Everything a BVH file says."""
+
+    hierarchy: Hierarchy
+    """Joints, channels and offsets."""
+    frame_time: str
+    """Seconds of one frame, as printed."""
+    values: np.ndarray
+    """(frames, channels), file unit and degrees."""
+    encoding: str
+    """How names are encoded: utf-8 or latin-1."""
+
+
+def read(path: str | PathLike[str]) -> BvhText:
+    """Read a BVH file. FileFormatError names the line and what was expected there."""
+    text, encoding = _decode(path, read_bytes(path))
+    scanner = Scanner(path, text)
+    hierarchy = read_hierarchy(scanner)
+    frames = _frame_count(scanner)
+    frame_time = _frame_time(scanner)
+    return BvhText(hierarchy, frame_time, _values(scanner, hierarchy.labels(), frames), encoding)
+
+
+def _decode(path: str | PathLike[str], raw: bytes) -> tuple[str, str]:
+    """Text with plain line feeds. Names in an old one-byte encoding are kept by reading them as latin-1."""
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise FileFormatError(path, "is UTF-16 text; save it as UTF-8", line=1)
+    if b"\0" in raw:
+        line = raw.count(b"\n", 0, raw.index(b"\0")) + 1
+        raise FileFormatError(path, "is a binary file, expected BVH text", line)
+    try:
+        text, encoding = raw.decode("utf-8-sig"), "utf-8"
+    except UnicodeDecodeError:
+        text, encoding = raw.decode("latin-1"), "latin-1"
+    return text.replace("\r\n", "\n").replace("\r", "\n"), encoding
+
+
+def _frame_count(scanner: Scanner) -> int:
+    word = scanner.match(_FRAMES, "'Frames: COUNT'")
+    if not re.fullmatch(r"[+-]?[0-9]{1,12}", word) or int(word) < 1:
+        scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
+    return int(word)
+
+
+def _frame_time(scanner: Scanner) -> str:
+    word = scanner.match(_FRAME_TIME, "'Frame Time: SECONDS'")
+    seconds = finite_number(word)
+    if seconds is None or len(word) > 60 or not SHORTEST_FRAME <= seconds <= LONGEST_FRAME:
+        allowed = f"between {SHORTEST_FRAME:g} and {LONGEST_FRAME:g} s"
+        scanner.fail(f"expected a frame time {allowed}, got {shorten(word)}")
+    return word
+
+
+def _values(scanner: Scanner, labels: Sequence[str], frames: int) -> np.ndarray:
+    """The motion block as (frames, channels). Parsed in one go; only a fault is looked for by row."""
+    expected = frames * len(labels)
+    if expected == 0:
+        scanner.fail("no joint has any CHANNELS, expected at least one")
+    # Rows may be wrapped where the total is right. Counted first, so a declared number allocates nothing.
+    if sum(len(row.split()) for _, row in _rows(scanner)) == expected:
+        try:
+            values = np.fromstring(scanner.text[scanner.stop :], sep=" ")
+        except ValueError:
+            values = np.empty(0)
+        # `1.5.2` parses as two values, so their number is checked too; NaN compares as not small.
+        if values.size == expected and bool((np.abs(values) < LARGEST_VALUE).all()):
+            return values.reshape(frames, len(labels))
+    raise _fault(scanner, labels, frames)
+
+
+def _rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
+    """Line number and text of every row that is not blank."""
+    text, start, line = scanner.text, scanner.stop, scanner.line_of(scanner.stop)
+    while start < len(text):
+        stop = text.find("\n", start)
+        stop = len(text) if stop < 0 else stop
+        row = text[start:stop]
+        if row and not row.isspace():
+            yield line, row
+        start, line = stop + 1, line + 1
+
+
+def _fault(scanner: Scanner, labels: Sequence[str], frames: int) -> FileFormatError:
+    """What is wrong with the motion block: its first bad value, else its first bad row, else their number."""
+    found, bad_row = 0, None
+    for line, row in _rows(scanner):
+        words = _DATUM.findall(row)
+        for column, word in enumerate(words):
+            if finite_number(word) is None:
+                label = labels[column] if column < len(labels) else "beyond the last channel"
+                place = f"frame {found}, column {column + 1} ({label})"
+                message = f"{place}: expected {NUMBER}, got {shorten(word)}"
+                return FileFormatError(scanner.path, message, line)
+        if len(words) != len(labels) and bad_row is None:
+            message = f"frame {found} has {len(words)} values, expected {len(labels)}"
+            bad_row = FileFormatError(scanner.path, message, line)
+        found += 1
+    count = FileFormatError(scanner.path, f"'Frames: {frames}' but {found} rows follow", scanner.line)
+    return bad_row or count
+
+
+def compose(hierarchy: Hierarchy, frame_time: str, values: np.ndarray, *, decimals: int) -> str:
+    """The text of a BVH file; `values` (frames, channels) get `decimals` digits after the point."""
+    row = " ".join([f"%.{decimals}f"] * values.shape[1])
+    # Adding zero turns -0.0 into 0.0.
+    rows = [row % tuple(frame) for frame in (np.round(values, decimals) + 0.0).tolist()]
+    head = ["HIERARCHY", *_hierarchy_lines(hierarchy, decimals)]
+    return "\n".join([*head, "MOTION", f"Frames: {len(rows)}", f"Frame Time: {frame_time}", *rows, ""])
+
+
+def _hierarchy_lines(hierarchy: Hierarchy, decimals: int) -> Iterator[str]:
+    open_joints: list[int] = []
+    for joint, parent in enumerate(hierarchy.parents):
+        while open_joints and open_joints[-1] != parent:
+            open_joints.pop()
+            yield "\t" * len(open_joints) + "}"
+        tab, channels = "\t" * len(open_joints), hierarchy.channels[joint]
+        yield f"{tab}{'JOINT' if open_joints else 'ROOT'} {hierarchy.names[joint]}"
+        yield f"{tab}{{"
+        yield f"{tab}\t{_offset_line(hierarchy.offsets[joint], decimals)}"
+        yield f"{tab}\t{' '.join(['CHANNELS', str(len(channels)), *channels])}"
+        if joint in hierarchy.end_offsets:
+            end = _offset_line(hierarchy.end_offsets[joint], decimals)
+            yield from (f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\t{end}", f"{tab}\t}}")
+        open_joints.append(joint)
+    for depth in reversed(range(len(open_joints))):
+        yield "\t" * depth + "}"
+
+
+def _offset_line(offset: Sequence[float], decimals: int) -> str:
+    return " ".join(["OFFSET", *(f"{round(value, decimals) + 0.0:.{decimals}f}" for value in offset)])

@@ -1,0 +1,160 @@
+"""Motions as numpy archives: the exact numbers, for use without this library.
+
+Keys (frames T, joints J, travelling joints M, joints with an End Site E; lengths in metres, Y up):
+
+- `format`: the text `mapctl-motion-1`
+- `names` (J,) text; `parents` (J,) whole numbers, -1 for the root
+- `offsets` (J, 3): each joint in its parent's frame at rest
+- `end_names` (E,) text and `end_offsets` (E, 3): End Sites
+- `fps` (2,) whole numbers: numerator and denominator of the frames per second
+- `root_position_world` (T, 3); `local_quat_xyzw` (T, J, 4): each joint's rotation in its parent's frame
+- `moving_joints` (M,) whole numbers and `moving_offsets` (M, T, 3): joints whose offset is animated
+
+What another format needs to write a file back as it came (`Motion.source`) is not kept.
+"""
+
+import io
+import lzma
+import zipfile
+import zlib
+from fractions import Fraction
+from os import PathLike
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.formats.atomic import write_bytes
+from mapctl.formats.reading import MAX_FILE_BYTES, read_bytes
+from mapctl.motion import Motion
+from mapctl.skeleton import Skeleton
+
+FORMAT = "mapctl-motion-1"
+"""Name and version of the set of keys."""
+
+# Key: kind of number (numpy's letters) and shape, by the letters of the module's docstring.
+_KEYS = {
+    "format": ("U", ""), "names": ("U", "J"), "parents": ("i", "J"), "offsets": ("f", "J3"),
+    "end_names": ("U", "E"), "end_offsets": ("f", "E3"), "fps": ("i", "2"),
+    "root_position_world": ("f", "T3"), "local_quat_xyzw": ("f", "TJ4"),
+    "moving_joints": ("i", "M"), "moving_offsets": ("f", "MT3"),
+}  # fmt: skip
+
+
+_UNSOUND = (
+    zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, lzma.LZMAError, ValueError, EOFError, OSError,
+    MemoryError, NotImplementedError, RuntimeError, SyntaxError, TypeError, OverflowError,
+)  # fmt: skip
+"""What zipfile and numpy raise on archives that are cut, encrypted, forged or hold pickled objects."""
+
+
+def load(path: str | PathLike[str]) -> Motion:
+    """Read what `save` wrote. FileFormatError names the key that is missing or wrong."""
+    arrays = _read_arrays(path, read_bytes(path))
+    _check_shapes(path, arrays)
+    if (found := str(arrays["format"])) != FORMAT:
+        raise FileFormatError(path, f"format is {found[:40]!r}, expected {FORMAT!r}")
+    _check_rotations(path, arrays["local_quat_xyzw"])
+    try:
+        return _motion(arrays)
+    except (MapctlError, ZeroDivisionError, ValueError, IndexError) as error:
+        raise FileFormatError(path, f"does not hold a motion: {error}") from error
+
+
+def save(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write the motion under the keys above. Same motion, same bytes. RequestError where it holds a NaN."""
+    arrays = _arrays(motion)
+    for key, values in arrays.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise RequestError(f"cannot write {path}: {key} is not finite")
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def _arrays(motion: Motion) -> dict[str, np.ndarray]:
+    skeleton, moving = motion.skeleton, sorted(motion.moving_offsets)
+    tracks = np.array([_numbers(motion.moving_offsets[joint]) for joint in moving])
+    return {
+        "format": np.array(FORMAT),
+        "names": np.array(skeleton.names),
+        "parents": np.array(skeleton.parents, dtype=np.int64),
+        "offsets": _numbers(skeleton.offsets),
+        "end_names": np.array(list(skeleton.end_offsets), dtype=np.str_),
+        "end_offsets": np.array(list(skeleton.end_offsets.values()), dtype=np.float64).reshape(-1, 3),
+        "fps": np.array([motion.fps.numerator, motion.fps.denominator], dtype=np.int64),
+        "root_position_world": _numbers(motion.root_position),
+        "local_quat_xyzw": _numbers(motion.local_quat_xyzw),
+        "moving_joints": np.array(moving, dtype=np.int64),
+        "moving_offsets": tracks.reshape(len(moving), motion.num_frames, 3),
+    }
+
+
+def _motion(arrays: dict[str, np.ndarray]) -> Motion:
+    names, parents = arrays["names"].tolist(), arrays["parents"].tolist()
+    end_names, moving = arrays["end_names"].tolist(), arrays["moving_joints"].tolist()
+    if not set(end_names) <= set(names) or not set(moving) <= set(range(1, len(names))):
+        raise MapctlError("end_names and moving_joints must be joints of the skeleton")
+    ends = {
+        name: (x, y, z) for name, (x, y, z) in zip(end_names, arrays["end_offsets"].tolist(), strict=True)
+    }
+    tracks = zip(moving, arrays["moving_offsets"], strict=True)
+    return Motion(
+        skeleton=Skeleton(tuple(names), tuple(parents), _tensor(arrays["offsets"]), ends),
+        fps=Fraction(*arrays["fps"].tolist()),
+        root_position=_tensor(arrays["root_position_world"]),
+        local_quat_xyzw=_tensor(arrays["local_quat_xyzw"]),
+        moving_offsets={joint: _tensor(track) for joint, track in tracks},
+    )
+
+
+def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
+    """The known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            _check_members(path, archive)
+            return {key: _read_array(archive, key) for key in _KEYS}
+    except _UNSOUND as error:
+        raise FileFormatError(path, f"is not a sound .npz archive: {error}") from error
+
+
+def _read_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
+    return np.lib.format.read_array(io.BytesIO(archive.read(f"{key}.npy")), allow_pickle=False)
+
+
+def _check_members(path: str | PathLike[str], archive: zipfile.ZipFile) -> None:
+    sizes = {member.filename: member.file_size for member in archive.infolist()}
+    if missing := [key for key in _KEYS if f"{key}.npy" not in sizes]:
+        raise FileFormatError(path, f"lacks the keys {', '.join(missing)}")
+    if (total := sum(sizes[f"{key}.npy"] for key in _KEYS)) > MAX_FILE_BYTES:
+        raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
+
+
+def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> None:
+    sizes = {"2": 2, "3": 3, "4": 4}
+    sizes |= {"J": arrays["names"].size, "E": arrays["end_names"].size, "M": arrays["moving_joints"].size}
+    sizes["T"] = len(np.atleast_1d(arrays["root_position_world"]))
+    for key, (kind, letters) in _KEYS.items():
+        values, wanted = arrays[key], tuple(sizes[letter] for letter in letters)
+        if values.dtype.kind != kind or values.shape != wanted:
+            found = f"{values.dtype} and shape {values.shape}"
+            raise FileFormatError(path, f"{key} has {found}, expected kind {kind!r} and shape {wanted}")
+        if kind == "f" and not np.isfinite(values).all():
+            place = np.argwhere(~np.isfinite(values))[0].tolist()
+            raise FileFormatError(path, f"{key} is not finite at {place}")
+
+
+def _check_rotations(path: str | PathLike[str], quat_xyzw: np.ndarray) -> None:
+    bad = np.abs(np.linalg.norm(quat_xyzw, axis=-1) - 1) > 1e-3
+    if bad.any():
+        frame, joint = np.argwhere(bad)[0].tolist()
+        raise FileFormatError(path, f"local_quat_xyzw of frame {frame}, joint {joint} is no unit quaternion")
+
+
+def _numbers(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
