@@ -161,9 +161,28 @@ class Curve:
             step = min(_SEARCH_STEP, reach / 4)
             guess = self._closest_of(points, _tensor(around).double().expand(points.shape[:-1]), reach, step)
             guess = self._closest_of(points, guess, step, step / _REFINEMENT)
-            direction = self._tables[2][self._segment(guess)[1]]
-        along = ((points - self._at(guess)) * direction).sum(-1)
-        return (guess + along.clamp(-step / _REFINEMENT, step / _REFINEMENT)).to(points.dtype)
+            within, segment = self._segment(guess)
+        segments = segment.unsqueeze(-1) + torch.tensor([-1, 0, 1])
+        return (guess + self._project(points, segments, within)).to(points.dtype)
+
+    def _project(
+        self, points: Tensor, segments: Int[Tensor, "*batch tried"], within: Tensor | float
+    ) -> Tensor:
+        """Metres from the arc `within` to the nearest place on the best of each point's segments."""
+        knots, corners, directions = self._tables
+        last = len(directions) - 1
+        segments = segments % (last + 1) if self.closed else segments.clamp(0, last)
+        along = ((points.unsqueeze(-2) - corners[segments]) * directions[segments]).sum(-1)
+        stop = knots[segments + 1] - knots[segments]
+        if self.closed:
+            along = along.clamp_min(0).minimum(stop)
+        else:  # the pieces beyond the ends have no end
+            along = torch.where(segments == 0, along, along.clamp_min(0))
+            along = torch.where(segments == last, along, along.minimum(stop))
+        apart = corners[segments] + along.unsqueeze(-1) * directions[segments] - points.unsqueeze(-2)
+        best = apart.detach().square().sum(-1).argmin(-1, keepdim=True)
+        step = (knots[segments] + along).gather(-1, best).squeeze(-1) - within
+        return torch.remainder(step + self.length / 2, self.length) - self.length / 2 if self.closed else step
 
     def _closest_of(self, points: Tensor, around: Tensor, reach: float, step: float) -> Tensor:
         """The closest to each point of the arcs `around` - reach ... + reach, `step` apart."""
@@ -181,12 +200,9 @@ class Curve:
         vertices = self._tree.query(points.detach().double().numpy(), k=min(_NEIGHBOURS, count))[1]
         vertices = torch.as_tensor(vertices, dtype=torch.long)
         segments = torch.cat([vertices - 1, vertices], dim=-1).clamp(0, count - 2)
-        knots, corners, directions = (table[0 if self.closed else 1 :] for table in self._tables)
-        along = ((points.unsqueeze(-2) - corners[segments]) * directions[segments]).sum(-1)
-        along = along.clamp_min(0).minimum(knots[segments + 1] - knots[segments])
-        feet = corners[segments] + along.unsqueeze(-1) * directions[segments]
-        best = (feet - points.unsqueeze(-2)).detach().square().sum(-1).argmin(-1, keepdim=True)
-        return (knots[segments] + along).gather(-1, best).squeeze(-1).to(points.dtype)
+        arc = self._project(points, segments if self.closed else segments + 1, 0.0)
+        arc = torch.remainder(arc, self.length) if self.closed else arc
+        return arc.to(points.dtype)
 
     def signed_offset(self, points_world: Float[Tensor, "*batch axes"], arc: Arc) -> Float[Tensor, "*batch"]:
         """Metres from the curve's place at `arc` to each point, sideways on the ground; left is positive."""

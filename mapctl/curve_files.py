@@ -1,6 +1,7 @@
 """Curves in files: CSV tables of metres and SVG drawings, read as plain points."""
 
 import math
+import warnings
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -145,9 +146,9 @@ def _drawn_paths(path: str | PathLike[str]) -> list:
             # A drawing without its xmlns is common and plain enough.
             if not element.tag.startswith("{"):
                 element.tag = "{http://www.w3.org/2000/svg}" + element.tag
-        return document.paths(path_conversions=CONVERT_ONLY_PATHS) or document.paths(
-            path_conversions=CONVERSIONS
-        )
+        with warnings.catch_warnings(action="ignore"):
+            paths = document.paths(path_conversions=CONVERT_ONLY_PATHS)
+            return paths or document.paths(path_conversions=CONVERSIONS)
     except Exception as error:  # the parsers raise whatever a malformed drawing leads them to
         reason = " ".join(str(error).split())[:80] or type(error).__name__
         raise FileFormatError(path, f"cannot be read as an SVG drawing ({reason})") from error
@@ -162,7 +163,8 @@ def _sampled(path: str | PathLike[str], segment, metres_per_unit: float) -> ndar
         return np.stack([np.real(at), np.imag(at)], axis=1) * metres_per_unit
 
     rough = places(1 if type(segment) is Line else 64)
-    length = np.linalg.norm(np.diff(rough, axis=0), axis=1).sum()
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(np.diff(rough, axis=0), axis=1).sum()
     if not (math.isfinite(length) and length <= MAX_LENGTH):
         raise FileFormatError(path, f"a path is {length:.3g} m long, allowed are {MAX_LENGTH:g}")
     wanted = min(math.ceil(length / 0.005), 100_000)

@@ -65,7 +65,7 @@ def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -
     text = os.fspath(source)
     if metres_per_unit is not None and not 1e-9 <= metres_per_unit <= 1e9:
         raise RequestError(f"metres per unit must be a positive number, got {metres_per_unit:g}")
-    if Path(text).suffix.lower() in _FILE_ENDINGS or (":" not in text and Path(text).exists()):
+    if Path(text).suffix.lower() in _FILE_ENDINGS or (text and ":" not in text and Path(text).exists()):
         return _read_file(text, metres_per_unit)
     if metres_per_unit is not None:
         raise RequestError(f"metres per unit is for files; the curve {text!r} is in metres")

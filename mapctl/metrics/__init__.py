@@ -26,7 +26,7 @@ def measure(
 
     Always: skate_cm_s, skate_ratio, contact_speed_cm_s, planted_share, penetration_cm, float_cm, jitter_m_s3,
     speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm, and sway_cm: from the straight
-    line between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, the same as
+    line between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, likewise
     path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s) wanted_m and progress_ratio too.
     `joint` names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or
     feet cannot be told, unknown joints and motions of one frame.

@@ -1,0 +1,402 @@
+"""Curves: geometry against closed forms, search against brute force, and files good and bad."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapctl import curves
+from mapctl.errors import FileFormatError, MapctlError, RequestError
+
+ARCS = torch.linspace(0, 30, 301, dtype=torch.float64)
+
+
+def brute_force(points, polyline):
+    """Distance and arc of the nearest place on a polyline, over all of its pieces (numpy)."""
+    start, along = polyline[:-1], np.diff(polyline, axis=0)
+    length = np.linalg.norm(along, axis=1)
+    share = np.clip(((points[:, None] - start) * along).sum(-1) / length**2, 0, 1)
+    distance = np.linalg.norm(points[:, None] - start - share[..., None] * along, axis=-1)
+    best, row = distance.argmin(1), np.arange(len(points))
+    return distance[row, best], (np.cumsum(length) - length)[best] + share[row, best] * length[best]
+
+
+def write(folder, name, text):
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.3, 4.0, 250.0])
+def test_circle_is_round_turns_left_and_wraps(radius):
+    curve = curves.circle(radius=radius)
+    angle = ARCS / radius
+    expected = radius * torch.stack([1 - torch.cos(angle), torch.sin(angle)], dim=-1)
+    assert curve.closed
+    assert curve.length == pytest.approx(2 * math.pi * radius, rel=1e-4)
+    laps = ARCS * (curve.length / (2 * math.pi * radius))
+    torch.testing.assert_close(curve.point(laps), expected, rtol=0, atol=1e-4 * radius + 1e-5)
+    torch.testing.assert_close(
+        curve.tangent(laps), torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1), rtol=0, atol=0.02
+    )
+    torch.testing.assert_close(curve.curvature(ARCS), torch.full_like(ARCS, 1 / radius), rtol=0.02, atol=1e-3)
+    assert curve.start_heading == pytest.approx(0, abs=0.02)
+
+
+def test_figure8_is_a_left_then_a_right_circle_that_touch_at_the_start():
+    curve = curves.figure8(radius=2.0)
+    lap = 4 * math.pi
+    for arc in (0.0, lap, 2 * lap):
+        torch.testing.assert_close(curve.point(arc), torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-3)
+        assert curve.tangent(arc)[1] > 0.999
+    assert float(curve.curvature(lap / 2)) == pytest.approx(0.5, rel=0.01)
+    assert float(curve.curvature(1.5 * lap)) == pytest.approx(-0.5, rel=0.01)
+    assert curve.points[:, 0].max() == pytest.approx(4, abs=1e-4)
+    assert curve.points[:, 0].min() == pytest.approx(-4, abs=1e-4)
+
+
+def test_s_line_and_wave_have_the_asked_sizes():
+    s, line, wave = curves.s(length=6.0), curves.line(length=10.0), curves.wave(amplitude=1.5, length=8.0)
+    assert float((s.points[-1] - s.points[0]).norm()) == pytest.approx(6.0, abs=1e-9)
+    assert s.length == pytest.approx(3 * math.pi, rel=1e-4)
+    assert float(s.curvature(1.0)) > 0.5
+    assert float(s.curvature(s.length - 1.0)) < -0.5
+    assert line.points[-1].tolist() == [0.0, 10.0]
+    assert line.length == pytest.approx(10.0)
+    assert wave.points[-1].tolist() == pytest.approx([0.0, 8.0])
+    assert float(wave.points[:, 0].max()) == pytest.approx(1.5, abs=1e-5)
+    assert wave.start_heading == pytest.approx(math.atan2(1.5 * 2 * math.pi / 8, 1), abs=0.02)
+    assert not any(curve.closed for curve in (s, line, wave))
+
+
+def test_left_is_plus_x_when_facing_plus_z():
+    line = curves.line(length=2.0)
+    places = torch.tensor([[0.3, 0.9, 1.0], [-0.2, 0.0, 1.0]], dtype=torch.float64)
+    arcs = line.nearest(places)
+    torch.testing.assert_close(arcs, torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(
+        line.signed_offset(places, arcs), torch.tensor([0.3, -0.2], dtype=torch.float64)
+    )
+    inside = torch.tensor([[3.0, 1.0]], dtype=torch.float64)  # of a circle that turns left
+    circle = curves.circle(radius=4.0)
+    assert float(circle.signed_offset(inside, circle.nearest(inside))) > 0
+
+
+def test_an_open_curve_goes_on_straight():
+    curve = curves.s(length=4.0)
+    for end, sign in ((0.0, -1.0), (curve.length, 1.0)):
+        beyond = torch.stack([curve.point(end + sign * far) for far in (0.5, 2.0, 50.0)])
+        steps = beyond.diff(dim=0)
+        torch.testing.assert_close(steps[0] / 1.5, steps[1] / 48, rtol=0, atol=1e-9)
+        # The S starts and ends along +Z; the last chord of 5 cm deviates by 5 / (2 * 100) rad.
+        torch.testing.assert_close(steps[0] / 1.5, torch.tensor([0.0, sign]).double(), rtol=0, atol=0.03)
+    assert float(curve.nearest(curve.point(-0.3), around=-0.1, reach=0.5)) == pytest.approx(-0.3, abs=1e-6)
+    assert float(curve.nearest(curve.point(-0.3))) == 0.0
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([2, 3]), st.integers(2, 12))
+def test_any_drawing_keeps_its_points_its_length_and_its_nearest_places(seed, dims, count):
+    rng = np.random.default_rng(seed)
+    drawn = rng.normal(size=(count, dims)) * 2
+    curve = curves.from_points(drawn, closed=False)
+    assert curve.length == pytest.approx(np.linalg.norm(np.diff(drawn, axis=0), axis=1).sum(), rel=1e-9)
+    assert curve.points.diff(dim=0).norm(dim=-1).max() <= 0.010001
+    for point in drawn:
+        assert np.linalg.norm(curve.points.numpy() - point, axis=1).min() < 1e-9
+    places = rng.normal(size=(30, dims)) * 3
+    distance, arc = brute_force(places, drawn)
+    found = curve.nearest(torch.tensor(places))
+    gap = (curve.point(found) - torch.tensor(places)).norm(dim=-1).numpy()
+    np.testing.assert_allclose(gap, distance, atol=2e-5)
+    local = curve.nearest(torch.tensor(places), around=torch.tensor(arc) + 0.1, reach=0.3)
+    gap = (curve.point(local) - torch.tensor(places)).norm(dim=-1).numpy()
+    inside = (arc > 0.5) & (arc < curve.length - 0.5)  # else the search meets the straight extension
+    np.testing.assert_allclose(gap[inside], distance[inside], atol=1e-4)
+    assert (gap <= distance + 1e-4).all()
+
+
+def test_a_dense_drawing_keeps_its_corners_and_its_length():
+    side = np.linspace(0, 1, 4001)[:, None]
+    corner = np.concatenate([side * [1.0, 0.0], [1.0, 0.0] + side[1:] * [0.0, 1.0]])
+    curve = curves.from_points(corner)
+    assert (curve.points - torch.tensor([1.0, 0.0])).norm(dim=-1).min() < 1e-9
+    assert curve.length == pytest.approx(2.0, abs=1e-9)
+    assert len(curve.points) < 500
+
+
+def test_tangents_outlast_the_jitter_of_a_drawing():
+    rng = np.random.default_rng(3)
+    z = np.arange(0, 3, 0.002)
+    curve = curves.from_points(np.stack([rng.normal(size=len(z)) * 0.001, z], axis=1))
+    assert curve.tangent(torch.linspace(0, 2.9, 200))[:, 1].min() > 0.97
+
+
+def test_a_local_search_stays_on_its_branch_where_a_curve_crosses_itself():
+    t = np.linspace(0, 2 * math.pi, 2000)
+    bow = curves.from_points(np.stack([np.sin(2 * t), 2 * np.sin(t)], axis=1))
+    arcs = torch.linspace(0, 2 * bow.length, 700, dtype=torch.float64)
+    torch.testing.assert_close(bow.track(bow.point(arcs)), arcs, rtol=0, atol=1e-4)
+    off_to_a_side = bow.point(arcs) + 0.05 * bow.left(arcs)
+    found = bow.nearest(off_to_a_side, around=arcs + 0.1, reach=0.3)
+    torch.testing.assert_close(
+        bow.signed_offset(off_to_a_side, found), torch.full_like(arcs, 0.05), rtol=0, atol=1e-3
+    )
+
+
+def test_a_walk_that_starts_elsewhere_is_tracked_from_there():
+    curve = curves.circle(radius=3.0)
+    arcs = torch.linspace(8, 12, 100, dtype=torch.float64)
+    torch.testing.assert_close(curve.track(curve.point(arcs)), arcs, rtol=0, atol=1e-6)
+
+
+def test_gradients_of_places_and_of_searches():
+    curve = curves.wave(amplitude=1.0, length=6.0)
+    arcs = torch.tensor([-0.5, 1.2345, 3.3, 40.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(curve.point, arcs)
+    assert torch.autograd.gradcheck(curve.tangent, arcs)
+    places = (curve.point(arcs) + torch.tensor([0.1, -0.03])).detach().requires_grad_()
+
+    def offset(at):
+        return curve.signed_offset(at, curve.nearest(at, around=arcs.detach()))
+
+    numeric = torch.autograd.functional.jacobian(offset, places).sum(1)
+    # The sideways offset grows by one to the left whatever the search does.
+    torch.testing.assert_close(
+        (numeric * curve.left(curve.nearest(places, around=arcs))).sum(-1),
+        torch.ones(4).double(),
+        rtol=0,
+        atol=0.02,
+    )
+
+
+def test_shapes_of_batches_and_dtypes():
+    curve = curves.circle(radius=1.0)
+    arcs = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(0))
+    assert curve.point(arcs).shape == curve.tangent(arcs).shape == curve.left(arcs).shape == (2, 3, 5, 2)
+    assert curve.point(arcs).dtype == torch.float32
+    assert curve.curvature(arcs).shape == (2, 3, 5)
+    places = torch.zeros(2, 3, 5, 3)
+    assert curve.nearest(places).shape == curve.nearest(places, around=arcs).shape == (2, 3, 5)
+    assert curve.signed_offset(places, arcs).shape == (2, 3, 5)
+    assert curve.point(0.5).shape == (2,)
+
+
+def test_a_curve_in_space_is_followed_in_space():
+    curve = curves.from_points(np.array([[0.0, 0.0, 0.0], [0.0, 3.0, 4.0]]))
+    assert curve.dims == 3
+    torch.testing.assert_close(curve.point(2.5), torch.tensor([0.0, 1.5, 2.0], dtype=torch.float64))
+    beside = torch.tensor([[0.2, 1.5, 2.0]], dtype=torch.float64)
+    assert float(curve.nearest(beside)) == pytest.approx(2.5)
+    assert float(curve.signed_offset(beside, 2.5)) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("points", "closed"),
+    [
+        ([[0, 0], [1, 0], [1, 1], [0, 0.0005]], True),  # within 1 mm
+        ([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0.4]], True),  # within half the spacing
+        ([[0, 0], [1, 0], [1, 1], [0, 1]], False),
+        ([[0, 0], [0.4, 0]], False),
+    ],
+)
+def test_a_curve_is_closed_where_its_ends_meet(points, closed):
+    curve = curves.from_points(np.array(points))
+    assert curve.closed is closed
+    assert torch.equal(curve.points[0], curve.points[-1]) is closed
+    assert not curves.from_points(np.array(points), closed=False).closed
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((0, 2)),
+        np.zeros((1, 2)),
+        np.zeros((5, 2)),
+        np.zeros((5, 4)),
+        np.zeros(6),
+        [[0, 0], [0, math.nan]],
+        [[0, 0], [0, math.inf]],
+        [[0, 0], [0, 0.001]],
+        [[0, 0], [0, 9e4], [9e4, 0]],
+    ],
+)
+def test_points_that_make_no_curve_are_refused(points):
+    with pytest.raises(RequestError):
+        curves.from_points(np.array(points, dtype=float))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "circle:0",
+        "circle:-1",
+        "circle:nan",
+        "circle:inf",
+        "circle:1e9",
+        "circle:",
+        "circle",
+        "circle:4x2",
+        "circle:four",
+        "wave:1",
+        "wave:0x8",
+        "line:1,5",
+        "spiral:3",
+        "",
+        "s:",
+        "nothing-here",
+        "x:y",
+    ],
+)
+def test_shapes_that_cannot_be_are_refused_in_one_line(text):
+    with pytest.raises(RequestError) as error:
+        curves.read(text)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_shape_lists_the_known_ones():
+    with pytest.raises(RequestError, match="circle:4, figure8:2, s:6, line:10, wave:1x8"):
+        curves.read("spiral:3")
+
+
+def test_shapes_are_read_as_typed():
+    assert torch.equal(curves.read("wave:1x8").points, curves.wave(amplitude=1.0, length=8.0).points)
+    assert torch.equal(curves.read("Figure8:2.5").points, curves.figure8(radius=2.5).points)
+    with pytest.raises(RequestError):
+        curves.read("circle:4", metres_per_unit=0.01)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,z\n0,0\n1,2\n3,1\n",
+        "0,0\n1,2\n3,1",
+        "\ufeffX;Z\r\n0;0\r\n1,0;2,0\r\n3;1\r\n",
+        "z\tx\n0\t0\n2\t1\n1\t3\n",
+        "# drawn by hand\n\nx, z\n 0, 0\n1e0 ,2.  # here\n\n3,1\n",
+        "0 0\n1   2\n3 1\n",
+        '"x","z"\n"0","0"\n1,2\n3,1\n',
+    ],
+)
+def test_csv_tables_are_read(tmp_path, text):
+    curve = curves.read(write(tmp_path, "drawn.csv", text))
+    expected = curves.from_points(np.array([[0.0, 0.0], [1.0, 2.0], [3.0, 1.0]]))
+    torch.testing.assert_close(curve.points, expected.points)
+
+
+def test_csv_in_space_and_in_other_units(tmp_path):
+    path = write(tmp_path, "reach.csv", "x,y,z\n0,100,0\n50,120,30\n")
+    curve = curves.read(path, metres_per_unit=0.01)
+    torch.testing.assert_close(curve.points[-1], torch.tensor([0.5, 1.2, 0.3], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("x,z\n0,0\n1,nan\n", 3),
+        ("x,z\n0,0\ninf,1\n", 3),
+        ("0,0\n1\n", 2),
+        ("0,0\n1,2,3\n", 2),
+        ("x,y\n0,0\n1,1\n", 1),
+        ("x,z\n0,0\n\n1,two\n", 4),
+        ("1\n2\n", 1),
+        ("x,z\n0,0\n1e300,1\n", 3),
+        ("a,b,c\n", 1),
+        ("t,x,z,q\n", 1),
+        ("0,0\n1,\n", 2),
+    ],
+)
+def test_a_bad_csv_line_is_named(tmp_path, text, line):
+    path = write(tmp_path, "bad.csv", text)
+    with pytest.raises(FileFormatError) as error:
+        curves.read(path)
+    assert error.value.line == line
+    assert str(error.value).startswith(f"{path}, line {line}: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.csv", ""),
+        ("a.csv", "\n\n"),
+        ("a.csv", "x,z\n"),
+        ("a.csv", "x,z\n1,1\n1,1\n"),
+        ("a.csv", b"\x00\xff\x93"),
+        ("a.csv", b"\xff\xfe0\x00,\x00"),
+        ("a.svg", ""),
+        ("a.svg", "<svg"),
+        ("a.svg", b"\x89PNG\x00\x01"),
+        ("a.svg", "<svg></svg>"),
+        ("a.svg", "<svg><path d='M0,0 L'/></svg>"),
+        ("a.svg", "<svg><path d='M 0 0'/></svg>"),
+        ("a.svg", "<svg><path d='M0,0 L5,5 Q nonsense'/></svg>"),
+        ("a.svg", "<svg><path d='M0,0 L1e300,0'/></svg>"),
+        ("a.svg", "<svg><path d='M0,0 L9,0'/><path d='M500,0 L600,0'/></svg>"),
+        ("a.svg", "<svg><path/></svg>"),
+        ("a.svg", "<svg><path d='M0,0 Lnan,9'/></svg>"),
+        ("a.svg", "<svg><circle cx='0' cy='0' r='0'/></svg>"),
+        ("a.svg", "<svg>" + "<g>" * 3000 + "</g>" * 3000 + "</svg>"),
+    ],
+)
+def test_files_that_hold_no_curve_are_refused_in_one_line(tmp_path, name, content):
+    path = write(tmp_path, name, content)
+    with pytest.raises(FileFormatError) as error:
+        curves.read(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["missing.csv", "missing.svg", "."])
+def test_places_without_a_file_are_refused(tmp_path, name):
+    with pytest.raises(FileFormatError):
+        curves.read(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("drawing", "length", "closed"),
+    [
+        ("<path d='M100,0 L100,300 L500,300'/>", 7.0, False),
+        ("<path d='M0,0 h100 v100 h-100 z'/>", 4.0, True),
+        ("<circle cx='50' cy='50' r='100'/>", 2 * math.pi, True),
+        ("<path d='M-100,0 A100,100 0 0 1 100,0'/>", math.pi, False),
+        ("<g transform='scale(2)'><path d='M0,0 L100,0' transform='translate(7,9)'/></g>", 2.0, False),
+        ("<polyline points='0,0 100,0 100,100'/>", 2.0, False),
+        ("<path d='M0,0 L100,0'/><path d='M100,0 L100,100'/>", 2.0, False),
+        ("<rect x='0' y='0' width='900' height='900'/><path d='M0,0 L100,0'/>", 1.0, False),
+    ],
+)
+@pytest.mark.parametrize("xmlns", ["", " xmlns='http://www.w3.org/2000/svg'"])
+def test_svg_drawings_are_read(tmp_path, drawing, length, closed, xmlns):
+    curve = curves.read(write(tmp_path, "drawn.svg", f"<svg{xmlns}>{drawing}</svg>"))
+    assert curve.length == pytest.approx(length, rel=1e-4)
+    assert curve.closed is closed
+
+
+def test_an_svg_page_is_the_ground_seen_from_above(tmp_path):
+    path = write(tmp_path, "drawn.svg", "<svg><path d='M10,20 C 10,60 50,60 50,120'/></svg>")
+    curve = curves.read(path, metres_per_unit=0.1)
+    torch.testing.assert_close(
+        curve.points[[0, -1]], torch.tensor([[1.0, 2.0], [5.0, 12.0]], dtype=torch.float64)
+    )
+    t = 0.3  # Bernstein form of the drawn Bezier curve
+    weights = np.array([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
+    on_it = torch.tensor(weights @ np.array([[1, 2], [1, 6], [5, 6], [5, 12]]), dtype=torch.float64)
+    assert float((curve.point(curve.nearest(on_it)) - on_it).norm()) < 1e-4
+    assert curve.start_heading == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
+def test_scales_that_cannot_be_are_refused(tmp_path, scale):
+    path = write(tmp_path, "drawn.svg", "<svg><path d='M0,0 L100,0'/></svg>")
+    with pytest.raises(MapctlError):
+        curves.read(path, metres_per_unit=scale)
+
+
+def test_a_very_long_curve_is_coarser_rather_than_larger():
+    curve = curves.from_points(np.array([[0.0, 0.0], [0.0, 60_000.0]]))
+    assert len(curve.points) <= 1_000_002
+    assert curve.length == pytest.approx(60_000)
+    assert float(curve.point(59_999.5)[1]) == pytest.approx(59_999.5)
