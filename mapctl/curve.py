@@ -20,7 +20,7 @@ Arc = Float[Tensor, "*batch"] | float
 _NEIGHBOURS = (
     16  # vertices looked at around a point: enough to hold an end of the nearest segment (1 cm apart)
 )
-_SEARCH_STEP = 0.01  # metres between the arcs that a local search tries first
+_SEARCH_STEP = 0.04  # metres between the arcs that a local search tries first
 _REFINEMENT = 10  # a local search's second grid is this much finer
 _RUN_ON = 1.0  # metres of straight extension in the tables; beyond them the line goes on all the same
 

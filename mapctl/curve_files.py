@@ -13,8 +13,10 @@ from mapctl.curve_points import MAX_LENGTH, MAX_POINTS
 from mapctl.errors import FileFormatError
 from mapctl.formats.reading import read_bytes, shorten
 
-MAX_FILE_BYTES = 64 * 2**20
-"""Largest curve file that is read."""
+MAX_CSV_BYTES = 64 * 2**20
+"""Largest table that is read."""
+MAX_SVG_BYTES, MAX_SVG_SEGMENTS = 2 * 2**20, 30_000
+"""Largest drawing that is read: its parser takes seconds for a megabyte."""
 SVG_METRES_PER_UNIT = 0.01
 """Scale of a drawing unless asked otherwise: 100 SVG units are a metre."""
 
@@ -29,7 +31,7 @@ def read_csv(path: str | PathLike[str]) -> ndarray:
     may order the columns; blank lines and lines from `#` on are skipped. FileFormatError names file and line.
     """
     rows, order = [], None
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(_text(path, MAX_CSV_BYTES).splitlines(), start=1):
         words = _words(line)
         if not words:
             continue
@@ -46,9 +48,9 @@ def read_csv(path: str | PathLike[str]) -> ndarray:
     return np.array(rows)[:, order]
 
 
-def _text(path: str | PathLike[str]) -> str:
-    if Path(path).is_file() and Path(path).stat().st_size > MAX_FILE_BYTES:
-        raise FileFormatError(path, f"is larger than {MAX_FILE_BYTES // 2**20} MiB, too large for a curve")
+def _text(path: str | PathLike[str], limit: int) -> str:
+    if Path(path).is_file() and Path(path).stat().st_size > limit:
+        raise FileFormatError(path, f"is larger than {limit // 2**20} MiB, too large for a curve")
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -91,12 +93,15 @@ def _plain_order(path: str | PathLike[str], words: list[str], number: int) -> li
 def _row(path: str | PathLike[str], words: list[str], number: int, columns: int) -> list[float]:
     if len(words) != columns:
         raise FileFormatError(path, f"found {len(words)} values where {columns} belong", number)
-    for word in words:
-        if not (_is_number(word) and abs(float(word)) <= MAX_LENGTH):
-            raise FileFormatError(
-                path, f"expected a number up to {MAX_LENGTH:g} (metres), got {shorten(word)}", number
-            )
-    return [float(word) for word in words]
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = [math.nan]
+    if all(abs(value) <= MAX_LENGTH for value in values):
+        return values
+    wrong = next(word for word in words if not (_is_number(word) and abs(float(word)) <= MAX_LENGTH))
+    expected = f"expected a number up to {MAX_LENGTH:g} (metres)"
+    raise FileFormatError(path, f"{expected}, got {shorten(wrong)}", number)
 
 
 def _is_number(word: str) -> bool:
@@ -127,6 +132,8 @@ def _segments(path: str | PathLike[str], metres_per_unit: float) -> list:
     segments = [segment for drawn in _drawn_paths(path) for segment in drawn]
     if not segments:
         raise FileFormatError(path, "holds no drawn path")
+    if len(segments) > MAX_SVG_SEGMENTS:
+        raise FileFormatError(path, f"holds {len(segments)} path segments, allowed are {MAX_SVG_SEGMENTS}")
     for before, after in pairwise(segments):
         gap = abs(after.start - before.end) * metres_per_unit
         if gap > 1e-3:
@@ -139,7 +146,7 @@ def _segments(path: str | PathLike[str], metres_per_unit: float) -> list:
 def _drawn_paths(path: str | PathLike[str]) -> list:
     from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document
 
-    text = _text(path)
+    text = _text(path, MAX_SVG_BYTES)
     try:
         document = Document.from_svg_string(text)
         for element in document.tree.iter():
@@ -155,17 +162,17 @@ def _drawn_paths(path: str | PathLike[str]) -> list:
 
 
 def _sampled(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
-    """A straight segment's ends; points at most about 5 mm apart, and 64 at least, along any other."""
+    """A straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
     from svgpathtools import Line
 
     def places(count: int) -> ndarray:
         at = np.array([segment.point(t) for t in np.linspace(0, 1, count + 1)])
         return np.stack([np.real(at), np.imag(at)], axis=1) * metres_per_unit
 
-    rough = places(1 if type(segment) is Line else 64)
+    rough = places(1 if type(segment) is Line else 8)
     with np.errstate(all="ignore"):
         length = np.linalg.norm(np.diff(rough, axis=0), axis=1).sum()
     if not (math.isfinite(length) and length <= MAX_LENGTH):
         raise FileFormatError(path, f"a path is {length:.3g} m long, allowed are {MAX_LENGTH:g}")
     wanted = min(math.ceil(length / 0.005), 100_000)
-    return rough if len(rough) == 2 or wanted <= 64 else places(wanted)
+    return rough if len(rough) == 2 or wanted <= 8 else places(wanted)
