@@ -1,0 +1,71 @@
+"""How much a solve may cost, and the meter that is asked before every evaluation."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mapctl.errors import RequestError
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Limits of one solve; None is no limit. Raises RequestError where a limit is negative or no number."""
+
+    evaluations: int | None = None
+    """Evaluations of the energy, with or without gradient; a batch counts every candidate in it."""
+    seconds: float | None = None
+    """Wall clock from the making of the meter, seconds."""
+
+    def __post_init__(self):
+        for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds)):
+            if limit is not None and (math.isnan(limit) or limit < 0):
+                raise RequestError(f"a budget's {name} must be 0 or more (or None for no limit), got {limit}")
+
+
+class Meter:
+    """Counts evaluations against a budget; the clock starts when the meter is made. Says no, never raises."""
+
+    def __init__(self, budget: Budget = Budget(), *, clock: Callable[[], float] = time.monotonic):
+        self.budget = budget
+        self.evaluations = 0
+        self._clock = clock
+        self._began = clock()
+
+    def take(self, count: int = 1) -> bool:
+        """Ask for `count` evaluations at once: True counts them; False counts none, make none."""
+        if self._late() or not self._affords(count):
+            return False
+        self.evaluations += count
+        return True
+
+    @property
+    def remaining(self) -> float:
+        """Evaluations that may still be made: a whole number, 0 after the deadline, or infinity."""
+        if self._late():
+            return 0
+        limit = self.budget.evaluations
+        return math.inf if limit is None else limit - self.evaluations
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether not one more evaluation is allowed."""
+        return self._late() or not self._affords(1)
+
+    @property
+    def reason(self) -> str:
+        """Which limit was reached, in words; empty while neither was."""
+        if not self._affords(1):
+            return f"used its {self.budget.evaluations} evaluations"
+        return f"used its {self.budget.seconds:g} s" if self._late() else ""
+
+    @property
+    def seconds(self) -> float:
+        """Time since the meter was made."""
+        return self._clock() - self._began
+
+    def _late(self) -> bool:
+        return self.budget.seconds is not None and self.seconds >= self.budget.seconds
+
+    def _affords(self, count: int) -> bool:
+        return self.budget.evaluations is None or self.evaluations + count <= self.budget.evaluations

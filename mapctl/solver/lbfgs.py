@@ -1,0 +1,315 @@
+"""Limited-memory BFGS for a batch of independent problems (Nocedal and Wright, chapter 7).
+
+Every problem is a coroutine of its own: it yields a point and is sent the energy and gradient there. The
+driver stacks the points, evaluates the batch once and hands the rows out. Problems so share evaluations and
+nothing else: a problem walks the same path, to the bit, whoever it is stacked with. Vectors live on the CPU
+in double precision (they are small beside an evaluation); points are rounded to the caller's precision, so
+that steps are differences of evaluated points.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.solver.budget import Meter
+
+Vector = NDArray[np.float64]
+EnergyAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Points (batch, n) to energies (batch,) and gradients (batch, n); row i of a call is always problem i."""
+
+
+class LbfgsStatus(Enum):
+    """Why a problem ended; the value is text."""
+
+    CONVERGED = "converged"
+    STALLED = "stalled"
+    OUT_OF_BUDGET = "out of budget"
+    NOT_FINITE = "not finite"
+
+
+@dataclass(frozen=True)
+class LbfgsSettings:
+    """How the search goes and when it ends."""
+
+    memory: int = 10
+    """Curvature pairs kept."""
+    max_iterations: int = 100
+    """Accepted steps; beyond them a problem is out of budget."""
+    gradient_tolerance: float = 1e-3
+    """Converged where no entry of the gradient is larger; energy per unit of the unknowns."""
+    relative_energy_tolerance: float = 1e-6
+    """Converged where a step wins less than this share of max(|energy|, 1)."""
+    armijo: float = 1e-4
+    """Share of the slope's promise that a step must keep."""
+    curvature: float = 0.9
+    """Share of the starting slope that may be left at a step's end; between `armijo` and 1."""
+    initial_step: float | None = None
+    """Length of the first trial step, unit of the unknowns; None: the gradient's length, 1 at most."""
+    max_step: float = math.inf
+    """Longest step, Euclidean, unit of the unknowns."""
+    max_trials: int = 12
+    """Trial steps in one line search."""
+
+    def __post_init__(self):
+        if self.memory < 1 or self.max_iterations < 0 or self.max_trials < 1:
+            raise RequestError(
+                "L-BFGS needs memory and max_trials of 1 or more, and max_iterations of 0 or more"
+            )
+        if not 0 < self.armijo < self.curvature < 1:
+            raise RequestError(
+                f"L-BFGS needs 0 < armijo < curvature < 1, got {self.armijo} and {self.curvature}"
+            )
+        if not self.max_step > 0 or (self.initial_step is not None and not self.initial_step > 0):
+            raise RequestError(f"L-BFGS steps must be positive, got {self.initial_step} and {self.max_step}")
+
+
+@dataclass(frozen=True, eq=False)
+class LbfgsResult:
+    """The best finite point of each problem; the start where nothing finite was seen."""
+
+    x: Float[Tensor, "batch n"]
+    """Never worse than the start."""
+    energy: Float[Tensor, " batch"]
+    """There; infinity where no evaluation was finite, or none was allowed."""
+    start_energy: Float[Tensor, " batch"]
+    """At the start; infinity where it was not finite, or not evaluated."""
+    gradient_norm: Float[Tensor, " batch"]
+    """Largest absolute entry of the gradient at x."""
+    evaluations: Int[Tensor, " batch"]
+    """Made while the problem was running; the meter also counts the idle rows of finished problems."""
+    iterations: Int[Tensor, " batch"]
+    """Accepted steps."""
+    status: tuple[LbfgsStatus, ...]
+    """Why each problem ended."""
+
+
+def minimise(
+    function: EnergyAndGradient, x: Float[Tensor, "batch n"], *, settings: LbfgsSettings = LbfgsSettings(),
+    meter: Meter | None = None, callback: Callable[[int, Float[Tensor, " batch"]], None] | None = None,
+) -> LbfgsResult:  # fmt: skip
+    """Minimise a batch of independent problems from `x`, evaluating the whole batch at once.
+
+    The meter is asked before every evaluation; each counts the batch. A trial with an energy or gradient that
+    is not finite has failed. After every evaluation `callback` gets their number and the best energies so far.
+    Raises RequestError where `x` is not a float32 or float64 matrix, or the function answers in other shapes.
+    """
+    if x.ndim != 2 or x.dtype not in (torch.float32, torch.float64):
+        raise RequestError(
+            f"L-BFGS starts from (batch, n) float32 or float64, got {tuple(x.shape)} {x.dtype}"
+        )
+    meter = Meter() if meter is None else meter
+    problems = [_Problem(row, settings) for row in x.detach().cpu().numpy().copy()]
+    calls = 0
+    while any(problem.running for problem in problems) and meter.take(len(problems)):
+        energies, gradients = _evaluate(function, np.stack([problem.ask for problem in problems]), x)
+        for problem, energy, gradient in zip(problems, energies, gradients, strict=True):
+            problem.tell(energy, gradient)
+        calls += 1
+        if callback is not None:
+            callback(calls, x.new_tensor([problem.best.energy for problem in problems]))
+    return _result(problems, x)
+
+
+def _evaluate(
+    function: EnergyAndGradient, points: NDArray, like: Tensor
+) -> tuple[list[float], NDArray[np.float64]]:
+    energy, gradient = function(torch.from_numpy(points).to(like.device))
+    if energy.shape != like.shape[:1] or gradient.shape != like.shape:
+        raise RequestError(
+            f"an objective must answer energies {tuple(like.shape[:1])} and gradients {tuple(like.shape)}, "
+            f"got {tuple(energy.shape)} and {tuple(gradient.shape)}"
+        )
+    return energy.detach().tolist(), gradient.detach().to("cpu", torch.float64).numpy()
+
+
+def _result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
+    count = torch.tensor([[p.evaluations, p.iterations] for p in problems], dtype=torch.int64).reshape(-1, 2)
+    points = [p.best.x for p in problems]
+    return LbfgsResult(
+        x=torch.from_numpy(np.stack(points)).to(x.device) if points else x.detach().clone(),
+        energy=x.new_tensor([p.best.energy for p in problems]),
+        start_energy=x.new_tensor([p.start_energy for p in problems]),
+        gradient_norm=x.new_tensor([p.best.gradient_norm for p in problems]),
+        evaluations=count[:, 0], iterations=count[:, 1], status=tuple(p.status for p in problems),
+    )  # fmt: skip
+
+
+@dataclass(slots=True)
+class _Point:
+    """An evaluated point of a line search."""
+
+    step: float
+    x: NDArray
+    energy: float
+    gradient: Vector
+    slope: float
+
+    @property
+    def gradient_norm(self) -> float:
+        return float(np.abs(self.gradient).max(initial=0.0))
+
+    @property
+    def finite(self) -> bool:
+        return math.isfinite(self.energy) and math.isfinite(self.gradient_norm)
+
+
+Search = Generator[NDArray, tuple[float, Vector]]
+"""Yields points, is sent energy and gradient."""
+
+
+class _Problem:
+    """One problem's search, its best point and its count."""
+
+    def __init__(self, start: NDArray, settings: LbfgsSettings):
+        self.settings = settings
+        self.evaluations = self.iterations = 0
+        self.start_energy = math.inf
+        self.status = LbfgsStatus.OUT_OF_BUDGET  # what it is until the search itself comes to an end
+        self.best = _Point(0.0, start, math.inf, np.full(start.shape, math.inf), 0.0)
+        self.running = True
+        self._search = self._descend(start)
+        self.ask = next(self._search)
+
+    def tell(self, energy: float, gradient: Vector):
+        """The evaluation of `ask`; of no interest to a finished problem."""
+        if not self.running:
+            return
+        self.evaluations += 1
+        point = _Point(0.0, self.ask, energy, gradient, 0.0)
+        if energy < self.best.energy and point.finite:
+            self.best = point
+        try:
+            with np.errstate(
+                over="ignore", invalid="ignore"
+            ):  # what overflows is seen to be not finite, and refused
+                self.ask = self._search.send((energy, gradient))
+        except StopIteration as stop:
+            self.running, self.status, self.ask = False, stop.value, self.best.x
+
+    def _descend(self, start: NDArray) -> Generator[NDArray, tuple[float, Vector], LbfgsStatus]:
+        settings, pairs = self.settings, _Pairs(self.settings.memory)
+        energy, gradient = yield start
+        here = _Point(0.0, start, energy, gradient, 0.0)
+        if not here.finite:
+            return LbfgsStatus.NOT_FINITE
+        self.start_energy = energy
+        while here.gradient_norm > settings.gradient_tolerance:
+            if self.iterations == settings.max_iterations:
+                return LbfgsStatus.OUT_OF_BUDGET
+            direction, first = self._direction(here, pairs)
+            found = yield from _line_search(here, direction, first, settings)
+            if found is None:
+                if not pairs:
+                    return LbfgsStatus.STALLED
+                pairs.clear()  # the model misleads: one more try along the gradient
+                continue
+            guessed = not pairs  # a first step's length is a guess, so how little it wins says nothing
+            won, scale = here.energy - found.energy, max(abs(here.energy), abs(found.energy), 1.0)
+            pairs.learn(found.x.astype(np.float64) - here.x, found.gradient - here.gradient)
+            here, self.iterations = found, self.iterations + 1
+            if won <= settings.relative_energy_tolerance * scale and not guessed:
+                return LbfgsStatus.CONVERGED
+        return LbfgsStatus.CONVERGED
+
+    def _direction(self, here: _Point, pairs: "_Pairs") -> tuple[Vector, float]:
+        """A descent direction, and the first step to try along it."""
+        if pairs:
+            direction = -pairs.apply(here.gradient)
+            if -math.inf < direction @ here.gradient < 0:
+                return direction, 1.0
+            pairs.clear()
+        length = float(np.linalg.norm(here.gradient))
+        return -here.gradient, (self.settings.initial_step or min(1.0, length)) / length
+
+
+class _Pairs:
+    """Curvature pairs and the inverse Hessian they stand for."""
+
+    def __init__(self, memory: int):
+        self._pairs: deque[tuple[Vector, Vector, float]] = deque(maxlen=memory)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def clear(self):
+        """Forget all."""
+        self._pairs.clear()
+
+    def learn(self, step: Vector, change: Vector):
+        """Keep a pair, unless its curvature is too small to divide by."""
+        product, size = float(step @ change), float(change @ change)
+        if np.finfo(np.float64).eps * size < product < math.inf:
+            self._pairs.append((step, change, product))
+
+    def apply(self, gradient: Vector) -> Vector:
+        """Inverse Hessian times gradient: the two-loop recursion (Nocedal and Wright, algorithm 7.4)."""
+        result, weights = gradient.copy(), []
+        for step, change, product in reversed(self._pairs):
+            weights.append(float(step @ result) / product)
+            result -= weights[-1] * change
+        _, change, product = self._pairs[-1]
+        result *= product / float(change @ change)  # size of the newest curvature (their equation 7.20)
+        for (step, change, product), weight in zip(self._pairs, reversed(weights), strict=True):
+            result += (weight - float(change @ result) / product) * step
+        return result
+
+
+def _line_search(
+    origin: _Point, direction: Vector, first: float, settings: LbfgsSettings
+) -> Generator[NDArray, tuple[float, Vector], _Point | None]:
+    """A point with enough decrease and enough curvature for a pair (weak Wolfe); None where no trial gains.
+
+    `low` is the best step so far that decreases enough, `high` the shortest known to be too long.
+    """
+    longest = settings.max_step / float(np.linalg.norm(direction))
+    slope = float(direction @ origin.gradient)
+    # Energies are rounded to the caller's precision: a rise within that says nothing.
+    noise = 2.0 * float(np.finfo(origin.x.dtype).eps) * abs(origin.energy)
+    low = base = _Point(0.0, origin.x, origin.energy, origin.gradient, slope)
+    high: _Point | None = None
+    step = min(first, longest)
+    for _ in range(settings.max_trials):
+        x = (origin.x + step * direction).astype(origin.x.dtype)
+        if np.array_equal(x, low.x):
+            break  # the bracket is below the precision of the unknowns
+        energy, gradient = yield x
+        trial = _Point(step, x, energy, gradient, float(direction @ gradient))
+        if not trial.finite or energy > base.energy + settings.armijo * step * slope + noise:
+            high = trial
+        elif trial.slope >= settings.curvature * slope or step == longest:
+            return trial
+        else:
+            low = trial
+        step = min(_next_step(low, high), longest)
+    return low if low is not base else None
+
+
+def _next_step(low: _Point, high: _Point | None) -> float:
+    """Within the bracket by cubic interpolation, kept off its ends; beyond `low` if none is too long."""
+    if high is None:
+        return 4.0 * low.step
+    width = high.step - low.step
+    if not high.finite:
+        return low.step + 0.2 * width
+    return low.step + min(max(_cubic_minimum(low, high), 0.1 * width), 0.8 * width)
+
+
+def _cubic_minimum(a: _Point, b: _Point) -> float:
+    """Minimum, from a, of the cubic with the energies and slopes of both (Nocedal and Wright, 3.59)."""
+    width = b.step - a.step
+    bend = a.slope + b.slope - 3.0 * (b.energy - a.energy) / width
+    square = bend * bend - a.slope * b.slope
+    if not 0.0 <= square < math.inf:
+        return 0.5 * width
+    root = math.sqrt(square)
+    denominator = b.slope - a.slope + 2.0 * root
+    return width * (1.0 - (b.slope + root - bend) / denominator) if denominator else 0.5 * width
