@@ -54,7 +54,7 @@ def positions_from_matrices(
     All joints of one depth are multiplied at once: a window of frames then takes a dozen tensor operations.
     """
     offsets = skeleton.offsets.to(local_matrix.dtype)
-    order, world, places = [0], local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, 0])
+    order, world, places = [0], local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, :, 0])
     above_world, above_places, above = world, places, [0]
     collected = [places]
     while level := [j for j, parent in enumerate(skeleton.parents) if parent in above]:

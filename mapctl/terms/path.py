@@ -54,7 +54,7 @@ class Path:
         """Distance to the curve, metres."""
         places = self._places(trial)
         at = self.curve.point(self._nearest(places))
-        return (places[..., :: 3 - self.curve.dims] - at).norm(dim=-1)
+        return (self._flat(places) - at).norm(dim=-1)
 
     def _places(self, trial: Trial) -> Float[Tensor, "batch frames 3"]:
         if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics

@@ -1,0 +1,39 @@
+"""Free-run health: does the density, sampled for long, stay a person moving as the data do?"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.features import LAYOUT
+from priors.lstm_gmm import LstmGmm
+from priors.training.corpus import Corpus
+from priors.training.starts import speed
+
+_SETTLE = 300
+
+
+def free_run(
+    model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500, temperature: float = 1.0, seed: int = 0
+) -> dict[str, float]:
+    """Speed, height and pose variation of free runs, each as a ratio to the corpus, and the slowest run's last speed.
+
+    Runs begin in the middle of clips; their first ten seconds are not counted.
+    """
+    clips = [clip for clip in corpus.clips() if len(clip) > 60]
+    clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]
+    state = model.initial_state(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
+    state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
+    features, _ = model.sample(state, frames, torch.Generator().manual_seed(seed), temperature=temperature)
+    settled = features[:, min(_SETTLE, frames // 2) :].cpu()
+    own, wanted = summary(settled.flatten(0, 1)), summary(corpus.features)
+    result = {f"free_run_{name}_ratio": own[name] / wanted[name] for name in own}
+    result["free_run_slowest_m_s"] = float(speed(settled[:, -150:]).mean(-1).min())
+    result["free_run_finite"] = float(torch.isfinite(features).all())
+    return result
+
+
+def summary(features: Float[Tensor, "frames size"]) -> dict[str, float]:
+    """Mean speed (m/s), mean root height (m) and mean spread of the joint rotations (rad)."""
+    joints = LAYOUT.pick(features, "joint_rotations")
+    return {"speed": float(speed(features).mean()), "height": float(LAYOUT.pick(features, "root_height").mean()),
+            "pose": float(joints.std(0).mean())}  # fmt: skip

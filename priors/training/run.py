@@ -1,0 +1,154 @@
+"""`mapctl train lstm-gmm`: from a folder of BVH to a run folder with checkpoints, a training curve and a loadable prior."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+
+from mapctl.errors import CheckpointError, RequestError
+from priors import checkpoints
+from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.training import corpus as corpora
+from priors.training import resume
+from priors.training.health import free_run
+from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
+from priors.training.starts import abilities, choose
+
+Progress = Callable[[str], None]
+"""Called with one line of news."""
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What to train on, and how."""
+
+    data: Path
+    """Folder of BVH files, searched below."""
+    out: Path
+    """Run folder: checkpoint, curve, finished prior."""
+    match: str = ""
+    """Regular expression that a file's path below `data` must contain."""
+    config: LstmGmmConfig = field(default_factory=LstmGmmConfig)
+    """The network."""
+    settings: TrainingSettings = field(default_factory=TrainingSettings)
+    """The recipe."""
+    resume: bool = False
+    """Continue from the run folder's last checkpoint."""
+    device: str = "auto"
+    """`auto`, `cpu` or `cuda`."""
+    checkpoint_minutes: float = 3.0
+    """Between checkpoints."""
+    report_steps: int = 100
+    """Between lines of news."""
+    validate_steps: int = 1000
+    """Between validations with a free run."""
+    starts: int = 64
+    """Moments of mocap that the finished prior carries."""
+    licence: str = "that of the training data"
+    """Of the weights, for the card."""
+    skip_first: bool = False
+    """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+
+
+def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
+
+    Killed and resumed, a run gives the same weights bit for bit on one machine (a test holds it to that).
+    """
+    if not request.data.is_dir():
+        raise RequestError(f"{request.data} is not a folder of BVH files")
+    corpus = corpora.read(request.data, match=request.match, cache=request.out / "cache",
+                          skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
+    parts = corpora.split(corpus, request.settings.seed)
+    progress(f"{len(corpus.names)} clips, {len(corpus.features)} frames; training on {len(parts.train.names)}")
+    trainer = Trainer(request.config, request.settings, parts.train, _device(request.device))
+    curve = _resume(request, trainer, progress)
+    _loop(request, trainer, parts, curve, progress)
+    return export(request, trainer, parts, curve)
+
+
+def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: list[dict[str, float]]) -> Path:
+    """Write the model in float16 with its starts and card."""
+    model = trainer.model.cpu().eval()
+    found = choose(model, parts.train, count=request.starts, generator=torch.Generator().manual_seed(request.settings.seed))
+    tensors = dict(model.state_dict())
+    tensors |= {"starts.previous": found.state.previous, "starts.hidden": found.state.hidden,
+                "starts.cell": found.state.cell, "starts.speed": found.speed}  # fmt: skip
+    path = request.out / "model.safetensors"
+    checkpoints.save(tensors, _card(request, model, parts, curve, found.names), path)
+    return path
+
+
+def _card(
+    request: TrainRequest, model: LstmGmm, parts: corpora.Split, curve: list[dict[str, float]], starts: tuple[str, ...]
+) -> checkpoints.Card:
+    data = {"clips": sum(len(p.names) for p in (parts.train, parts.validation, parts.test)),
+            "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
+            "match": request.match, "split_seed": request.settings.seed, "starts": list(starts),
+            "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
+    training = {"settings": asdict(request.settings), "steps": request.settings.steps, "curve": curve}
+    quality = {"test_nats_per_frame": validation_nats(model, parts.test), "free_run": free_run(model, parts.validation)}
+    return checkpoints.Card(
+        kind="lstm-gmm", config=asdict(request.config), licence=request.licence, data=data, training=training,
+        quality=quality, abilities=asdict(abilities(parts.train)), **checkpoints.Card.of_layout(),
+    )  # fmt: skip
+
+
+def _loop(
+    request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: list[dict[str, float]], progress: Progress
+) -> None:
+    saved, losses, began = time.monotonic(), [], time.monotonic()
+    while trainer.step < request.settings.steps:
+        losses.append(trainer.train_step())
+        last = trainer.step == request.settings.steps
+        if trainer.step % request.report_steps == 0 or last:
+            progress(f"step {trainer.step}: {sum(losses) / len(losses):.2f} nats, {time.monotonic() - began:.0f} s")
+            losses = []
+        if trainer.step % request.validate_steps == 0 or last:
+            curve.append(_validate(trainer, parts))
+            progress(json.dumps(curve[-1]))
+        if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
+            resume.save(request.out, trainer, curve)
+            saved = time.monotonic()
+
+
+def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float]:
+    """Validation likelihood and the free-run health gate: likelihood does not predict stability (design, 11.2)."""
+    trainer.model.eval()
+    row = {"step": trainer.step, "validation_nats": validation_nats(trainer.model, parts.validation)}
+    row |= free_run(trainer.model, parts.validation)
+    trainer.model.train()
+    return row
+
+
+def _resume(request: TrainRequest, trainer: Trainer, progress: Progress) -> list[dict[str, float]]:
+    present = resume.exists(request.out)
+    if request.resume and not present:
+        raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
+    if present and not request.resume:
+        raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
+    if not present:
+        request.out.mkdir(parents=True, exist_ok=True)
+        return []
+    curve = resume.load(request.out, trainer)
+    progress(f"resumed at step {trainer.step}")
+    return curve
+
+
+def _device(wanted: str) -> str:
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise RequestError("this machine has no CUDA device; use --device cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
+
+
+def _reading(progress: Progress) -> Callable[[int, int], None]:
+    def news(done: int, total: int) -> None:
+        if done % 200 == 0 or done == total:
+            progress(f"read {done} of {total} clips")
+
+    return news
