@@ -15,9 +15,9 @@ from mapctl.curves import Curve
 from mapctl.features import decode
 from mapctl.intent import Follow, SpeedProfile
 from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.solver.methods import LatentMethod, Method
 from mapctl.solver.result import Outcome, Solution, Status
 from mapctl.solver.window import Committed, WindowSettings, WindowSolver
-from mapctl.solver.proposals import Proposal, zero_start
 from mapctl.terms import Footing, Noise, Path, Term
 
 
@@ -36,9 +36,11 @@ class FollowSettings:
     noise: Noise = field(default_factory=Noise)
     """The prior, in the latents of its rollout."""
     window: WindowSettings = field(default_factory=WindowSettings)
-    """Windows and budgets."""
-    proposal: Proposal = zero_start
-    """Where L-BFGS starts in each window."""
+    """How windows are laid."""
+    method: Method = field(default_factory=LatentMethod)
+    """How one window is solved."""
+    extra: tuple[Term, ...] = ()
+    """Further terms, the same in every window (a likelihood for the method over states)."""
     joint: str = "hips"
     """Which joint follows the curve."""
 
@@ -62,7 +64,7 @@ def follow(
     arcs = request.arcs(frames + settings.window.frames, fps)
     terms_of = _terms_of(curve, arcs, settings)
     start = choose_start(prior, curve, arcs, terms_of, skeleton=skeleton, fps=fps, generator=generator)
-    solver = WindowSolver(prior, settings.window, skeleton, fps, settings.proposal)
+    solver = WindowSolver(prior, settings.window, skeleton, fps, settings.method)
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
                                  deadline=deadline)  # fmt: skip
@@ -74,7 +76,7 @@ def _terms_of(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSett
                 sigma_raw=settings.path_sigma_raw, sigma_progress=settings.path_sigma_progress)  # fmt: skip
 
     def terms(first: int, frames: int) -> Sequence[Term]:
-        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing
+        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *settings.extra
 
     return terms
 

@@ -1,7 +1,7 @@
 """What the core asks of learned models. A model has the roles it can fill; none is given a fake one."""
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -66,3 +66,27 @@ class Refiner(Protocol):
     def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
         """The refined frames."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Moments of mocap from which a density may begin: its state after a stretch of a clip."""
+
+    state: Any
+    """A density's state, one batch row a start."""
+    speed: Float[Tensor, " starts"]
+    """Mean speed over the second before, m/s."""
+    names: tuple[str, ...]
+    """The clip each was taken from."""
+
+
+@dataclass(frozen=True)
+class Abilities:
+    """What the training data show, so that impossible wishes can be named with numbers."""
+
+    slowest: float
+    """Speed, m/s, 1st percentile of one-second means."""
+    fastest: float
+    """Speed, m/s, 99th percentile of one-second means."""
+    turn_rate: float
+    """Turning of the travel direction, rad/s, 99.5th percentile of one-second means."""

@@ -40,8 +40,7 @@ class Objective:
         (gradient,) = torch.autograd.grad(energy.sum(), unknowns)
         return energy.detach(), gradient
 
-    def ledger(self, unknowns: Float[Tensor, "1 unknowns"]) -> Ledger:
-        """By term, the energies and residuals of one candidate."""
+    def ledger_of(self, trial: Trial) -> Ledger:
+        """By term, the energies and residuals of a trial of one candidate."""
         with torch.no_grad():
-            trial = self.build(unknowns)
             return Ledger(tuple(LedgerEntry(t.name, t.unit, t(trial)[0], t.residual(trial)[0]) for t in self.terms))

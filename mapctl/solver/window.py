@@ -12,15 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, Place, root_places
+from mapctl.features import Place, root_places
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.solver.budget import Budget, Meter
-from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
-from mapctl.solver.objective import Objective
-from mapctl.solver.proposals import Proposal, zero_start
+from mapctl.solver.methods import LatentMethod, Method
 from mapctl.solver.result import Ledger, Outcome, WindowRecord
-from mapctl.solver.variables import Context, Latents
+from mapctl.solver.variables import Context
 from mapctl.terms.base import Term
 
 TermsOf = Callable[[int, int], Sequence[Term]]
@@ -29,18 +26,12 @@ TermsOf = Callable[[int, int], Sequence[Term]]
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """How windows are laid and solved."""
+    """How windows are laid."""
 
     frames: int = 34
     """Length of a window (the paper's)."""
     overlap: int = 17
     """Frames of it that the next window solves again."""
-    rounds: int = 3
-    """How often components and contact bits are chosen anew along the current rollout."""
-    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=10))
-    """Of one round."""
-    budget: Budget = field(default_factory=lambda: Budget(evaluations=40))
-    """Of one window."""
     past: int = 40
     """Committed frames that terms may look back on."""
 
@@ -57,8 +48,8 @@ class Committed:
     """Of every committed frame, the first being the start."""
     joints_world: Float[Tensor, "past joints 3"]
     """World joint positions of its last frames, metres."""
-    tail: Float[Tensor, "frames continuous"]
-    """Noise of the last window beyond what was committed: where the next one starts."""
+    tail: Float[Tensor, "frames width"]
+    """What the last window found for the frames beyond: where the next one starts (see the method's `carry`)."""
     ledger: Ledger = field(default_factory=Ledger)
     """Of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
@@ -77,8 +68,8 @@ class WindowSolver:
     """Bones of the character."""
     fps: float = 30.0
     """Frames per second."""
-    proposal: Proposal = zero_start
-    """Where L-BFGS starts."""
+    method: Method = field(default_factory=LatentMethod)
+    """How one window is solved."""
 
     def solve(
         self, committed: Committed, terms_of: TermsOf, frames: int, *, generator: torch.Generator,
@@ -104,66 +95,15 @@ class WindowSolver:
         began = time.perf_counter()
         context = Context(self.density, done.state, done.place, done.joints_world, self.settings.frames,
                           self.skeleton, self.fps)  # fmt: skip
-        window = solve_window(context, terms, done.tail, self.settings, self.proposal, generator)
-        trial = window.latents.build(window.result.x)
-        with torch.no_grad():
-            features = trial.features[0, :count]
-            ground, heading = root_places(features, done.place)
-            joints = torch.cat([done.joints_world, trial.joints_world[0, :count]])[-self.settings.past :]
-        noise = window.result.x[0].unflatten(-1, (self.settings.frames, LAYOUT.continuous))
+        window = self.method(context, terms, done.tail, generator)
+        features = window.trial.features[0, :count]
+        ground, heading = root_places(features, done.place)
+        joints = torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :]
+        state = self.density.advance(done.state, features.unsqueeze(0))
         record = WindowRecord(count, time.perf_counter() - began, window.evaluations, window.start_energy,
-                              float(window.result.energy[0]), window.result.status[0].value)  # fmt: skip
+                              window.energy, window.ended)  # fmt: skip
         return Committed(
-            state=self.density.advance(done.state, features.unsqueeze(0)), place=Place(ground[-1], heading[-1]),
-            features=torch.cat([done.features, features]), joints_world=joints, tail=noise[count:].detach(),
-            ledger=done.ledger.join(window.ledger.slice(count)), windows=(*done.windows, record),
+            state=state, place=Place(ground[-1], heading[-1]), features=torch.cat([done.features, features]),
+            joints_world=joints, tail=window.carry[count:], ledger=done.ledger.join(window.ledger.slice(count)),
+            windows=(*done.windows, record),
         )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedWindow:
-    """The best of one window."""
-
-    latents: Latents
-    """Unknowns to trial, with the last plan."""
-    result: LbfgsResult
-    """Of the last round, batch of one."""
-    ledger: Ledger
-    """By term and frame."""
-    evaluations: int
-    """Spent in all, proposals included."""
-    start_energy: float
-    """Nats at the first candidate of L-BFGS."""
-
-
-def solve_window(
-    context: Context, terms: Sequence[Term], tail: Float[Tensor, "frames continuous"], settings: WindowSettings,
-    proposal: Proposal, generator: torch.Generator,
-) -> SolvedWindow:  # fmt: skip
-    """Propose, plan, then rounds of L-BFGS; between rounds the plan is chosen anew unless that costs more than it won."""
-    meter = Meter(settings.budget)
-    unknowns = proposal(context, terms, _extended(tail, context.frames), meter, generator)
-    best: tuple[Latents, Objective, LbfgsResult] | None = None
-    start_energy = float("nan")
-    for _ in range(settings.rounds):
-        latents = Latents.planned(context, unknowns)
-        objective = Objective(latents.build, terms)
-        result = minimise(objective.energy_and_gradient, unknowns, settings=settings.lbfgs, meter=meter)
-        if best is None:
-            start_energy = float(result.start_energy[0])
-        elif not result.energy[0] < best[2].energy[0]:
-            break
-        best = latents, objective, result
-        unknowns = result.x
-        if meter.exhausted:
-            break
-    assert best is not None
-    latents, objective, result = best
-    return SolvedWindow(latents, result, objective.ledger(result.x), meter.evaluations, start_energy)
-
-
-def _extended(tail: Tensor, frames: int) -> Float[Tensor, "1 unknowns"]:
-    """The last solution's tail, and zero noise (the prior's own continuation) beyond it."""
-    noise = tail.new_zeros(frames, LAYOUT.continuous)
-    noise[: len(tail)] = tail[:frames]
-    return noise.flatten().unsqueeze(0)

@@ -1,0 +1,150 @@
+"""How one window is solved: over the latents of a rollout (the default), or over the states themselves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.features import LAYOUT
+from mapctl.protocols import Plan
+from mapctl.solver.budget import Budget, Meter
+from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
+from mapctl.solver.objective import Objective
+from mapctl.solver.proposals import Proposal, zero_start
+from mapctl.solver.result import Ledger
+from mapctl.solver.variables import Context, Latents, States
+from mapctl.terms.base import Term
+from mapctl.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedWindow:
+    """The best that was found for one window."""
+
+    trial: Trial
+    """Batch of one, detached."""
+    carry: Float[Tensor, "frames width"]
+    """By frame, what the next window may start from."""
+    ledger: Ledger
+    """By term and frame."""
+    evaluations: int
+    """Spent in all, proposals included."""
+    start_energy: float
+    """Nats at the first point of L-BFGS."""
+    energy: float
+    """Nats at the end."""
+    ended: str
+    """Why L-BFGS stopped."""
+
+
+class Method(Protocol):
+    """Solves one window."""
+
+    def __call__(
+        self, context: Context, terms: Sequence[Term], tail: Float[Tensor, "frames width"], generator: torch.Generator
+    ) -> SolvedWindow:
+        """`tail` is the end of the last window's `carry`, empty at the start."""
+        ...
+
+
+@dataclass(frozen=True)
+class LatentMethod:
+    """Propose, plan, then rounds of L-BFGS over the rollout's noise.
+
+    Between rounds components and contact bits are chosen anew along the current rollout; a round that ends higher than
+    the one before it is thrown away, since the plan itself is not part of the energy.
+    """
+
+    rounds: int = 3
+    """Rounds at most."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=10))
+    """Of one round."""
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=32))
+    """Of one window."""
+    proposal: Proposal = zero_start
+    """Where the first round starts."""
+
+    def __call__(
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator
+    ) -> SolvedWindow:
+        """See Method; the carry is the noise."""
+        meter = Meter(self.budget)
+        unknowns = self.proposal(context, terms, _extended(tail, context.frames), meter, generator)
+        best = self._round(context, terms, unknowns, meter)
+        start_energy = float(best[1].start_energy[0])
+        for _ in range(self.rounds - 1):
+            if meter.exhausted:
+                break
+            again = self._round(context, terms, best[1].x, meter)
+            if not again[1].energy[0] < best[1].energy[0]:
+                break
+            best = again
+        objective, result = best
+        carry = result.x[0].unflatten(-1, (context.frames, LAYOUT.continuous))
+        return _solved(objective, result, carry, meter, start_energy)
+
+    def _round(
+        self, context: Context, terms: Sequence[Term], unknowns: Tensor, meter: Meter
+    ) -> tuple[Objective, LbfgsResult]:
+        objective = Objective(Latents.planned(context, unknowns).build, terms)
+        return objective, minimise(objective.energy_and_gradient, unknowns, settings=self.lbfgs, meter=meter)
+
+
+@dataclass(frozen=True, eq=False)
+class StateMethod:
+    """L-BFGS over the states and the network's input noise, with teacher forcing (Eq. 14-19).
+
+    The terms should hold a likelihood. Starts from the last window's states and the prior's plain continuation of them.
+    """
+
+    scale: Float[Tensor, " continuous"]
+    """The prior's standard deviations: one unit of each unknown."""
+    centre: Float[Tensor, " continuous"]
+    """The prior's means."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=150))
+    """Of one window."""
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=160))
+    """Of one window."""
+
+    def __call__(
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator
+    ) -> SolvedWindow:
+        """See Method; the carry is the features."""
+        features, plan = _continued(context, tail)
+        states = States(context, self.scale, self.centre, plan.contacts)
+        objective, meter = Objective(states.build, terms), Meter(self.budget)
+        result = minimise(objective.energy_and_gradient, states.from_features(features), settings=self.lbfgs, meter=meter)
+        carry = states.build(result.x).features[0].detach()
+        return _solved(objective, result, carry, meter, float(result.start_energy[0]))
+
+
+def _solved(
+    objective: Objective, result: LbfgsResult, carry: Tensor, meter: Meter, start_energy: float
+) -> SolvedWindow:
+    with torch.no_grad():
+        trial = objective.build(result.x)
+    return SolvedWindow(trial, carry, objective.ledger_of(trial), meter.evaluations, start_energy,
+                        float(result.energy[0]), result.status[0].value)  # fmt: skip
+
+
+def _extended(tail: Tensor, frames: int) -> Float[Tensor, "1 unknowns"]:
+    """The last solution's tail, and zero noise (the prior's own continuation) beyond it."""
+    noise = tail.new_zeros(frames, LAYOUT.continuous)
+    noise[: len(tail)] = tail[:frames]
+    return noise.flatten().unsqueeze(0)
+
+
+def _continued(context: Context, tail: Tensor) -> tuple[Float[Tensor, "1 frames size"], Plan]:
+    """The tail's features and the prior's zero-noise rollout after them, and their contact bits."""
+    known = tail[: context.frames].unsqueeze(0)
+    state = context.density.advance(context.state, known) if len(tail) else context.state
+    noise = tail.new_zeros(1, context.frames - known.shape[1], LAYOUT.continuous)
+    plan = context.density.plan(state, noise)
+    with torch.no_grad():
+        beyond, _ = context.density.rollout(state, noise, plan)
+    features = torch.cat([known, beyond], dim=1) if len(tail) else beyond
+    bits = LAYOUT.pick(features, "contacts") > 0.5
+    return features, Plan(torch.zeros(bits.shape[:2], dtype=torch.long), bits)
