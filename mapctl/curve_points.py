@@ -48,7 +48,7 @@ def dense_polyline(
 
 
 def _checked(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
-    given = np.array(points, dtype=np.float64)
+    given = np.asarray(points, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] not in (2, 3):
         raise RequestError(f"a curve's points have the shape (n, 2) or (n, 3), got {given.shape}")
     if not 2 <= len(given) <= MAX_POINTS:

@@ -11,7 +11,8 @@ from mapctl.skeleton import Skeleton
 # Where a rig has no toe joint, its foot stands for it.
 _TOES = ("toes", "toebase", "toe", "toe0", "toejoint", "ball", "toeend", "foot", "footjoint", "ankle")
 _UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint")
-_HIPS = ("hips", "hip", "pelvis", "rootjoint", "root")
+_HIPS = ("hips", "hip", "pelvis")
+_ROOTS = ("rootjoint", "root")  # of rigs without hips
 
 # Beginnings that say which program made the rig rather than what the joint is.
 _PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint|def)[ _-]+)", re.IGNORECASE)
@@ -20,8 +21,8 @@ _PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint
 def find_hips(skeleton: Skeleton) -> int:
     """Index of the hips; RequestError lists the joints if none is named so."""
     names = _plain_names(skeleton)
-    for match in (_exactly, _at_the_end):
-        for part in _HIPS:
+    for match, parts in ((_exactly, _HIPS), (_at_the_end, _HIPS), (_exactly, _ROOTS)):
+        for part in parts:
             joint = match(names, {part})
             if joint is not None:
                 return joint

@@ -1,0 +1,230 @@
+"""Measures against the design's definitions written out anew, and on motions whose measures are known."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from mapctl import curves
+from mapctl.errors import MapctlError, RequestError
+from mapctl.metrics import body, feet, measure, path, reference
+from mapctl.metrics.smoothing import gaussian_kernel, slow_part
+from mapctl.motion import Motion
+from mapctl.rotations import about_y, from_rotation_vector
+from mapctl.skeleton import CANONICAL
+
+IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+
+
+def walk(places_xz, *, headings=0.0, fps=30, swing=0.5, wobble=0.0, seed=0):
+    """The canonical body at these places; its legs swing once a second and its joints wobble (radians)."""
+    frames = len(places_xz)
+    time = torch.arange(frames, dtype=torch.float64) / fps
+    vectors = wobble * torch.randn(
+        frames, 21, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
+    for side, sign in (("left", 1), ("right", -1)):
+        vectors[:, CANONICAL.index(f"{side}UpperLeg"), 0] += sign * swing * torch.sin(2 * math.pi * time)
+    quats = from_rotation_vector(vectors)
+    quats[:, 0] = about_y(torch.as_tensor(headings, dtype=torch.float64).expand(frames))
+    places = torch.as_tensor(places_xz, dtype=torch.float64)
+    root = torch.stack([places[:, 0], torch.full((frames,), 0.87, dtype=torch.float64), places[:, 1]], dim=-1)
+    return Motion(CANONICAL, Fraction(fps), root, quats)
+
+
+def straight(frames, speed=1.2, fps=30, **options):
+    """A walk along +Z."""
+    z = np.arange(frames) * speed / fps
+    return walk(np.stack([np.zeros(frames), z], axis=1), fps=fps, **options)
+
+
+def definitions(positions, hips, toes, fps):
+    """Section 6 of the design, measure by measure, in centimetres and seconds."""
+    skate, ratio, slid, stood = [], [], [], 0
+    for joint in toes:
+        over = positions[:, joint, 1] - np.percentile(positions[:, joint, 1], 5)
+        speed = np.hypot(*np.diff(positions[:, joint], axis=0)[:, [0, 2]].T) * fps
+        low = over[1:] < 0.025
+        skate.append(np.where(low, speed * (2 - 2 ** (np.maximum(over[1:], 0) / 0.025)), 0))
+        ratio.append((over[1:] < 0.05) & (over[:-1] < 0.05) & (speed > 0.2))
+        run = []
+        for frame in [*range(len(speed)), None]:
+            if frame is not None and low[frame] and speed[frame] < 0.35:
+                run.append(speed[frame])
+                continue
+            if len(run) >= round(0.1 * fps):
+                slid += run
+                stood += len(run)
+            run = []
+    third = positions[3:] - 3 * positions[2:-1] + 3 * positions[1:-2] - positions[:-3]
+    ground = positions[:, hips][:, [0, 2]]
+    return {
+        "skate_cm_s": 100 * np.mean(skate),
+        "skate_ratio": np.mean(ratio),
+        "contact_speed_cm_s": 100 * np.mean(slid),
+        "planted_share": stood / (2 * (len(positions) - 1)),
+        "jitter_m_s3": np.sqrt((third**2).sum(-1)).mean() * fps**3,
+        "speed_m_s": np.sqrt((np.diff(ground, axis=0) ** 2).sum(-1)).mean() * fps,
+    }
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_measures_are_those_of_the_design(seed):
+    rng = np.random.default_rng(seed)
+    places = np.cumsum(rng.normal(size=(120, 2)) * 0.003 + [0.0, 0.004], axis=0)
+    clip = walk(places, swing=0.15, wobble=0.004, seed=seed)
+    expected = definitions(clip.joint_positions().numpy(), 0, TOES, 30)
+    assert 0 < expected["planted_share"] < 1
+    got = measure(clip)
+    for name, value in expected.items():
+        assert got[name] == pytest.approx(value, rel=1e-9), name
+
+
+def test_sway_is_what_a_slow_gaussian_leaves():
+    rng, fps = np.random.default_rng(1), 30
+    offset = np.cumsum(rng.normal(size=200)) * 0.003
+    taps = int(3 * 0.35 * fps)
+    weights = np.exp(-0.5 * ((np.arange(-taps, taps + 1) / fps) / 0.35) ** 2)
+    weights /= weights.sum()
+    quick = [offset[t] - weights @ offset[t - taps : t + taps + 1] for t in range(taps, 200 - taps)]
+    assert path.sway(torch.tensor(offset), fps) == pytest.approx(
+        np.sqrt(np.mean(np.square(quick))), rel=1e-12
+    )
+    assert math.isnan(path.sway(torch.tensor(offset[: 2 * taps + 4]), fps))
+
+
+def test_sway_of_a_straight_walk_is_its_swing_from_side_to_side():
+    time = np.arange(400) / 30
+    places = np.stack([0.03 * np.sin(2 * np.pi * time), 1.2 * time], axis=1)
+    gain = 1 - math.exp(-0.5 * (2 * math.pi * 0.35) ** 2)  # of one hertz after the slow part is gone
+    assert measure(walk(places))["sway_cm"] == pytest.approx(3 / math.sqrt(2) * gain, rel=0.03)
+    assert measure(straight(400))["sway_cm"] == pytest.approx(0, abs=1e-9)
+
+
+def test_straight_offset_is_positive_to_the_left():
+    places = torch.tensor([[0.0, 0.0], [0.2, 1.0], [-0.1, 2.0], [0.0, 3.0]], dtype=torch.float64)
+    torch.testing.assert_close(path.straight_offset(places), torch.tensor([0.0, 0.2, -0.1, 0.0]).double())
+
+
+def test_path_error_is_the_distance_to_the_curve():
+    angle = np.linspace(0, 3, 200)
+    radius = 2 + 0.05 * np.cos(3 * angle)
+    places = np.stack([2 - radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    got = measure(walk(places, headings=angle), curves.circle(radius=2.0))
+    expected = 100 * np.abs(radius - 2)
+    assert got["path_error_mean_cm"] == pytest.approx(expected.mean(), abs=0.001)
+    assert got["path_error_p95_cm"] == pytest.approx(np.percentile(expected, 95), abs=0.001)
+    assert got["path_error_max_cm"] == pytest.approx(expected.max(), abs=0.001)
+
+
+def test_the_low_pass_takes_sway_out_and_leaves_drift():
+    time = np.arange(600) / 30
+    for hertz, kept in ((2.0, 0.0), (0.0, 1.0)):
+        x = 0.03 * np.cos(2 * np.pi * hertz * time)
+        got = measure(walk(np.stack([x, time], axis=1)), curves.line(length=30.0))
+        assert got["path_error_low_passed_mean_cm"] == pytest.approx(3 * kept, abs=0.1)
+        assert got["path_error_max_cm"] == pytest.approx(3, abs=0.01)
+
+
+@pytest.mark.parametrize("fps", [25, 30, 120])
+def test_progress_is_measured_along_the_arc(fps):
+    curve = curves.figure8(radius=1.0)
+    arcs = torch.linspace(0, 1.5 * curve.length, 12 * fps + 1, dtype=torch.float64)
+    got = measure(walk(curve.point(arcs), fps=fps), curve, speed=2.0)
+    assert got["travelled_m"] == pytest.approx(6 * math.pi, rel=1e-3)
+    assert got["wanted_m"] == pytest.approx(24.0)
+    assert got["progress_ratio"] == pytest.approx(6 * math.pi / 24, rel=1e-3)
+    assert got["path_error_max_cm"] < 1e-3
+    assert got["speed_m_s"] == pytest.approx(math.pi / 2, rel=0.01)
+
+
+def test_the_walk_back_is_negative_progress():
+    z = np.linspace(8, 2, 200)
+    got = measure(walk(np.stack([0 * z, z], axis=1)), curves.line(length=10.0))
+    assert got["travelled_m"] == pytest.approx(-6)
+
+
+def test_another_joint_may_follow_in_space():
+    clip = straight(90)
+    hand = clip.joint_positions()[:, CANONICAL.index("leftHand")]
+    curve = curves.from_points(hand + torch.tensor([0.0, 0.04, 0.0]))
+    got = measure(clip, curve, joint="leftHand")
+    assert got["path_error_mean_cm"] == pytest.approx(4, abs=1e-6)
+
+
+def test_measures_do_not_depend_on_place_and_direction():
+    rng = np.random.default_rng(5)
+    places = np.cumsum(rng.normal(size=(150, 2)) * 0.004 + [0.0, 0.004], axis=0)
+    here = measure(walk(places, swing=0.15, wobble=0.004))
+    turned = np.stack([places[:, 1], -places[:, 0]], axis=1) + [5.0, -3.0]
+    there = measure(walk(turned, headings=math.pi / 2, swing=0.15, wobble=0.004))
+    assert here == pytest.approx(there, rel=1e-9)
+
+
+def test_facing_and_turning():
+    angle = np.linspace(0, 7, 300)
+    clip = walk(np.zeros((300, 2)), headings=angle)
+    got = measure(clip)
+    assert got["turned_deg"] == pytest.approx(math.degrees(7))
+    assert got["turn_rate_deg_s"] == pytest.approx(math.degrees(7 / (299 / 30)), rel=0.06)
+    positions = clip.joint_positions()
+    left, right = (positions[:, CANONICAL.index(f"{side}UpperLeg")] for side in ("left", "right"))
+    torch.testing.assert_close(body.facing(left, right), torch.tensor(angle))
+
+
+def test_pose_variation_sees_poses_only():
+    frames = 200
+    circling = np.stack([np.cos(np.arange(frames) / 20), np.sin(np.arange(frames) / 20)], axis=1)
+    frozen = walk(circling, headings=np.arange(frames) / 20, swing=0.0)
+    assert measure(frozen)["pose_variation_cm"] == pytest.approx(0, abs=1e-9)
+    little, much = (measure(straight(frames, swing=swing))["pose_variation_cm"] for swing in (0.2, 0.4))
+    assert much == pytest.approx(2 * little, rel=0.1)
+
+
+def test_penetration_and_float_of_planted_toes():
+    toes = torch.zeros(100, 1, 3, dtype=torch.float64)
+    toes[:10, 0, 1], toes[10:, 0, 1] = 0.0, 0.01  # a tenth of the frames is the floor
+    found = feet.Toes.of(toes, 30)
+    assert feet.floating(found) == pytest.approx(0.009)
+    assert feet.penetration(found) == 0.0
+    toes[:3, 0, 1] = -0.02  # too few to be the floor
+    found = feet.Toes.of(toes, 30)
+    assert feet.penetration(found) == pytest.approx(3 * 0.02 / 100, rel=1e-9)
+
+
+def test_what_a_clip_cannot_tell_is_nan():
+    flying = torch.zeros(20, 1, 3, dtype=torch.float64)
+    flying[:, 0, 0] = torch.arange(20)
+    assert math.isnan(feet.contact_speed(feet.Toes.of(flying, 30)))
+    got = measure(straight(3))
+    assert math.isnan(got["jitter_m_s3"])
+    assert math.isnan(got["sway_cm"])
+
+
+def test_smoothing_keeps_constants_and_lines_inside():
+    line = torch.linspace(0, 1, 200, dtype=torch.float64)
+    torch.testing.assert_close(
+        slow_part(torch.full_like(line, 3.0), seconds=0.5, fps=30), torch.full_like(line, 3.0)
+    )
+    torch.testing.assert_close(slow_part(line, seconds=0.5, fps=30)[50:150], line[50:150])
+    assert float(gaussian_kernel(0.5, 30).sum()) == pytest.approx(1)
+
+
+def test_a_reference_is_mean_and_percentiles_over_clips():
+    speeds = np.array([0.5, 1.0, 1.5, 2.0, 1.0])
+    clips = [straight(frames, speed=speed) for frames, speed in zip((90, 90, 90, 90, 3), speeds, strict=True)]
+    table = reference(iter(clips))
+    assert table["speed_m_s"] == pytest.approx((speeds.mean(), *np.percentile(speeds, [2, 98])))
+    assert not math.isnan(table["sway_cm"].mean)  # the clip of 3 frames has none and is left out
+    with pytest.raises(RequestError):
+        reference([])
+
+
+def test_what_cannot_be_measured_is_refused():
+    with pytest.raises(RequestError):
+        measure(straight(1))
+    with pytest.raises(MapctlError, match="tail"):
+        measure(straight(90), curves.line(length=3.0), joint="tail")
