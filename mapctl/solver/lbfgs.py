@@ -99,7 +99,7 @@ def minimise(
     """Minimise a batch of independent problems from `x`, evaluating the whole batch at once.
 
     The meter is asked before every evaluation; each counts the batch. A trial with an energy or gradient that
-    is not finite has failed. After every evaluation `callback` gets their number and the best energies so far.
+    is not finite has failed. After every evaluation `callback` gets their number and the best energies.
     Raises RequestError where `x` is not a float32 or float64 matrix, or the function answers in other shapes.
     """
     if x.ndim != 2 or x.dtype not in (torch.float32, torch.float64):

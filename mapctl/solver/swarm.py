@@ -163,10 +163,10 @@ class _Flight:
         self._knows = (
             {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
         )
-        self._swarm: Any = Swarm(  # pyright: ignore[reportCallIssue]
-            points, np.zeros_like(points), pbest_cost=np.full(len(points), np.inf), best_pos=points[0],
-            options={"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social},
-        )  # fmt: skip
+        weights = {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
+        self._swarm: Any = Swarm(points, np.zeros_like(points), options=weights)  # pyright: ignore[reportCallIssue]
+        self._swarm.pbest_cost = np.full(len(points), np.inf)
+        self._swarm.best_pos = points[0]  # until a finite energy is seen, which may be never
 
     @property
     def positions(self) -> np.ndarray:

@@ -1,0 +1,72 @@
+"""Budgets are kept exactly, by count and by clock."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapctl.errors import RequestError
+from mapctl.solver.budget import Budget, Meter
+
+
+class Clock:
+    """A clock that stands still until told."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@given(limit=st.integers(0, 40), requests=st.lists(st.integers(1, 9), max_size=30))
+def test_exactly_what_fits_is_granted(limit: int, requests: list[int]):
+    meter, granted = Meter(Budget(evaluations=limit)), 0
+    for count in requests:
+        fits = granted + count <= limit
+        assert meter.take(count) is fits
+        granted += count if fits else 0
+    assert (meter.evaluations, meter.remaining) == (granted, limit - granted)
+    assert meter.exhausted is (granted == limit)
+    assert bool(meter.reason) is meter.exhausted
+
+
+def test_deadline_counts_from_the_making_of_the_meter_and_refuses_at_it():
+    clock = Clock()
+    meter = Meter(Budget(seconds=0.5), clock=clock)
+    clock.now += 0.4375
+    assert meter.take(1000)
+    assert not meter.exhausted
+    assert meter.seconds == 0.4375
+    clock.now += 0.0625
+    assert not meter.take()
+    assert meter.exhausted
+    assert meter.remaining == 0
+    assert (meter.evaluations, meter.reason) == (1000, "used its 0.5 s")
+
+
+def test_whichever_limit_comes_first_is_named():
+    clock = Clock()
+    meter = Meter(Budget(evaluations=2, seconds=1.0), clock=clock)
+    assert meter.take(2)
+    assert not meter.take()
+    assert meter.reason == "used its 2 evaluations"
+    other = Meter(Budget(evaluations=2, seconds=1.0), clock=clock)
+    clock.now += 2.0
+    assert not other.take()
+    assert other.reason == "used its 1 s"
+
+
+def test_no_limits_never_refuse():
+    meter = Meter()
+    assert meter.take(10**9)
+    assert not meter.exhausted
+    assert meter.remaining == math.inf
+    assert meter.reason == ""
+
+
+@pytest.mark.parametrize("limits", [{"evaluations": -1}, {"seconds": -0.1}, {"seconds": math.nan}])
+def test_impossible_limits_are_refused(limits: dict[str, float]):
+    with pytest.raises(RequestError, match=f"{next(iter(limits))} must be 0 or more"):
+        Budget(**limits)

@@ -1,0 +1,326 @@
+"""L-BFGS on textbook functions: minima, cost beside scipy's, independence, walls, budgets."""
+
+import importlib.util
+import math
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.solver import lbfgs
+from mapctl.solver.budget import Budget, Meter
+from mapctl.solver.lbfgs import EnergyAndGradient, LbfgsResult, LbfgsSettings, LbfgsStatus, minimise
+
+Energy = Callable[[Tensor], Tensor]
+TIGHT = LbfgsSettings(max_iterations=1000, gradient_tolerance=1e-9, relative_energy_tolerance=1e-15)
+
+
+def with_gradient(energy: Energy) -> EnergyAndGradient:
+    """An energy of rows, and its gradient by autograd."""
+
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:
+        x = x.clone().requires_grad_()
+        value = energy(x)
+        value.sum().backward()
+        assert x.grad is not None
+        return value, x.grad
+
+    return function
+
+
+def rosenbrock(x: Tensor) -> Tensor:
+    return (100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(-1)
+
+
+def beale(x: Tensor) -> Tensor:
+    a, b = x.unbind(-1)
+    return (1.5 - a + a * b) ** 2 + (2.25 - a + a * b**2) ** 2 + (2.625 - a + a * b**3) ** 2
+
+
+def powell(x: Tensor) -> Tensor:
+    a, b, c, d = x.unbind(-1)
+    return (a + 10 * b) ** 2 + 5 * (c - d) ** 2 + (b - 2 * c) ** 4 + 10 * (a - d) ** 4
+
+
+def wood(x: Tensor) -> Tensor:
+    a, b, c, d = x.unbind(-1)
+    return (
+        100 * (a**2 - b) ** 2 + (a - 1) ** 2 + (c - 1) ** 2 + 90 * (c**2 - d) ** 2
+        + 10.1 * ((b - 1) ** 2 + (d - 1) ** 2) + 19.8 * (b - 1) * (d - 1)
+    )  # fmt: skip
+
+
+def himmelblau(x: Tensor) -> Tensor:
+    a, b = x.unbind(-1)
+    return (a**2 + b - 11) ** 2 + (a + b**2 - 7) ** 2
+
+
+def quadratic(condition: float, size: int = 50) -> Energy:
+    scale = torch.logspace(0, math.log10(condition), size, dtype=torch.float64)
+    return lambda x: 0.5 * (scale.to(x) * x * x).sum(-1)
+
+
+def rows(*values: float) -> Tensor:
+    return torch.tensor([values], dtype=torch.float64)
+
+
+def alternating(size: int) -> Tensor:
+    return rows(*([-1.2, 1.0] * size)[:size])
+
+
+PROBLEMS: dict[str, tuple[Energy, Tensor]] = {
+    **{f"rosenbrock-{n}": (rosenbrock, alternating(n)) for n in (2, 3, 5, 10, 20)},
+    "beale": (beale, rows(1, 1)),
+    "powell": (powell, rows(3, -1, 0, 1)),
+    "wood": (wood, rows(-3, -1, -3, -1)),
+    "himmelblau": (himmelblau, rows(0, 0)),
+    "quadratic-1e2": (quadratic(1e2), torch.linspace(-1, 2, 50, dtype=torch.float64)[None]),
+    "quadratic-1e4": (quadratic(1e4), torch.linspace(-1, 2, 50, dtype=torch.float64)[None]),
+}  # every one of them has its least energy 0
+
+
+def curve_of(
+    function: EnergyAndGradient, start: Tensor, options: LbfgsSettings
+) -> tuple[list[float], LbfgsResult]:
+    """Best energies of a single problem after each evaluation, and the result."""
+    energies: list[float] = []
+    result = minimise(
+        function, start, settings=options, callback=lambda _, best: energies.append(float(best[0]))
+    )
+    return energies, result
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_minimum_is_found_at_no_more_than_scipys_cost(name: str):
+    energy, start = PROBLEMS[name]
+    function, theirs = with_gradient(energy), []
+
+    def of_scipy(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = function(torch.from_numpy(x)[None])
+        theirs.append(float(value[0].detach()))
+        return theirs[-1], gradient[0].numpy()
+
+    options = {"maxcor": 10, "ftol": 1e-15, "gtol": 1e-9, "maxfun": 5000, "maxiter": 5000}
+    scipy.optimize.minimize(of_scipy, start[0].numpy(), jac=True, method="L-BFGS-B", options=options)
+    ours, result = curve_of(function, start, TIGHT)
+    assert result.energy[0] < 1e-8
+    assert result.status == (LbfgsStatus.CONVERGED,)
+    for level in (1e-3, 1e-8):
+        count, bar = (next(i for i, e in enumerate(curve, 1) if e <= level) for curve in (ours, theirs))
+        assert count <= 1.5 * bar
+
+
+@pytest.mark.parametrize("name", ["beale", "powell", "himmelblau", "quadratic-1e2", "quadratic-1e4"])
+def test_single_precision_reaches_its_resolution_and_ends_there(name: str):
+    energy, start = PROBLEMS[name]
+    shifted = with_gradient(lambda x: energy(x) + 3000.0)  # resolution 2e-4, as of many frames
+    options = LbfgsSettings(max_iterations=1000, gradient_tolerance=0.0, relative_energy_tolerance=0.0)
+    result = minimise(shifted, start.float(), settings=options)
+    assert result.x.dtype == result.energy.dtype == torch.float32
+    assert result.energy[0] <= 3000.0 * (1 + 3e-5)
+    assert result.status[0] is not LbfgsStatus.OUT_OF_BUDGET
+    spent = int(minimise(with_gradient(energy), start, settings=TIGHT).evaluations[0])
+    assert result.evaluations[0] <= spent + 2 * options.max_trials
+
+
+def test_problems_in_a_batch_are_those_alone_to_the_bit():
+    # Of very different size, starts and lengths; one ends at once, one is never finite.
+    scales = torch.tensor([1.0, 1e-4, 1e6, 1.0, 1.0], dtype=torch.float64)
+    near, never = torch.ones(1, 6), torch.full((1, 6), math.nan)
+    starts = torch.cat([alternating(6), alternating(6) * 3, alternating(6) / 5, near, never])
+
+    def of(chosen: list[int]) -> EnergyAndGradient:
+        single = with_gradient(rosenbrock)
+
+        def function(x: Tensor) -> tuple[Tensor, Tensor]:  # by rows, so that its own sums know no batch
+            each = [single(row[None]) for row in x]
+            factor = scales[chosen]
+            return torch.cat([e for e, _ in each]) * factor, torch.cat([g for _, g in each]) * factor[:, None]
+
+        return function
+
+    together = minimise(of([0, 1, 2, 3, 4]), starts, settings=TIGHT)
+    assert len(set(together.iterations.tolist())) > 3
+    for i in range(5):
+        alone = minimise(of([i]), starts[i : i + 1], settings=TIGHT)
+        assert torch.equal(alone.x.nan_to_num(7), together.x[i : i + 1].nan_to_num(7))
+        assert torch.equal(alone.energy, together.energy[i : i + 1])
+        assert torch.equal(alone.evaluations, together.evaluations[i : i + 1])
+        assert torch.equal(alone.iterations, together.iterations[i : i + 1])
+        assert alone.status == together.status[i : i + 1]
+
+
+@pytest.mark.parametrize("beyond", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("spoilt", ["energy", "gradient"])
+def test_walls_are_backed_away_from(beyond: float, spoilt: str):
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:  # least at 0.01, close to a wall at 0
+        inside = (x > 0).all(-1)
+        safe = x.clamp_min(1e-12)
+        energy, gradient = (safe - 0.01 * safe.log()).sum(-1), 1 - 0.01 / safe
+        wall = torch.full_like(x, beyond)
+        if spoilt == "energy":
+            return torch.where(inside, energy, beyond), gradient
+        return torch.where(inside, energy, -1e9), torch.where(inside[:, None], gradient, wall)
+
+    result = minimise(function, torch.full((1, 4), 3.0, dtype=torch.float64), settings=TIGHT)
+    assert (result.x - 0.01).abs().max() < 1e-6
+    assert result.status == (LbfgsStatus.CONVERGED,)
+
+
+def test_start_that_is_not_finite_is_said_and_handed_back():
+    start = rows(2, 3)
+    for energy, slope in ((math.nan, 1.0), (1.0, math.inf)):
+        result = minimise(lambda x, e=energy, s=slope: (x.new_tensor([e]), x.new_tensor([[s, s]])), start)
+        assert result.status == (LbfgsStatus.NOT_FINITE,)
+        assert result.evaluations.tolist() == [1]
+        assert torch.equal(result.x, start)
+        assert result.energy.isinf().all()
+        assert result.start_energy.isinf().all()
+
+
+def test_surrounded_by_walls_the_start_is_kept():
+    start = rows(2, 3)
+
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.where((x == start).all(-1), 5.0, math.nan), torch.ones_like(x)
+
+    result = minimise(function, start)
+    assert result.status == (LbfgsStatus.STALLED,)
+    assert torch.equal(result.x, start)
+    assert result.energy.tolist() == result.start_energy.tolist() == [5.0]
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**16), limit=st.integers(1, 40), single=st.booleans())
+def test_rugged_ground_never_ends_worse_and_names_the_energy_of_its_point(
+    seed: int, limit: int, single: bool
+):
+    dtype = torch.float32 if single else torch.float64
+    function = with_gradient(
+        lambda x: (x**2 + 3 * torch.sin(20 * x)).sum(-1) + torch.log(30 - x.abs().sum(-1))
+    )
+    start = 2 * torch.randn(3, 5, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+    result = minimise(function, start, meter=Meter(Budget(evaluations=3 * limit)))
+    energy, gradient = function(result.x)
+    assert torch.equal(energy, result.energy)
+    assert torch.equal(gradient.abs().amax(-1), result.gradient_norm)
+    assert torch.equal(function(start)[0], result.start_energy)
+    assert (result.energy <= result.start_energy).all()
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_evaluations_are_kept_to_exactly_and_the_best_is_returned(batch: int):
+    single = with_gradient(rosenbrock)
+    for limit in range(0, 40, 3):
+        seen: list[Tensor] = []
+
+        def function(x: Tensor, seen: list[Tensor] = seen) -> tuple[Tensor, Tensor]:
+            energy, gradient = single(x)
+            seen.append(energy.detach())
+            return energy, gradient
+
+        meter = Meter(Budget(evaluations=limit))
+        start = alternating(10).expand(batch, -1)
+        result = minimise(function, start, settings=TIGHT, meter=meter)
+        assert len(seen) == limit // batch
+        assert meter.evaluations == batch * len(seen)
+        assert result.status == (LbfgsStatus.OUT_OF_BUDGET,) * batch
+        best = torch.stack(seen).amin(0) if seen else torch.full((batch,), math.inf, dtype=torch.float64)
+        assert torch.equal(result.energy, best)
+        assert bool(seen) or torch.equal(result.x, start)
+
+
+def test_deadline_is_checked_before_every_evaluation():
+    now = [0.0]
+    meter, single = Meter(Budget(seconds=0.5), clock=lambda: now[0]), with_gradient(rosenbrock)
+
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:
+        assert now[0] < 0.5
+        now[0] += 0.125
+        return single(x)
+
+    result = minimise(function, alternating(10), settings=TIGHT, meter=meter)
+    assert result.evaluations.tolist() == [4]
+    assert result.status == (LbfgsStatus.OUT_OF_BUDGET,)
+
+
+def test_iteration_limit_and_callback():
+    curve, result = curve_of(with_gradient(rosenbrock), alternating(4), LbfgsSettings(max_iterations=5))
+    assert result.iterations.tolist() == [5]
+    assert result.status == (LbfgsStatus.OUT_OF_BUDGET,)
+    assert len(curve) == int(result.evaluations[0])
+    assert curve == sorted(curve, reverse=True)
+
+
+def test_first_step_and_longest_step_have_the_lengths_asked_for():
+    points: list[Tensor] = []
+
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:
+        points.append(x[0].clone())
+        return 0.5 * (x**2).sum(-1), x
+
+    minimise(function, rows(30, 40), settings=LbfgsSettings(initial_step=0.5, max_step=2.0))
+    lengths = torch.stack(points).diff(dim=0).norm(dim=-1)
+    assert lengths[0].item() == pytest.approx(0.5)
+    assert lengths.max() <= 2.0 + 1e-9
+    assert lengths.sum().item() == pytest.approx(50, abs=2.0)
+
+
+def test_neither_the_start_nor_the_search_is_touched_by_a_function_that_writes_on_its_points():
+    start, single = alternating(4), with_gradient(rosenbrock)
+
+    def scribbles(x: Tensor) -> tuple[Tensor, Tensor]:
+        answer = single(x)
+        x.fill_(99.0)
+        return answer
+
+    expected = minimise(single, start, settings=TIGHT)
+    assert torch.equal(minimise(scribbles, start, settings=TIGHT).x, expected.x)
+    assert torch.equal(start, alternating(4))
+
+
+def test_own_time_per_iteration_is_under_0_3_ms_at_2200_unknowns(monkeypatch: pytest.MonkeyPatch):
+    spec = importlib.util.spec_from_file_location("lbfgs_without_checks_of_shapes", lbfgs.__file__)
+    assert spec is not None
+    assert spec.loader is not None
+    shipped = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, shipped)
+    spec.loader.exec_module(shipped)
+    scale, inside = torch.logspace(0, 6, 2200), [0.0]
+
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:
+        began = time.thread_time()
+        answer = 0.5 * (scale * x * x).sum(-1), scale * x
+        inside[0] += time.thread_time() - began
+        return answer
+
+    options, costs = shipped.LbfgsSettings(gradient_tolerance=0.0, relative_energy_tolerance=-1.0), []
+    for _ in range(5):
+        inside[0], began = 0.0, time.thread_time()
+        result = shipped.minimise(function, torch.ones(1, 2200), settings=options)
+        costs.append((time.thread_time() - began - inside[0]) / int(result.iterations[0]))
+    assert min(costs) < 0.3e-3
+
+
+def test_wrong_shapes_and_settings_are_refused():
+    start = torch.zeros(2, 3)
+    with pytest.raises(RequestError, match=r"energies \(2,\)"):
+        minimise(lambda x: (x.sum(), x), start)
+    with pytest.raises(RequestError, match=r"gradients \(2, 3\)"):
+        minimise(lambda x: (x.sum(-1), x[:1]), start)
+    with pytest.raises(RequestError, match="float32 or float64"):
+        minimise(lambda x: (x.sum(-1), x), start.half())
+    with pytest.raises(RequestError, match="armijo < curvature"):
+        LbfgsSettings(armijo=0.9, curvature=0.1)
+    with pytest.raises(RequestError, match="memory"):
+        LbfgsSettings(memory=0)
+    with pytest.raises(RequestError, match="positive"):
+        LbfgsSettings(initial_step=0.0)

@@ -1,0 +1,237 @@
+"""The particle swarm on textbook functions, and that pyswarms' habits stay inside the adapter."""
+
+import logging
+import logging.config
+import math
+import subprocess
+import sys
+import textwrap
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.solver.budget import Budget, Meter
+from mapctl.solver.swarm import SwarmResult, SwarmSettings, best_of, swarm
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def sphere(x: Tensor) -> Tensor:
+    return (x**2).sum(-1)
+
+
+def rastrigin(x: Tensor) -> Tensor:
+    return (x**2 - 10 * torch.cos(2 * math.pi * x) + 10).sum(-1)
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def same(a: SwarmResult, b: SwarmResult) -> bool:
+    return torch.equal(a.x, b.x) and (a.energy, a.evaluations, a.history) == (
+        b.energy,
+        b.evaluations,
+        b.history,
+    )
+
+
+@pytest.mark.parametrize("neighbours", [None, 4])
+def test_sphere_is_descended(neighbours: int | None):
+    options = SwarmSettings(particles=20, iterations=60, neighbours=neighbours)
+    start = torch.full((6,), 2.0, dtype=torch.float64)
+    found = swarm(sphere, start=start, spread=1.0, settings=options, generator=seeded())
+    assert found.energy < 0.05
+    assert found.evaluations == 1200
+    assert len(found.history) == 60
+    assert list(found.history) == sorted(found.history, reverse=True)
+    assert found.history[-1] == found.energy
+    assert sphere(found.x).item() == found.energy
+
+
+@pytest.mark.parametrize("neighbours", [None, 5])
+def test_many_basins_are_searched_better_than_by_as_many_draws(neighbours: int | None):
+    options, start = SwarmSettings(particles=30, iterations=40, neighbours=neighbours), torch.full((4,), 3.3)
+    flown, drawn = [], []
+    for seed in range(8):
+        flown.append(swarm(rastrigin, start=start, spread=1.5, settings=options, generator=seeded(seed)))
+        drawn.append(best_of(rastrigin, start=start, spread=1.5, count=1200, generator=seeded(seed)))
+    assert {f.evaluations for f in flown} == {d.evaluations for d in drawn} == {1200}
+    assert np.median([f.energy for f in flown]) < 0.6 * np.median([d.energy for d in drawn])
+
+
+def test_start_is_the_first_particle_so_the_result_is_never_worse():
+    start, asked = torch.zeros(5), []
+
+    def cost(x: Tensor) -> Tensor:  # least at the start
+        asked.append(x)
+        return sphere(x)
+
+    for found in (
+        swarm(cost, start=start, spread=2.0, generator=seeded()),
+        best_of(cost, start=start, spread=2.0, count=16, generator=seeded()),
+    ):
+        assert torch.equal(found.x, start)
+        assert found.energy == 0.0
+    for points in (asked[0], asked[-1]):
+        assert torch.equal(points[0], start)
+        assert points.unique(dim=0).shape == (16, 5)
+
+
+def test_draws_have_the_spread_asked_for_by_unknown():
+    spread, seen = torch.tensor([0.1, 10.0]), []
+    best_of(
+        lambda x: (seen.append(x), sphere(x))[1],
+        start=torch.ones(2),
+        spread=spread,
+        count=4000,
+        generator=seeded(),
+    )
+    torch.testing.assert_close(seen[0].std(0), spread, rtol=0.05, atol=0.0)
+    torch.testing.assert_close((seen[0].mean(0) - 1) / spread, torch.zeros(2), rtol=0.0, atol=0.06)
+
+
+def test_same_generator_same_bits_whatever_numpys_state():
+    def run(generator: torch.Generator) -> SwarmResult:
+        return swarm(rastrigin, start=torch.full((3,), 3.3), spread=1.0, generator=generator)
+
+    results = []
+    for numpy_seed in (1, 2):
+        np.random.seed(numpy_seed)
+        results.append(run(seeded(5)))
+    assert same(*results)
+    assert not same(results[0], run(seeded(6)))
+    generator = seeded(5)
+    assert same(run(generator), results[0])
+    assert not same(run(generator), results[0])
+
+
+def test_numpys_global_state_is_the_costs_alone():
+    drawn = []
+
+    def cost(x: Tensor) -> Tensor:
+        drawn.append(np.random.random())
+        return sphere(x)
+
+    np.random.seed(3)
+    swarm(cost, start=torch.ones(3), spread=1.0, generator=seeded())
+    drawn.append(np.random.random())
+    np.random.seed(3)
+    assert drawn == [np.random.random() for _ in drawn]
+
+
+def test_logging_is_left_alone():
+    root = logging.getLogger()
+    handlers, level, configure = list(root.handlers), root.level, logging.config.dictConfig
+    swarm(sphere, start=torch.ones(3), spread=1.0, settings=SwarmSettings(neighbours=3), generator=seeded())
+    assert (list(root.handlers), root.level, logging.config.dictConfig) == (handlers, level, configure)
+
+
+def test_first_use_in_a_read_only_folder_leaves_no_trace(tmp_path: Path):
+    script = """
+        import logging, sys, torch
+        import mapctl.solver.swarm as m
+        assert "pyswarms" not in sys.modules, "imported early"
+        logging.basicConfig(level=logging.ERROR, format="mine %(message)s")
+        mine = logging.getLogger().handlers[:]
+        m.swarm(lambda x: x.sum(-1), start=torch.ones(3), spread=1.0, generator=torch.Generator())
+        assert logging.getLogger().handlers == mine and logging.getLogger().level == logging.ERROR
+        logging.error("still here")
+    """
+    tmp_path.chmod(0o555)
+    try:
+        command = [sys.executable, "-c", textwrap.dedent(script)]
+        done = subprocess.run(
+            command, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+        )
+    finally:
+        tmp_path.chmod(0o755)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "mine still here\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_particles_stay_within_bounds():
+    low, high, seen = torch.tensor([-1.0, 0.5]), torch.tensor([1.0, 0.75]), []
+    options = SwarmSettings(particles=10, iterations=20)
+
+    def cost(x: Tensor) -> Tensor:
+        seen.append(x)
+        return -x.sum(-1)
+
+    start = torch.tensor([0.0, 0.5])
+    found = swarm(cost, start=start, spread=3.0, bounds=(low, high), settings=options, generator=seeded())
+    points = torch.cat(seen)
+    assert (points >= low).all()
+    assert (points <= high).all()
+    assert torch.equal(found.x, high)
+    for search in (swarm, partial(best_of, count=3)):
+        with pytest.raises(RequestError, match="within its bounds"):
+            search(sphere, start=torch.zeros(2), spread=1.0, bounds=(low, high), generator=seeded())
+
+
+@pytest.mark.parametrize("neighbours", [None, 3])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_costs_that_are_not_finite_count_as_infinity(bad: float, neighbours: int | None):
+    options = SwarmSettings(particles=12, iterations=15, neighbours=neighbours)
+
+    def half(x: Tensor) -> Tensor:
+        return torch.where(x[:, 0] > 0, sphere(x), bad)
+
+    start = torch.tensor([-0.1, 1.0, 1.0])
+    found = swarm(half, start=start, spread=1.0, settings=options, generator=seeded())
+    assert math.isfinite(found.energy)
+    assert found.x[0] > 0
+    assert found.energy == half(found.x[None]).item()
+    never = swarm(
+        lambda x: x.new_full((len(x),), bad), start=start, spread=1.0, settings=options, generator=seeded()
+    )
+    assert torch.equal(never.x, start)
+    assert never.energy == math.inf
+
+
+def test_budget_is_kept_to_exactly():
+    for limit, wanted in ((0, 0), (1, 1), (7, 7), (16, 16), (40, 32), (96, 96), (500, 96)):
+        seen: list[int] = []
+
+        def cost(x: Tensor, seen: list[int] = seen) -> Tensor:
+            seen.append(len(x))
+            return sphere(x)
+
+        meter = Meter(Budget(evaluations=limit))
+        options = SwarmSettings(particles=16, iterations=6 if limit >= 16 else 1)
+        found = swarm(
+            cost, start=torch.ones(3), spread=1.0, settings=options, meter=meter, generator=seeded()
+        )
+        assert sum(seen) == found.evaluations == meter.evaluations == wanted
+        assert found.energy <= 3.0 if limit else found.energy == math.inf
+    meter = Meter(Budget(evaluations=10))
+    assert (
+        best_of(
+            sphere, start=torch.ones(3), spread=1.0, count=99, meter=meter, generator=seeded()
+        ).evaluations
+        == 10
+    )
+    late = Meter(Budget(seconds=0.0))
+    for found in (
+        swarm(sphere, start=torch.ones(3), spread=1.0, meter=late, generator=seeded()),
+        best_of(sphere, start=torch.ones(3), spread=1.0, count=4, meter=late, generator=seeded()),
+    ):
+        assert torch.equal(found.x, torch.ones(3))
+        assert found.evaluations == 0
+        assert found.history == ()
+
+
+def test_wrong_shapes_and_settings_are_refused():
+    for cost in (lambda x: x.sum(), lambda x: x):
+        with pytest.raises(RequestError, match=r"energies \(16,\)"):
+            swarm(cost, start=torch.ones(3), spread=1.0, generator=seeded())
+    for wrong in ({"particles": 0}, {"iterations": 0}, {"neighbours": 1}):
+        with pytest.raises(RequestError, match="or more"):
+            SwarmSettings(**wrong)
+    with pytest.raises(RequestError, match="at least 1"):
+        best_of(sphere, start=torch.ones(3), spread=1.0, count=0, generator=seeded())
