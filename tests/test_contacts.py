@@ -92,7 +92,9 @@ def test_a_clip_too_short_for_a_contact_has_none():
     assert not planted(torch.zeros(2, 2, 3), 30).any()
 
 
-@pytest.mark.parametrize(("shape", "fps"), [((0, 2, 3), 30), ((5, 3), 30), ((5, 2, 2), 30), ((5, 2, 3), 0)])
-def test_other_shapes_are_refused(shape, fps):
+@pytest.mark.parametrize(
+    ("shape", "fps"), [((0, 2, 3), 30), ((5, 2, 3), 0), ((5, 2, 3), -30), ((5, 2, 3), float("nan"))]
+)
+def test_no_frames_and_no_frame_rate_are_refused(shape, fps):
     with pytest.raises(RequestError):
         planted(torch.zeros(shape), fps)

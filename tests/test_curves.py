@@ -1,4 +1,4 @@
-"""Curves: geometry against closed forms, search against brute force, and files good and bad."""
+"""Curves: geometry against closed forms, search against brute force, wishes that cannot be."""
 
 import math
 
@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import curves
-from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.errors import RequestError
 
 ARCS = torch.linspace(0, 30, 301, dtype=torch.float64)
 
@@ -22,12 +22,6 @@ def brute_force(points, polyline):
     distance = np.linalg.norm(points[:, None] - start - share[..., None] * along, axis=-1)
     best, row = distance.argmin(1), np.arange(len(points))
     return distance[row, best], (np.cumsum(length) - length)[best] + share[row, best] * length[best]
-
-
-def write(folder, name, text):
-    path = folder / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
 
 
 @pytest.mark.parametrize("radius", [0.01, 0.3, 4.0, 250.0])
@@ -267,132 +261,6 @@ def test_shapes_are_read_as_typed():
     assert torch.equal(curves.read("Figure8:2.5").points, curves.figure8(radius=2.5).points)
     with pytest.raises(RequestError):
         curves.read("circle:4", metres_per_unit=0.01)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "x,z\n0,0\n1,2\n3,1\n",
-        "0,0\n1,2\n3,1",
-        "\ufeffX;Z\r\n0;0\r\n1,0;2,0\r\n3;1\r\n",
-        "z\tx\n0\t0\n2\t1\n1\t3\n",
-        "# drawn by hand\n\nx, z\n 0, 0\n1e0 ,2.  # here\n\n3,1\n",
-        "0 0\n1   2\n3 1\n",
-        '"x","z"\n"0","0"\n1,2\n3,1\n',
-    ],
-)
-def test_csv_tables_are_read(tmp_path, text):
-    curve = curves.read(write(tmp_path, "drawn.csv", text))
-    expected = curves.from_points(np.array([[0.0, 0.0], [1.0, 2.0], [3.0, 1.0]]))
-    torch.testing.assert_close(curve.points, expected.points)
-
-
-def test_csv_in_space_and_in_other_units(tmp_path):
-    path = write(tmp_path, "reach.csv", "x,y,z\n0,100,0\n50,120,30\n")
-    curve = curves.read(path, metres_per_unit=0.01)
-    torch.testing.assert_close(curve.points[-1], torch.tensor([0.5, 1.2, 0.3], dtype=torch.float64))
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("x,z\n0,0\n1,nan\n", 3),
-        ("x,z\n0,0\ninf,1\n", 3),
-        ("0,0\n1\n", 2),
-        ("0,0\n1,2,3\n", 2),
-        ("x,y\n0,0\n1,1\n", 1),
-        ("x,z\n0,0\n\n1,two\n", 4),
-        ("1\n2\n", 1),
-        ("x,z\n0,0\n1e300,1\n", 3),
-        ("a,b,c\n", 1),
-        ("t,x,z,q\n", 1),
-        ("0,0\n1,\n", 2),
-    ],
-)
-def test_a_bad_csv_line_is_named(tmp_path, text, line):
-    path = write(tmp_path, "bad.csv", text)
-    with pytest.raises(FileFormatError) as error:
-        curves.read(path)
-    assert error.value.line == line
-    assert str(error.value).startswith(f"{path}, line {line}: ")
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.csv", ""),
-        ("a.csv", "\n\n"),
-        ("a.csv", "x,z\n"),
-        ("a.csv", "x,z\n1,1\n1,1\n"),
-        ("a.csv", b"\x00\xff\x93"),
-        ("a.csv", b"\xff\xfe0\x00,\x00"),
-        ("a.svg", ""),
-        ("a.svg", "<svg"),
-        ("a.svg", b"\x89PNG\x00\x01"),
-        ("a.svg", "<svg></svg>"),
-        ("a.svg", "<svg><path d='M0,0 L'/></svg>"),
-        ("a.svg", "<svg><path d='M 0 0'/></svg>"),
-        ("a.svg", "<svg><path d='M0,0 L5,5 Q nonsense'/></svg>"),
-        ("a.svg", "<svg><path d='M0,0 L1e300,0'/></svg>"),
-        ("a.svg", "<svg><path d='M0,0 L9,0'/><path d='M500,0 L600,0'/></svg>"),
-        ("a.svg", "<svg><path/></svg>"),
-        ("a.svg", "<svg><path d='M0,0 Lnan,9'/></svg>"),
-        ("a.svg", "<svg><circle cx='0' cy='0' r='0'/></svg>"),
-        ("a.svg", "<svg>" + "<g>" * 3000 + "</g>" * 3000 + "</svg>"),
-    ],
-)
-def test_files_that_hold_no_curve_are_refused_in_one_line(tmp_path, name, content):
-    path = write(tmp_path, name, content)
-    with pytest.raises(FileFormatError) as error:
-        curves.read(path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["missing.csv", "missing.svg", "."])
-def test_places_without_a_file_are_refused(tmp_path, name):
-    with pytest.raises(FileFormatError):
-        curves.read(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("drawing", "length", "closed"),
-    [
-        ("<path d='M100,0 L100,300 L500,300'/>", 7.0, False),
-        ("<path d='M0,0 h100 v100 h-100 z'/>", 4.0, True),
-        ("<circle cx='50' cy='50' r='100'/>", 2 * math.pi, True),
-        ("<path d='M-100,0 A100,100 0 0 1 100,0'/>", math.pi, False),
-        ("<g transform='scale(2)'><path d='M0,0 L100,0' transform='translate(7,9)'/></g>", 2.0, False),
-        ("<polyline points='0,0 100,0 100,100'/>", 2.0, False),
-        ("<path d='M0,0 L100,0'/><path d='M100,0 L100,100'/>", 2.0, False),
-        ("<rect x='0' y='0' width='900' height='900'/><path d='M0,0 L100,0'/>", 1.0, False),
-    ],
-)
-@pytest.mark.parametrize("xmlns", ["", " xmlns='http://www.w3.org/2000/svg'"])
-def test_svg_drawings_are_read(tmp_path, drawing, length, closed, xmlns):
-    curve = curves.read(write(tmp_path, "drawn.svg", f"<svg{xmlns}>{drawing}</svg>"))
-    assert curve.length == pytest.approx(length, rel=1e-4)
-    assert curve.closed is closed
-
-
-def test_an_svg_page_is_the_ground_seen_from_above(tmp_path):
-    path = write(tmp_path, "drawn.svg", "<svg><path d='M10,20 C 10,60 50,60 50,120'/></svg>")
-    curve = curves.read(path, metres_per_unit=0.1)
-    torch.testing.assert_close(
-        curve.points[[0, -1]], torch.tensor([[1.0, 2.0], [5.0, 12.0]], dtype=torch.float64)
-    )
-    t = 0.3  # Bernstein form of the drawn Bezier curve
-    weights = np.array([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
-    on_it = torch.tensor(weights @ np.array([[1, 2], [1, 6], [5, 6], [5, 12]]), dtype=torch.float64)
-    assert float((curve.point(curve.nearest(on_it)) - on_it).norm()) < 1e-4
-    assert curve.start_heading == pytest.approx(0, abs=0.05)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
-def test_scales_that_cannot_be_are_refused(tmp_path, scale):
-    path = write(tmp_path, "drawn.svg", "<svg><path d='M0,0 L100,0'/></svg>")
-    with pytest.raises(MapctlError):
-        curves.read(path, metres_per_unit=scale)
 
 
 def test_a_very_long_curve_is_coarser_rather_than_larger():

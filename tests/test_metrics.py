@@ -159,7 +159,7 @@ def test_measures_do_not_depend_on_place_and_direction():
     rng = np.random.default_rng(5)
     places = np.cumsum(rng.normal(size=(150, 2)) * 0.004 + [0.0, 0.004], axis=0)
     here = measure(walk(places, swing=0.15, wobble=0.004))
-    turned = np.stack([places[:, 1], -places[:, 0]], axis=1) + [5.0, -3.0]
+    turned = np.stack([places[:, 1], -places[:, 0]], axis=1) + np.array([5.0, -3.0])
     there = measure(walk(turned, headings=math.pi / 2, swing=0.15, wobble=0.004))
     assert here == pytest.approx(there, rel=1e-9)
 
