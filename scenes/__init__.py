@@ -1,0 +1,54 @@
+"""scenes: films of motions and scripted scenes.
+
+`scenes.film.film(actors, "walk.mp4")` films any motions; `scenes.load("crossing.toml")` reads a scene file.
+"""
+
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from scenes import film as film
+    from scenes.cameras import CameraSettings as CameraSettings
+    from scenes.description import Actor as Actor
+    from scenes.description import SceneDescription as SceneDescription
+    from scenes.description import load as load
+    from scenes.painters import back_end as back_end
+    from scenes.stage import Shot as Shot
+
+# Graphics libraries take seconds to import and may be missing, so public names arrive on first use.
+_HOMES = {
+    "CameraSettings": "scenes.cameras",
+    "Actor": "scenes.description",
+    "SceneDescription": "scenes.description",
+    "load": "scenes.description",
+    "film": "scenes.film",
+    "Shot": "scenes.stage",
+    "back_end": "scenes.painters",
+}
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module 'scenes' has no attribute {name!r}")
+    module = import_module(_HOMES[name])
+    return module if _HOMES[name] == f"scenes.{name}" else getattr(module, name)
+
+
+def ready() -> tuple[str, ...]:
+    """Names of the scenes that come with mapctl."""
+    return tuple(
+        sorted(p.name.removesuffix(".toml") for p in files("scenes").iterdir() if p.name.endswith(".toml"))
+    )
+
+
+def find(scene: str) -> Path:
+    """The path of a scene file or of a ready scene by name; RequestError lists these if there is neither."""
+    if Path(scene).is_file() or Path(scene).suffix:
+        return Path(scene)
+    if scene not in ready():
+        raise RequestError(f"no scene file {scene!r}; ready scenes: {', '.join(ready())}")
+    return Path(str(files("scenes") / f"{scene}.toml"))

@@ -1,0 +1,163 @@
+"""Cameras: where to look from so that everything is in the picture. Pure functions, no graphics library."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, cast
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import brentq
+
+from mapctl.errors import RequestError
+from scenes.shapes import Array, unit
+
+_UP = np.array([0.0, 1.0, 0.0])
+_ROOM = 1.12
+"""How much larger the picture is than what must be seen."""
+_MOST_FRAMES = 400
+"""Frames looked at to find the distance; more of a long motion would not change it."""
+
+
+_BOUNDS = (
+    ("azimuth_deg", -360, 360),
+    ("elevation_deg", 0, 89),
+    ("fov_deg", 5, 120),
+    ("zoom", 0.05, 20),
+    ("smooth_seconds", 0.01, 60),
+)
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How a film looks at its actors. The distance is always found from the motion."""
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}
+
+    kind: Literal["fixed", "follow", "top"] = "fixed"
+    """Fixed: everything in view all the time. Follow: with the actors, smoothly. Top: fixed, from above."""
+    azimuth_deg: float = 30.0
+    """Where the camera stands, degrees about +Y: 0 is +Z, 90 is +X. From the top: what is at the bottom."""
+    elevation_deg: float = 24.0
+    """How high it stands over the horizon, degrees, 0 to 89. Ignored from the top."""
+    fov_deg: float = 32.0
+    """Vertical field of view, degrees."""
+    zoom: float = 1.0
+    """Closer than needed (over 1) or further away; 2 halves the distance."""
+    smooth_seconds: float = 0.6
+    """How slowly a following camera moves: standard deviation of a Gaussian over time, seconds."""
+
+    def __post_init__(self):
+        if self.kind not in ("fixed", "follow", "top"):
+            raise RequestError(f"the camera must be fixed, follow or top, got {self.kind!r}")
+        for name, low, high in _BOUNDS:
+            if not low <= getattr(self, name) <= high:
+                raise RequestError(
+                    f"the camera's {name} must be {low:g} to {high:g}, got {getattr(self, name):g}"
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera at one moment."""
+
+    pose: Array
+    """(4, 4) camera to world, looking along its -z, y up in the picture."""
+    fov: float
+    """Vertical field of view, radians."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+
+    def project(self, points: Array) -> Array:
+        """(..., 3) world to (..., 3): pixels right, pixels down, metres in front of the camera."""
+        local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+        depth = -local[..., 2]
+        focal = self.height / 2 / np.tan(self.fov / 2)
+        safe = np.where(np.abs(depth) < 1e-6, 1e-6, depth)
+        right, down = (
+            local[..., 0] / safe * focal + self.width / 2,
+            -local[..., 1] / safe * focal + self.height / 2,
+        )
+        return np.stack([right, down, depth], axis=-1)
+
+
+def look_at(eye: Array, target: Array, up: Array = _UP) -> Array:
+    """(4, 4) camera-to-world pose at `eye`; straight up or down the picture's top is -Z."""
+    back = unit(np.asarray(eye, float) - target)
+    right = np.cross(up, back)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(np.array([0.0, 0.0, -1.0]), back)
+    right = unit(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = eye
+    return pose
+
+
+def orientation(settings: CameraSettings) -> Array:
+    """(3, 3) columns right, up and back of the camera."""
+    azimuth = np.radians(settings.azimuth_deg)
+    if settings.kind == "top":
+        bottom = np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
+        return np.stack([np.cross(-bottom, _UP), -bottom, _UP], axis=1)
+    elevation = np.radians(settings.elevation_deg)
+    level = np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
+    back = np.cos(elevation) * level + np.sin(elevation) * _UP
+    return look_at(back, np.zeros(3))[:3, :3]
+
+
+def fit(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
+    """The nearest place (3,) from which a camera with the given axes sees all points (n, 3), in the middle.
+
+    Each side of the picture bounds the eye by a plane. Left and right, and top and bottom, meet in two
+    lines; the eye lies on the further one, and is centred in the direction that has room left.
+    """
+    right, up, back = (points @ axes).T
+    wide, high = aspect * np.tan(fov / 2), np.tan(fov / 2)
+    away = max(_apex(right, back, wide), _apex(up, back, high))
+    depth = away - back
+    return axes @ np.array([_centred(right, depth), _centred(up, depth), away])
+
+
+def _apex(across: Array, back: Array, slope: float) -> float:
+    """How far back the tightest wedge of a slope starts that opens over all points."""
+    return float(((across / slope + back).max() + (-across / slope + back).max()) / 2)
+
+
+def _centred(across: Array, depth: Array) -> float:
+    """The place across that has the outermost points of both sides equally far from the middle."""
+    depth = np.maximum(depth, 1e-6)
+
+    def lopsided(place: float) -> float:
+        seen = (across - place) / depth
+        return float(seen.max() + seen.min())
+
+    return cast(float, brentq(lopsided, across.min() - 1e-6, across.max() + 1e-6, xtol=1e-6))
+
+
+def views(
+    settings: CameraSettings, points: Array, targets: Array, *, fps: float, size: tuple[int, int]
+) -> list[View]:
+    """One view a frame.
+
+    `points` (frames or 1, n, 3) must be seen; a following camera follows `targets` (frames, 3). `size` is
+    the picture's width and height, pixels.
+    """
+    axes, fov = orientation(settings), np.radians(settings.fov_deg)
+    centre = np.zeros_like(targets)
+    if settings.kind == "follow":
+        centre = gaussian_filter1d(targets, settings.smooth_seconds * fps, axis=0, mode="nearest")
+        centre[:, 1] = np.median(targets[:, 1])
+    seen = points - (centre[:, None] if len(points) == len(centre) else 0.0)
+    seen = seen[:: max(1, len(seen) // _MOST_FRAMES)].reshape(-1, 3)
+    framed = 2 * np.arctan(np.tan(fov / 2) * settings.zoom / _ROOM)
+    eye = fit(seen, axes, fov=framed, aspect=size[0] / size[1])
+    pose = np.eye(4)
+    pose[:3, :3] = axes
+    return [View(_moved(pose, eye + shift), float(fov), *size) for shift in centre]
+
+
+def _moved(pose: Array, eye: Array) -> Array:
+    moved = pose.copy()
+    moved[:3, 3] = eye
+    return moved

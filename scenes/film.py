@@ -1,0 +1,101 @@
+"""Films of motions: MP4, GIF, and a PNG contact sheet. Files appear whole or not at all."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from fractions import Fraction
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapctl.errors import RequestError
+from mapctl.formats import atomic
+from scenes.cameras import CameraSettings
+from scenes.painters import RendererName, painter
+from scenes.shapes import Array
+from scenes.sheet import contact_sheet
+from scenes.stage import Painter, Shot, Stage
+from scenes.writers import gif_writer, mp4_writer, save_png
+
+WRITERS = {".mp4": mp4_writer, ".gif": gif_writer}
+ENDINGS = (*WRITERS, ".png")
+"""What `film` can write."""
+_SMALLEST, _LARGEST = 16, 8192
+
+PathOrText = str | PathLike[str]
+
+
+def film(
+    actors: Sequence[tuple[Any, ...]],
+    out: PathOrText | Sequence[PathOrText],
+    *,
+    camera: CameraSettings | None = None,
+    size: tuple[int, int] = (1280, 720),
+    fps: Fraction | float | None = None,
+    renderer: RendererName | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Film the actors walking together; one pass serves all outputs. Returns the paths written.
+
+    `actors` are Shots, or tuples (motion, curve, colour, start seconds) of which all but the motion may be
+    left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
+    the way over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
+    them. `size` is the width and height in pixels (MP4 rounds up to even). `progress` is called with frames
+    done and all frames. `renderer` is that of `scenes.painters.painter`. RequestError for endings, sizes
+    and places that cannot be.
+    """
+    paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
+    stage, brush, camera = (
+        Stage([Shot(*actor) for actor in actors], fps),
+        painter(renderer),
+        camera or CameraSettings(),
+    )
+    moving, sheets = (
+        [p for p in paths if p.suffix.lower() in WRITERS],
+        [p for p in paths if p.suffix.lower() == ".png"],
+    )
+    if moving:
+        _shoot(moving, stage, brush, camera, size, progress)
+    if sheets:
+        picture = contact_sheet(stage, brush, camera, size)
+        for path in sheets:
+            save_png(path, picture)
+    return paths
+
+
+def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path]:
+    """The paths, or RequestError before any long work."""
+    width, height = size
+    if not (_SMALLEST <= width <= _LARGEST and _SMALLEST <= height <= _LARGEST):
+        raise RequestError(f"the size must be {_SMALLEST} to {_LARGEST} pixels a side, got {width}x{height}")
+    for path in out:
+        ending = Path(path).suffix.lower()
+        if ending not in ENDINGS:
+            raise RequestError(
+                f"cannot film to {fspath(path)}: unknown ending {ending!r}; allowed: {', '.join(ENDINGS)}"
+            )
+        atomic.check_writable(path)
+    return [Path(path) for path in out]
+
+
+def frames(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Iterator[Array]:
+    """Every picture of a film in turn, (height, width, 3) uint8."""
+    for frame, view in enumerate(stage.views(camera, size)):
+        yield brush.paint(view, stage.content(frame))
+
+
+def _shoot(
+    paths: Sequence[Path], stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int],
+    progress: Callable[[int, int], None] | None,
+) -> None:  # fmt: skip
+    with ExitStack() as open_files:
+        writers: list[Any] = []
+        for path in paths:
+            scratch = open_files.enter_context(atomic.atomic_path(path))
+            writers.append(open_files.enter_context(WRITERS[path.suffix.lower()](scratch, size, stage.fps)))
+        for done, picture in enumerate(frames(stage, brush, camera, size), start=1):
+            for write in writers:
+                write(np.ascontiguousarray(picture))
+            if progress is not None:
+                progress(done, stage.num_frames)

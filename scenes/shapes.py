@@ -1,0 +1,109 @@
+"""Coloured triangles, and the one solid everything round is made of.
+
+A rounded box is a sphere whose eight octants are moved apart: without extent it is a ball, with extent
+along one axis a capsule, along three a box with soft edges. Every body part is one, so a character is one
+array operation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles with a colour at every vertex; drawn in the order of its faces."""
+
+    vertices: Array
+    """(n, 3) world positions, metres."""
+    faces: Array
+    """(m, 3) vertex indices, counter-clockwise seen from outside."""
+    rgba: Array
+    """(n, 4) sRGB colour and opacity, 0 to 1."""
+    normals: Array | None = None
+    """(n, 3) unit normals of a lit surface; None for flat colour."""
+
+
+def merge(surfaces: Sequence[Surface]) -> Surface:
+    """One surface of all, faces in the order given. All are lit or none is."""
+    counts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
+    lit = surfaces[0].normals is not None
+    return Surface(
+        vertices=np.concatenate([s.vertices for s in surfaces]),
+        faces=np.concatenate([s.faces + start for s, start in zip(surfaces, counts, strict=False)]),
+        rgba=np.concatenate([s.rgba for s in surfaces]),
+        normals=np.concatenate([s.normals for s in surfaces if s.normals is not None]) if lit else None,
+    )
+
+
+@cache
+def ball(around: int = 16, up: int = 10) -> tuple[Array, Array]:
+    """Unit sphere (n, 3) and its triangles; no vertex lies on a coordinate plane, so that each has an octant.
+
+    `around` must be divisible by 4 and `up` even. The axis is y.
+    """
+    polar = (np.arange(up) + 0.5) * np.pi / up
+    turn = (np.arange(around) + 0.5) * 2 * np.pi / around
+    ring = np.stack([np.sin(turn), np.zeros(around), np.cos(turn)], axis=-1)
+    points = np.sin(polar)[:, None, None] * ring + np.cos(polar)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    index = np.arange(up * around).reshape(up, around)
+    a, b = index[:-1], index[1:]
+    right = [np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)]
+    quads = np.stack([a, b, right[1], right[0]], axis=-1).reshape(-1, 4)
+    sides = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], axis=-1)
+    caps = np.concatenate([index[0][fan], index[-1][fan[:, ::-1]]])
+    return points.reshape(-1, 3), np.concatenate([sides, caps])
+
+
+@dataclass(frozen=True, eq=False)
+class RoundedBoxes:
+    """Many rounded boxes at once; `parts` of them."""
+
+    centre: Array
+    """(parts, 3) world, metres."""
+    frame: Array
+    """(parts, 3, 3) rotation: columns are the box's axes in the world."""
+    half: Array
+    """(parts, 3) half extents without the rounding, metres."""
+    radius: Array
+    """(parts, 2) rounding at the lower and upper end of the box's y axis, metres."""
+    squash: Array
+    """(parts, 3) factor on the rounding along each axis."""
+    rgb: Array
+    """(parts, 3) sRGB."""
+
+    def surface(self) -> Surface:
+        """All boxes as one lit surface."""
+        sphere, faces = ball()
+        octant = np.sign(sphere)
+        radius = np.where(sphere[:, 1] < 0, self.radius[:, :1], self.radius[:, 1:])[..., None]
+        local = octant * self.half[:, None] + sphere * self.squash[:, None] * radius
+        normals = sphere / self.squash[:, None]
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        turned = np.swapaxes(self.frame, 1, 2)
+        parts, corners = local.shape[:2]
+        return Surface(
+            vertices=(local @ turned + self.centre[:, None]).reshape(-1, 3),
+            faces=(faces + corners * np.arange(parts)[:, None, None]).reshape(-1, 3),
+            rgba=np.repeat(np.column_stack([self.rgb, np.ones(parts)]), corners, axis=0),
+            normals=(normals @ turned).reshape(-1, 3),
+        )
+
+
+def frame_along(axis: Array, across: Array) -> Array:
+    """(..., 3, 3) rotations whose y column is `axis` and whose x column is as near to `across` as can be."""
+    y = unit(axis)
+    z = np.cross(across, y)
+    fallback = np.cross(np.where(np.abs(y[..., :1]) < 0.7, np.array([1.0, 0, 0]), np.array([0, 0, 1.0])), y)
+    z = unit(np.where(np.linalg.norm(z, axis=-1, keepdims=True) > 1e-6, z, fallback))
+    return np.stack([np.cross(y, z), y, z], axis=-1)
+
+
+def unit(vector: Array) -> Array:
+    """Vectors of length one; zero stays zero."""
+    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,193 @@
+"""Who is in a film and what lies on the ground, frame by frame, for whoever paints it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+
+from mapctl.contacts import planted
+from mapctl.curves import Curve
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from scenes import colours, overlays
+from scenes.body import Body
+from scenes.cameras import CameraSettings, View, views
+from scenes.parts import Side
+from scenes.shapes import Array, Surface, merge
+
+_RIBBON_STEP = 0.06
+
+
+class Shot(NamedTuple):
+    """One actor of a film; a plain tuple (motion, curve, colour, start) serves as well."""
+
+    motion: Motion
+    """On any rig and at any frame rate."""
+    curve: Curve | None = None
+    """What the actor was asked to follow."""
+    colour: str | None = None
+    """Name from `scenes.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
+    start_seconds: float = 0.0
+    """When the motion begins; until then the actor stands in its first pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """One body in one pose."""
+
+    body: Body
+    frame: int
+    fade: float = 0.0
+    """Share of the background in its colours; ghosts have some."""
+
+    def surface(self) -> Surface:
+        """Its skin."""
+        skin = self.body.surface(self.frame)
+        rgba = skin.rgba.copy()
+        rgba[:, :3] = colours.mix(rgba[:, :3], colours.rgb(colours.BACKGROUND), self.fade)
+        return Surface(skin.vertices, skin.faces, rgba, skin.normals)
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What one picture shows."""
+
+    ground: Sequence[Surface]
+    """Flat surfaces in the order in which they cover each other."""
+    figures: Sequence[Figure]
+
+
+class Painter(Protocol):
+    """Turns content into pixels."""
+
+    name: str
+
+    def paint(self, view: View, content: Content) -> Array:
+        """(height, width, 3) uint8."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """An actor made ready: its body, and its ribbons and contacts worked out once."""
+
+    body: Body
+    wish: Surface | None
+    trail: Surface
+    planted: Array
+    """(frames, feet) whether the foot stands."""
+    start: int
+    """Film frame of the motion's first."""
+
+    def frame(self, film_frame: int) -> int:
+        """The motion's frame at a film's; the first before it starts and the last after it ends."""
+        return min(max(film_frame - self.start, 0), self.body.num_frames - 1)
+
+
+class Stage:
+    """All actors on their ground. `fps` resamples every motion; by default the first actor's rate holds."""
+
+    def __init__(self, shots: Sequence[Shot], fps: Fraction | float | None = None):
+        if not shots:
+            raise RequestError("a film needs at least one actor")
+        self.fps = Fraction(fps or shots[0].motion.fps).limit_denominator(100_000)
+        self.players = [_player(shot, k, len(shots), self.fps) for k, shot in enumerate(shots)]
+        self.num_frames = max(p.start + p.body.num_frames for p in self.players)
+        self._grid = overlays.grid(self._places()[:, [0, 2]])
+        wishes = [player.wish for player in self.players if player.wish is not None]
+        self._still = merge([self._grid, *wishes])
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the film."""
+        return float(self.num_frames / self.fps)
+
+    def content(self, film_frame: int) -> Content:
+        """Everything at one frame."""
+        figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
+        trails = [
+            overlays.part_of_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)
+        ]
+        marks = [_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
+        ground = [self._still, *trails, *(m for m in marks if m is not None), *_shadows(figures)]
+        return Content(ground, figures)
+
+    def ghosts(self, film_frames: Sequence[int]) -> Content:
+        """All actors at several moments in one picture, earlier ones paler, with the whole trails."""
+        fades = np.linspace(0.62, 0.0, len(film_frames)) if len(film_frames) > 1 else [0.0]
+        moments = list(zip(film_frames, fades, strict=True))
+        figures = [
+            Figure(player.body, frame, fade)
+            for player in self.players
+            # A later ghost takes the place of one in the same pose: an actor who waits or has arrived.
+            for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
+        ]
+        trails = [overlays.part_of_ribbon(p.trail, p.frame(film_frames[-1]) + 1) for p in self.players]
+        return Content([self._still, *trails, *_shadows(figures)], figures)
+
+    def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
+        """One view a frame that shows all actors, and all curves unless the camera follows."""
+        index = [[p.frame(k) for k in range(self.num_frames)] for p in self.players]
+        bodies = [p.body.anatomy.seen[i] for p, i in zip(self.players, index, strict=True)]
+        hips = [p.body.anatomy.hips_world[i] for p, i in zip(self.players, index, strict=True)]
+        seen = np.concatenate(bodies, axis=1)
+        if settings.kind != "follow":
+            places = [p.wish.vertices for p in self.players if p.wish is not None]
+            still = np.concatenate([seen.reshape(-1, 3), *places])
+            seen = still[None]
+        return views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
+
+    def _places(self) -> Array:
+        """(n, 3) where anything happens, for the grid."""
+        paths = [p.body.anatomy.hips_world for p in self.players]
+        return np.concatenate([*paths, *(p.wish.vertices for p in self.players if p.wish is not None)])
+
+
+def _player(shot: Shot, number: int, count: int, fps: Fraction) -> Player:
+    if not 0 <= shot.start_seconds < 3600:
+        raise RequestError(f"start_seconds must be from 0 to 3600, got {shot.start_seconds:g}")
+    motion = shot.motion.resample(fps)
+    colour = colours.rgb(shot.colour or colours.default(number))
+    body = Body(motion, colour)
+    # One actor has a red wish and a yellow trail as in the paper; among several both must say whose they are.
+    wish, trod = colours.rgb(colours.WISH), colours.rgb(colours.TRAIL)
+    if count > 1:
+        wish, trod = colours.mix(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
+    ribbon = None if shot.curve is None else _wish(shot.curve, wish)
+    path = body.anatomy.hips_world[:, [0, 2]]
+    trail = overlays.ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT)
+    return Player(body, ribbon, trail, _planted(body, float(fps)), round(shot.start_seconds * fps))
+
+
+def _wish(curve: Curve, rgb: Array) -> Surface:
+    """A band along the curve; its dense points are thinned to what a picture shows."""
+    points = curve.points.detach().cpu().numpy()
+    keep = max(1, round(_RIBBON_STEP / max(curve.length / (len(points) - 1), 1e-6)))
+    thin = np.concatenate([points[:-1:keep], points[-1:]])
+    return overlays.ribbon(thin, width=0.11, rgb=rgb, height=overlays.WISH_HEIGHT)
+
+
+def _planted(body: Body, fps: float) -> Array:
+    balls = [foot.ball for foot in body.anatomy.feet]
+    if len(balls) != 2:
+        return np.zeros((body.num_frames, len(balls)), bool)
+    return planted(torch.from_numpy(body.anatomy.points.world[:, balls]), fps).numpy()
+
+
+def _marks(player: Player, frame: int) -> Surface | None:
+    """A disc under the ball of every foot that stands, in its side's colour."""
+    feet = [
+        foot for foot, stands in zip(player.body.anatomy.feet, player.planted[frame], strict=True) if stands
+    ]
+    if not feet:
+        return None
+    centres = player.body.anatomy.points.world[frame, [foot.ball for foot in feet]][:, [0, 2]]
+    sides = [colours.rgb(colours.LEFT if foot.side is Side.LEFT else colours.RIGHT) for foot in feet]
+    return overlays.discs(centres, np.array(sides), radius=0.1 * player.body.anatomy.scale)
+
+
+def _shadows(figures: Sequence[Figure]) -> list[Surface]:
+    return [overlays.shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(figures)]

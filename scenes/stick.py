@@ -1,0 +1,72 @@
+"""Stick figures by matplotlib, for machines without OpenGL: the same cameras, ground and colours."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenes import colours
+from scenes.cameras import View
+from scenes.shapes import Array, Surface
+
+if TYPE_CHECKING:
+    from scenes.stage import Content, Figure
+
+_NEAR = 0.1
+"""Nothing closer to the camera than this is drawn, metres."""
+_DPI = 100
+
+
+class StickPainter:
+    """Paints bones as thick lines. Raises ImportError where there is no matplotlib."""
+
+    name = "matplotlib (stick figures)"
+
+    def __init__(self):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure as Sheet
+
+        self._sheet = Sheet(dpi=_DPI, facecolor=colours.BACKGROUND)
+        self._canvas = FigureCanvasAgg(self._sheet)
+
+    def paint(self, view: View, content: "Content") -> Array:
+        """The picture, (height, width, 3) uint8."""
+        self._sheet.clear()
+        self._sheet.set_size_inches(view.width / _DPI, view.height / _DPI)
+        axes = self._sheet.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        axes.set(xlim=(0, view.width), ylim=(view.height, 0))
+        for surface in content.ground:
+            _draw_flat(axes, view, surface)
+        for figure in content.figures:
+            _draw_figure(axes, view, figure)
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[: view.height, : view.width, :3].copy()
+
+
+def _draw_flat(axes, view: View, surface: Surface) -> None:
+    from matplotlib.collections import PolyCollection
+
+    corners = view.project(surface.vertices)[surface.faces]
+    rgba = surface.rgba[surface.faces].mean(axis=1)
+    shown = (corners[..., 2] > _NEAR).all(axis=1) & (rgba[:, 3] > 0.02)
+    # Without antialiasing neighbours meet without a seam, which smooth shadows need.
+    axes.add_collection(
+        PolyCollection(list(corners[shown, :, :2]), facecolors=rgba[shown], linewidths=0, antialiaseds=False)
+    )
+
+
+def _draw_figure(axes, view: View, figure: "Figure") -> None:
+    from matplotlib.collections import LineCollection
+
+    ends, radii, rgb = figure.body.sticks(figure.frame)
+    flat = view.project(ends)
+    depth = flat[..., 2].mean(axis=1)
+    order = np.argsort(-depth)[depth[np.argsort(-depth)] > _NEAR]
+    focal = view.height / 2 / np.tan(view.fov / 2)
+    points = np.maximum(1.0, 1.3 * radii * focal / np.maximum(depth, _NEAR)) * 72 / _DPI
+    shown = colours.mix(rgb, colours.rgb(colours.BACKGROUND), figure.fade)
+    axes.add_collection(
+        LineCollection(
+            list(flat[order, :, :2]), linewidths=points[order], colors=shown[order], capstyle="round"
+        )
+    )
