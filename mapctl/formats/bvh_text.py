@@ -47,9 +47,11 @@ def read(path: str | PathLike[str]) -> BvhText:
     text, encoding = _decode(path, read_bytes(path))
     scanner = Scanner(path, text)
     hierarchy = read_hierarchy(scanner)
-    frames = _frame_count(scanner)
+    frames, frames_line = _frame_count(scanner), scanner.line
     frame_time = _frame_time(scanner)
-    return BvhText(hierarchy, frame_time, _values(scanner, hierarchy.labels(), frames), encoding)
+    labels = hierarchy.labels()
+    values = _values(scanner, labels, frames=frames, frames_line=frames_line)
+    return BvhText(hierarchy, frame_time, values, encoding)
 
 
 def _decode(path: str | PathLike[str], raw: bytes) -> tuple[str, str]:
@@ -82,21 +84,22 @@ def _frame_time(scanner: Scanner) -> str:
     return word
 
 
-def _values(scanner: Scanner, labels: Sequence[str], frames: int) -> np.ndarray:
+def _values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int) -> np.ndarray:
     """The motion block as (frames, channels). Parsed in one go; only a fault is looked for by row."""
     expected = frames * len(labels)
     if expected == 0:
         scanner.fail("no joint has any CHANNELS, expected at least one")
-    # Rows may be wrapped where the total is right. Counted first, so a declared number allocates nothing.
-    if sum(len(row.split()) for _, row in _rows(scanner)) == expected:
-        try:
-            values = np.fromstring(scanner.text[scanner.stop :], sep=" ")
-        except ValueError:
-            values = np.empty(0)
-        # `1.5.2` parses as two values, so their number is checked too; NaN compares as not small.
-        if values.size == expected and bool((np.abs(values) < LARGEST_VALUE).all()):
-            return values.reshape(frames, len(labels))
-    raise _fault(scanner, labels, frames)
+    try:
+        values = np.fromstring(scanner.text[scanner.stop :], sep=" ")
+    except ValueError:
+        values = np.empty(0)
+    # NaN compares as not small. `1.5.2` was parsed as two values, so words are counted too.
+    sound = values.size == expected and bool((np.abs(values) < LARGEST_VALUE).all())
+    if sound and sum(len(row.split()) for _, row in _rows(scanner)) == expected:
+        return values.reshape(frames, len(labels))
+    raise _fault(scanner, labels, may_wrap=values.size == expected) or FileFormatError(
+        scanner.path, f"'Frames: {frames}' but {sum(1 for _ in _rows(scanner))} rows follow", frames_line
+    )
 
 
 def _rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
@@ -111,23 +114,21 @@ def _rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
         start, line = stop + 1, line + 1
 
 
-def _fault(scanner: Scanner, labels: Sequence[str], frames: int) -> FileFormatError:
-    """What is wrong with the motion block: its first bad value, else its first bad row, else their number."""
-    found, bad_row = 0, None
+def _fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool) -> FileFormatError | None:
+    """The first value that is none, or the first row of a wrong length (where rows may not be wrapped)."""
+    read = 0
     for line, row in _rows(scanner):
         words = _DATUM.findall(row)
-        for column, word in enumerate(words):
+        for place, word in enumerate(words, read):
             if finite_number(word) is None:
-                label = labels[column] if column < len(labels) else "beyond the last channel"
-                place = f"frame {found}, column {column + 1} ({label})"
-                message = f"{place}: expected {NUMBER}, got {shorten(word)}"
-                return FileFormatError(scanner.path, message, line)
-        if len(words) != len(labels) and bad_row is None:
-            message = f"frame {found} has {len(words)} values, expected {len(labels)}"
-            bad_row = FileFormatError(scanner.path, message, line)
-        found += 1
-    count = FileFormatError(scanner.path, f"'Frames: {frames}' but {found} rows follow", scanner.line)
-    return bad_row or count
+                frame, column = divmod(place, len(labels))
+                where = f"frame {frame}, column {column + 1} ({labels[column]})"
+                return FileFormatError(scanner.path, f"{where}: expected {NUMBER}, got {shorten(word)}", line)
+        if len(words) != len(labels) and not may_wrap:
+            count = f"frame {read // len(labels)} has {len(words)} values, expected {len(labels)}"
+            return FileFormatError(scanner.path, count, line)
+        read += len(words)
+    return None
 
 
 def compose(hierarchy: Hierarchy, frame_time: str, values: np.ndarray, *, decimals: int) -> str:

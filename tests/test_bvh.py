@@ -1,0 +1,412 @@
+"""BVH reading and writing against an independent reading of the format, over every channel layout."""
+
+import time
+from dataclasses import replace
+from fractions import Fraction
+from itertools import product
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from mapctl import formats, rotations
+from mapctl.errors import MapctlError, RequestError
+from mapctl.formats import bvh, bvh_text
+from mapctl.formats.frame_rate import frame_rate
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+
+AXES = "XYZ"
+EULER_ORDERS = [order for order in product(range(3), repeat=3) if order[0] != order[1] != order[2]]
+PLAIN = """HIERARCHY
+ROOT hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT leftUpperLeg
+  {
+    OFFSET 10 0 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT leftFoot
+    {
+      OFFSET 0 -80 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET 0 0 10
+      }
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0333333
+1 90 3 10 20 30 1 2 3 0.1 -0.2 0.3
+2 91 4 11 21 31 2 3 4 0.2 -0.3 100
+"""
+
+
+def turn(axis: int, degrees: float) -> np.ndarray:
+    """Rotation matrix about one axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = np.cos(np.radians(degrees))
+    matrix[j, i] = np.sin(np.radians(degrees))
+    matrix[i, j] = -matrix[j, i]
+    return matrix
+
+
+def world(tree, values):
+    """World positions (frames, joints, 3) and matrices, straight from the definition of the channels."""
+    places, turns = (
+        np.zeros((len(values), len(tree.names), 3)),
+        np.zeros((len(values), len(tree.names), 3, 3)),
+    )
+    for frame, row in enumerate(values):
+        numbers = iter(row)
+        for joint, parent in enumerate(tree.parents):
+            place, rotation = np.array(tree.offsets[joint]), np.eye(3)
+            for channel in tree.channels[joint]:
+                axis, value = AXES.index(channel[0]), next(numbers)
+                if channel.endswith("position"):
+                    place[axis] = value
+                else:
+                    rotation = rotation @ turn(axis, value)
+            up_place, up_turn = (places[frame, parent], turns[frame, parent]) if joint else (0, np.eye(3))
+            places[frame, joint], turns[frame, joint] = up_place + up_turn @ place, up_turn @ rotation
+    return places, turns
+
+
+def agrees(path, places, turns, scale):
+    """Within 0.01 mm and 0.001 degree, as files of 6 decimals allow."""
+    motion = bvh.load(path)
+    found = rotations.to_matrix(motion.joint_rotations()).numpy()
+    angle = np.degrees(2 * np.arcsin(np.linalg.norm(found - turns, axis=(-1, -2)) / np.sqrt(8)))
+    assert np.abs(motion.joint_positions().numpy() - places * scale).max() < 1e-5
+    assert angle.max() < 1e-3
+    return motion
+
+
+@st.composite
+def channel_lists(draw):
+    order = draw(st.sampled_from(EULER_ORDERS))[: draw(st.integers(0, 3))]
+    positions = draw(st.permutations(range(3)))[: draw(st.sampled_from((0, 0, 1, 3)))]
+    names = [AXES[a] + "position" for a in positions] + [AXES[a] + "rotation" for a in order]
+    return tuple(names)
+
+
+@st.composite
+def files(draw):
+    """A small tree of any shape and layout, a number of frames and a seed."""
+    joints = draw(st.integers(1, 5))
+    stack, parents = [], []
+    for joint in range(joints):
+        # Depth first: a parent is the last joint or one that encloses it.
+        del stack[draw(st.integers(1, max(1, len(stack)))) :]
+        parents.append(stack[-1] if stack else -1)
+        stack.append(joint)
+    channels = [draw(channel_lists()) for _ in range(joints)]
+    channels[0] = channels[0] or ("Yrotation",)
+    return parents, channels, draw(st.integers(1, 4)), draw(st.integers(0, 2**32 - 1))
+
+
+def content(parents, channels, frames, seed):
+    """Offsets and channel values for a drawn layout."""
+    random, joints = np.random.default_rng(seed), len(parents)
+    offsets = random.normal(0, 40, (joints, 3)).round(4)
+    names, ends = tuple(f"joint{j}" for j in range(joints)), {joints - 1: (0.0, 5.0, 0.0)}
+    offsets = tuple((x, y, z) for x, y, z in offsets.tolist())
+    tree = bvh_text.Hierarchy(names, tuple(parents), offsets, tuple(channels), ends)
+    values = random.uniform(-180, 180, (frames, len(tree.labels()))).round(4)
+    return tree, values
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(files())
+def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_factory, file):
+    tree, values = content(*file)
+    folder = tmp_path_factory.mktemp("layout")
+    first, second, third = (folder / f"{name}.bvh" for name in ("first", "second", "third"))
+    first.write_text(bvh_text.compose(tree, "0.0333333", values, decimals=6))
+    places, turns = world(tree, values)
+    motion = agrees(first, places, turns, bvh.load(first).source.metres_per_unit)
+    motion.save(second)
+    again = agrees(second, places, turns, motion.source.metres_per_unit)
+    assert again.source.hierarchy.channels == tree.channels
+    assert again.source.frame_time == "0.0333333"
+    again.save(third)
+    motion.save(first)
+    assert first.read_bytes() == second.read_bytes()
+    assert np.abs(bvh_text.read(third).values - bvh_text.read(second).values).max() < 1e-4
+
+
+QUIRKS = {
+    "tabs": lambda t: t.replace("  ", "\t"),
+    "CRLF": lambda t: t.replace("\n", "\r\n"),
+    "CR": lambda t: t.replace("\n", "\r"),
+    "mark": lambda t: "\ufeff" + t,
+    "scientific": lambda t: t.replace("1 90 3", "1e0 9.0E+1 0.3e1"),
+    "spaced colon": lambda t: t.replace("Frames:", "Frames :").replace("Frame Time:", "Frame  Time :"),
+    "no space after colon": lambda t: t.replace("Frames: ", "Frames:").replace("Time: ", "time:"),
+    "tab after colon": lambda t: t.replace("Frames: ", "Frames:\t").replace("Time: ", "Time:\t"),
+    "no colon": lambda t: t.replace("Frames:", "Frames").replace("Frame Time:", "FrameTime"),
+    "lower case": lambda t: t.lower().replace("leftupperleg", "leftUpperLeg").replace("leftfoot", "leftFoot"),
+    "braces on the line": lambda t: t.replace("\n{", " {").replace("\n  {", "{").replace("}\n  }\n}", "}}}"),
+    "one line": lambda t: t.split("MOTION")[0].replace("\n", " ") + "\nMOTION" + t.split("MOTION")[1],
+    "blank lines": lambda t: t.replace("\n", "\n\n  \n"),
+    "no end": lambda t: t.replace("End Site", "").replace("      {\n        OFFSET 0 0 10\n      }\n", ""),
+    "named end": lambda t: t.replace("End Site", "End toe_tip"),
+    "wrapped rows": lambda t: t.replace(" 10 20 30 ", "\n10 20 30\n"),
+    "no last line feed": lambda t: t.rstrip(),
+    "trailing blanks": lambda t: t.replace("\n", "  \n"),
+    "plus signs": lambda t: t.replace("1 90 3", "+1 +90 +3."),
+}
+
+
+@pytest.mark.parametrize("quirk", QUIRKS)
+def test_quirk_reads_as_the_plain_file(quirk, tmp_path):
+    (tmp_path / "plain.bvh").write_text(PLAIN)
+    (tmp_path / "quirk.bvh").write_bytes(QUIRKS[quirk](PLAIN).encode())
+    assert QUIRKS[quirk](PLAIN) != PLAIN
+    plain, odd = bvh.load(tmp_path / "plain.bvh"), bvh.load(tmp_path / "quirk.bvh")
+    assert odd.skeleton.names == plain.skeleton.names == ("hips", "leftUpperLeg", "leftFoot")
+    assert torch.equal(odd.joint_positions(), plain.joint_positions())
+    assert torch.equal(odd.local_quat_xyzw, plain.local_quat_xyzw)
+    assert odd.fps == plain.fps == 30
+
+
+@pytest.mark.parametrize("name", ["mixamorig:LeftFoot", "Left Foot", "foot.L", "左足", "MOTION", "OFFSET 1"])
+def test_names_come_through_a_round_trip(name, tmp_path):
+    (tmp_path / "in.bvh").write_text(PLAIN.replace("leftFoot", name), encoding="utf-8")
+    bvh.load(tmp_path / "in.bvh").save(tmp_path / "out.bvh")
+    assert bvh.load(tmp_path / "out.bvh").skeleton.names[2] == name
+
+
+def test_a_name_in_an_old_encoding_goes_back_as_the_same_bytes(tmp_path):
+    raw = PLAIN.replace("leftFoot", "Fuß").encode("latin-1")
+    (tmp_path / "in.bvh").write_bytes(raw)
+    bvh.load(tmp_path / "in.bvh").save(tmp_path / "out.bvh")
+    assert "Fuß".encode("latin-1") in (tmp_path / "out.bvh").read_bytes()
+
+
+RATES = {
+    "0.0333333": 30, "0.033333": 30, "0.0333": 30, "0.033": 30, "0.033333333333333333": 30, "3.33333e-2": 30,
+    "0.03333333507180214": 30, "0.00833333": 120, "0.0083333": 120, "0.008333": 120, "0.016667": 60,
+    "0.016666": 60, "0.0166667": 60, "0.0416667": 24, "0.041667": 24, "0.041708": Fraction(24000, 1001),
+    "0.0417083": Fraction(24000, 1001), "0.033367": Fraction(30000, 1001), "0.0166833": Fraction(60000, 1001),
+    "0.04": 25, "0.02": 50, "0.01": 100, "0.1": 10, "0.08": Fraction(25, 2), "1": 1, "0.0142857": 70,
+    "0.00694444": 144, "0.011111": 90,
+    "0.133333": Fraction(15, 2),
+    "0.033898305": Fraction(59, 2), "0.0345678": Fraction(10**7, 345678),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", RATES)
+def test_frame_time_is_read_as_the_rate_it_was_printed_from(text):
+    assert frame_rate(text) == RATES[text]
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.integers(1, 999), st.integers(6, 12))
+def test_every_whole_rate_survives_its_print(fps, digits):
+    assert abs(frame_rate(f"{1 / fps:.{digits}f}") - fps) / fps <= 0.5 * 10.0**-digits * fps
+    assert frame_rate(f"{1 / fps:.9f}") == fps
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01, 0.0254, 0.056444])
+@pytest.mark.parametrize("named", [True, False])
+def test_unit_is_found_by_the_size_of_the_body_and_undone(unit, named, tmp_path):
+    motion = standing()
+    bones = motion.skeleton.offsets.numpy() / unit
+    names = tuple(motion.skeleton.names if named else (f"bone{j}" for j in range(motion.num_joints)))
+    motion = replace(motion, skeleton=replace(motion.skeleton, names=names, end_offsets={}))
+    motion.save(tmp_path / "cm.bvh")
+    text = bvh_text.read(tmp_path / "cm.bvh")
+    offsets = tuple(tuple(float(x) * 0.01 / unit for x in offset) for offset in text.hierarchy.offsets)
+    tree = replace(text.hierarchy, offsets=offsets)
+    values = text.values.copy()
+    values[:, :3] *= 0.01 / unit
+    (tmp_path / "unit.bvh").write_text(bvh_text.compose(tree, "0.0333333", values, decimals=8))
+    read = bvh.load(tmp_path / "unit.bvh")
+    assert read.source.metres_per_unit == unit
+    torch.testing.assert_close(read.root_position, motion.root_position, atol=1e-6, rtol=0)
+    read.save(tmp_path / "back.bvh")
+    back = np.array(bvh_text.read(tmp_path / "back.bvh").hierarchy.offsets)
+    order = [names.index(name) for name in tree.names]
+    assert np.abs(back[1:] - bones[order][1:]).max() < 1e-5 / unit
+
+
+def standing(frames=20, seed=0) -> Motion:
+    """Smooth random movement of the canonical skeleton."""
+    generator = torch.Generator().manual_seed(seed)
+    start, stop = torch.randn(2, 21, 3, generator=generator, dtype=torch.float64)
+    weight = torch.linspace(0, 1, frames, dtype=torch.float64)[:, None, None]
+    quat = rotations.from_rotation_vector(start + weight * (stop - start))
+    root = torch.cat([weight[:, :, 0], weight[:, :, 0] * 0 + 0.95, weight[:, :, 0] * 2], dim=1)
+    return Motion(CANONICAL, Fraction(30), root, quat)
+
+
+def test_a_motion_without_source_is_written_in_the_plain_layout(tmp_path):
+    motion = standing()
+    motion.save(tmp_path / "out.bvh")
+    tree = bvh_text.read(tmp_path / "out.bvh").hierarchy
+    assert tree.offsets[0] == (0, 0, 0)
+    assert tree.channels[0] == ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
+    assert set(tree.channels[1:]) == {("Zrotation", "Xrotation", "Yrotation")}
+    assert "Frame Time: 0.033333333\n" in (tmp_path / "out.bvh").read_text()
+    read = bvh.load(tmp_path / "out.bvh")
+    order = [read.skeleton.index(name) for name in CANONICAL.names]
+    assert set(read.skeleton.names) == set(CANONICAL.names)
+    assert read.skeleton.names[4:7] == ("head", "leftShoulder", "leftUpperArm")
+    torch.testing.assert_close(read.joint_positions()[:, order], motion.joint_positions(), atol=1e-7, rtol=0)
+    for name, offset in CANONICAL.end_offsets.items():
+        assert read.skeleton.end_offsets[name] == pytest.approx(offset, abs=1e-8)
+
+
+def test_still_six_channel_joints_are_bones_and_travelling_ones_are_not(tmp_path):
+    text = PLAIN.replace("CHANNELS 3 Zr", "CHANNELS 6 Xposition Yposition Zposition Zr")
+    head = text.split("Frames:")[0]
+    rows = "5 0 0 0 0 0 10 90 0 1 2 3 0 -79 1 4 5 6\n5 0 0 0 0 0 11 90 0 1 2 3 0 -79 1 4 5 6\n"
+    (tmp_path / "in.bvh").write_text(f"{head}Frames: 2\nFrame Time: 0.01\n{rows}")
+    motion = bvh.load(tmp_path / "in.bvh")
+    assert list(motion.moving_offsets) == [1]
+    assert motion.moving_offsets[1].tolist() == [[0.10, 0.9, 0], [0.11, 0.9, 0]]
+    assert motion.skeleton.offsets[2].tolist() == [0, -0.79, 0.01]
+    assert motion.root_position.tolist() == [[0.05, 0, 0], [0.05, 0, 0]]
+    motion.save(tmp_path / "out.bvh")
+    before, after = (bvh_text.read(tmp_path / f"{name}.bvh") for name in ("in", "out"))
+    assert np.abs(before.values - after.values).max() < 1e-5
+    assert before.hierarchy == after.hierarchy
+
+
+def test_positions_that_repeat_the_offset_up_to_rounding_are_the_offset(tmp_path):
+    text = PLAIN.replace("CHANNELS 3 Zr", "CHANNELS 6 Xposition Yposition Zposition Zr")
+    row = "5 0 0 0 0 0 10.00001 0 -0.00002 1 2 3 0 -80 0 4 5 6\n"
+    (tmp_path / "in.bvh").write_text(f"{text.split('Frames:')[0]}Frames: 1\nFrame Time: 0.01\n{row}")
+    assert bvh.load(tmp_path / "in.bvh").skeleton.offsets[1].tolist() == [0.1, 0, 0]
+
+
+def test_the_way_of_a_travelling_joint_does_not_count_as_body(tmp_path):
+    text = PLAIN.replace("CHANNELS 3 Zr", "CHANNELS 6 Xposition Yposition Zposition Zr").replace(
+        "leftFoot", "b"
+    )
+    rows = "0 0 0 0 0 0 10 95 0 1 2 3 0 -120 0 4 5 6\n0 0 0 0 0 0 400 90 0 1 2 3 0 -120 0 4 5 6\n"
+    text = text.replace("OFFSET 10 0 0", "OFFSET 4 90 -400")
+    (tmp_path / "in.bvh").write_text(f"{text.split('Frames:')[0]}Frames: 2\nFrame Time: 0.01\n{rows}")
+    assert bvh.load(tmp_path / "in.bvh").source.metres_per_unit == 0.01
+
+
+def test_channels_are_added_where_the_source_cannot_hold_the_motion(tmp_path):
+    text = PLAIN.replace("CHANNELS 6 Xposition Yposition Zposition Zr", "CHANNELS 3 Zr").replace(
+        "CHANNELS 3 Zrotation Xrotation Yrotation\n      End", "CHANNELS 1 Xrotation\n      End"
+    )
+    head = text.split("Frames:")[0]
+    rows = "10 20 30 1 2 3 7\n" * 20
+    (tmp_path / "in.bvh").write_text(f"{head}Frames: 20\nFrame Time: 0.0333333\n{rows}")
+    source = bvh.load(tmp_path / "in.bvh")
+    moved = standing()
+    wanted = replace(source, root_position=moved.root_position, local_quat_xyzw=moved.local_quat_xyzw[:, :3])
+    wanted.save(tmp_path / "out.bvh")
+    read = bvh.load(tmp_path / "out.bvh")
+    assert [len(channels) for channels in read.source.hierarchy.channels] == [6, 3, 3]
+    torch.testing.assert_close(read.joint_positions(), wanted.joint_positions(), atol=1e-7, rtol=0)
+
+
+def test_resampled_motion_states_its_own_frame_time(tmp_path):
+    (tmp_path / "in.bvh").write_text(PLAIN)
+    bvh.load(tmp_path / "in.bvh").resample(120).save(tmp_path / "out.bvh")
+    assert bvh.load(tmp_path / "out.bvh").fps == 120
+
+
+def written_angles(quat, order, tmp_path):
+    """What is written in the three channels of a single joint, degrees."""
+    tree = bvh_text.Hierarchy(
+        ("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {}
+    )
+    (tmp_path / "in.bvh").write_text(bvh_text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
+    source = bvh.load(tmp_path / "in.bvh")
+    root = torch.zeros(len(quat), 3, dtype=torch.float64)
+    replace(source, root_position=root, local_quat_xyzw=quat[:, None]).save(tmp_path / "out.bvh")
+    return bvh_text.read(tmp_path / "out.bvh").values
+
+
+def euler_quat(degrees, order):
+    """Quaternions of angles (frames, 3) by matrices."""
+    turns = [turn(order[0], a) @ turn(order[1], b) @ turn(order[2], c) for a, b, c in degrees]
+    return rotations.sign_continuous(rotations.from_matrix(torch.from_numpy(np.array(turns))))
+
+
+@pytest.mark.parametrize("order", EULER_ORDERS)
+def test_angles_are_written_continuous_through_turns_and_past_the_middle_axis_range(order, tmp_path):
+    # The middle angle leaves its principal range on the way, and the outer ones wind up.
+    steps = np.linspace(0, 1, 200)[:, None]
+    degrees = np.array([10.0, 20.0, -30.0]) + steps * np.array([800.0, 145.0, -500.0])
+    assert np.abs(written_angles(euler_quat(degrees, order), order, tmp_path) - degrees).max() < 1e-5
+
+
+@pytest.mark.parametrize("order", EULER_ORDERS)
+def test_gimbal_lock_keeps_the_rotation_and_does_not_jump(order, tmp_path):
+    steps = np.linspace(0, 1, 50)
+    locked = np.full(50, 0.0 if order[0] == order[2] else 90.0)
+    degrees = np.stack([20 + 100 * steps, locked, 40 - 10 * steps], axis=1)
+    quat = euler_quat(degrees, order)
+    written = written_angles(quat, order, tmp_path)
+    assert np.abs(np.diff(written, axis=0)).max() < 3
+    assert ((euler_quat(written, order) * quat).sum(-1).abs() > 1 - 1e-12).all()
+
+
+def test_the_same_motion_is_written_as_the_same_bytes_without_negative_zeros(tmp_path):
+    for name in ("a", "b"):
+        standing().save(tmp_path / f"{name}.bvh")
+    content = (tmp_path / "a.bvh").read_bytes()
+    assert content == (tmp_path / "b.bvh").read_bytes()
+    assert b"-0.000000 " not in content
+
+
+@pytest.mark.parametrize("what", ["root_position", "local_quat_xyzw"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_motion_that_is_not_finite_is_refused_and_nothing_is_left(what, bad, tmp_path):
+    values = getattr(standing(), what).clone()
+    values[7] = bad
+    with pytest.raises(RequestError, match="hips at frame 7"):
+        replace(standing(), **{what: values}).save(tmp_path / "out.bvh")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["", " hips", "a{b", "a\nb"])
+def test_names_that_bvh_cannot_hold_are_refused(name, tmp_path):
+    skeleton = replace(CANONICAL, names=(name, *CANONICAL.names[1:]))
+    with pytest.raises(RequestError, match="joint name"):
+        replace(standing(), skeleton=skeleton).save(tmp_path / "out.bvh")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("fps", [Fraction(1, 1000), Fraction(10**7)])
+def test_a_frame_rate_out_of_range_is_refused(fps, tmp_path):
+    with pytest.raises(RequestError, match="frames per second"):
+        replace(standing(), fps=fps).save(tmp_path / "out.bvh")
+
+
+def test_a_long_capture_is_read_and_written_quickly(tmp_path):
+    names = tuple(f"joint{j}" for j in range(31))
+    tree = bvh_text.Hierarchy(names, tuple(range(-1, 30)), ((0.0, 5.0, 0.0),) * 31,
+                              (("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation"),
+                               *[("Zrotation", "Xrotation", "Yrotation")] * 30), {})  # fmt: skip
+    values = np.random.default_rng(0).uniform(-180, 180, (5000, 96))
+    (tmp_path / "in.bvh").write_text(bvh_text.compose(tree, "0.00833333", values, decimals=6))
+    start = time.perf_counter()
+    motion = bvh.load(tmp_path / "in.bvh")
+    read = time.perf_counter()
+    motion.save(tmp_path / "out.bvh")
+    # Ten times what an idle machine takes.
+    assert read - start < 1.5
+    assert time.perf_counter() - read < 3
+
+
+def test_unknown_endings_name_the_known_ones(tmp_path):
+    with pytest.raises(MapctlError, match=r"'\.fbx'; allowed: \.bvh, \.npz"):
+        formats.load(tmp_path / "walk.fbx")
+    with pytest.raises(RequestError, match=r"'\.fbx'; allowed: \.bvh, \.npz"):
+        standing().save(tmp_path / "walk.fbx")

@@ -1,0 +1,186 @@
+"""npz archives keep a motion exactly; broken ones are refused; outputs appear whole or not at all."""
+
+import io
+import os
+from dataclasses import replace
+from fractions import Fraction
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from mapctl import formats
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats import npz
+from mapctl.formats.atomic import atomic_path, check_writable, write_text
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+
+
+def example(frames=5, fps=Fraction(24000, 1001), seed=0) -> Motion:
+    generator = torch.Generator().manual_seed(seed)
+    root, quat, track = (
+        torch.randn(frames, *shape, generator=generator, dtype=torch.float64)
+        for shape in ((3,), (21, 4), (3,))
+    )
+    return Motion(CANONICAL, fps, root, torch.nn.functional.normalize(quat, dim=-1), {4: track})
+
+
+def archive(motion: Motion, **changes) -> bytes:
+    """The archive of a motion with some keys changed, or left out where the change is None."""
+    arrays = {**npz._arrays(motion), **changes}
+    buffer = io.BytesIO()
+    np.savez(buffer, **{key: values for key, values in arrays.items() if values is not None})
+    return buffer.getvalue()
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(st.integers(1, 9), st.fractions(Fraction(1, 10), 1000, max_denominator=10**6), st.integers(0, 99))
+def test_a_motion_comes_back_exactly(tmp_path_factory, frames, fps, seed):
+    motion, path = example(frames, fps, seed), tmp_path_factory.mktemp("npz") / "walk.npz"
+    motion.save(path)
+    read = formats.load(path)
+    assert read.fps == fps
+    assert (read.skeleton.names, read.skeleton.parents) == (CANONICAL.names, CANONICAL.parents)
+    assert read.skeleton.end_offsets == CANONICAL.end_offsets
+    assert torch.equal(read.skeleton.offsets, CANONICAL.offsets)
+    assert torch.equal(read.root_position, motion.root_position)
+    assert torch.equal(read.local_quat_xyzw, motion.local_quat_xyzw)
+    assert torch.equal(read.moving_offsets[4], motion.moving_offsets[4])
+    first = path.read_bytes()
+    read.save(path)
+    assert path.read_bytes() == first
+
+
+def test_the_keys_are_the_documented_ones(tmp_path):
+    example().save(tmp_path / "walk.npz")
+    with np.load(tmp_path / "walk.npz", allow_pickle=False) as arrays:
+        assert all(f"`{key}`" in npz.__doc__ for key in arrays)
+        assert arrays["local_quat_xyzw"].shape == (5, 21, 4)
+        assert arrays["moving_offsets"].shape == (1, 5, 3)
+
+
+QUAT = npz._arrays(example())["local_quat_xyzw"]
+CHANGES = {
+    "missing": ({"parents": None, "fps": None}, "lacks the keys parents, fps"),
+    "other version": ({"format": np.array("mapctl-motion-9")}, "format is 'mapctl-motion-9'"),
+    "fewer joints": ({"local_quat_xyzw": QUAT[:, :20]}, r"local_quat_xyzw .* expected .*\(5, 21, 4\)"),
+    "fewer frames": ({"local_quat_xyzw": QUAT[:4]}, r"local_quat_xyzw .* expected .*\(5, 21, 4\)"),
+    "whole numbers": ({"offsets": np.zeros((21, 3), int)}, "offsets has int64"),
+    "nan": ({"root_position_world": np.full((5, 3), np.nan)},
+            r"root_position_world is not finite at \[0, 0\]"),
+    "no rotation": ({"local_quat_xyzw": QUAT * 0}, "no unit quaternion"),
+    "no frames": ({"root_position_world": np.zeros((0, 3)), "local_quat_xyzw": np.zeros((0, 21, 4)),
+                   "moving_offsets": np.zeros((1, 0, 3))}, "at least one frame"),
+    "no rate": ({"fps": np.array([30, 0])}, "does not hold a motion"),
+    "negative rate": ({"fps": np.array([-30, 1])}, "positive frame rate"),
+    "not a tree": ({"parents": np.full(21, 3)}, "joint 0 must be the root"),
+    "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)},
+                   "unique"),
+    "stray end": ({"end_names": np.array(["a", "b", "c", "d", "e"])}, "joints of the skeleton"),
+    "stray joint": ({"moving_joints": np.array([77])}, "joints of the skeleton"),
+    "objects": ({"names": np.array([object()] * 21)}, "not a sound .npz archive"),
+    "one number": ({"root_position_world": np.array(1.0)}, "root_position_world"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_an_archive_that_is_no_motion_is_refused(case, tmp_path):
+    changes, words = CHANGES[case]
+    (tmp_path / "walk.npz").write_bytes(archive(example(), **changes))
+    with pytest.raises(FileFormatError, match=words) as caught:
+        formats.load(tmp_path / "walk.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_unchanged_archive_is_sound(tmp_path):
+    (tmp_path / "walk.npz").write_bytes(archive(example()))
+    assert formats.load(tmp_path / "walk.npz").num_frames == 5
+
+
+def test_pickled_objects_are_never_run(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "sprung"),)
+
+    (tmp_path / "walk.npz").write_bytes(archive(example(), format=np.array(Trap(), dtype=object)))
+    with pytest.raises(FileFormatError, match="not a sound"):
+        formats.load(tmp_path / "walk.npz")
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_an_archive_that_unpacks_too_large_is_refused_before_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(npz, "MAX_FILE_BYTES", 1000)
+    example().save(tmp_path / "walk.npz")
+    with pytest.raises(FileFormatError, match="unpacks to"):
+        formats.load(tmp_path / "walk.npz")
+
+
+def test_cut_and_mutated_archives_are_read_or_refused(tmp_path):
+    whole, random, refused = archive(example()), np.random.default_rng(0), 0
+    path = tmp_path / "walk.npz"
+    for _ in range(100):
+        raw = bytearray(whole[: random.integers(1, len(whole))] if random.random() < 0.3 else whole)
+        for place in random.integers(0, len(raw), 3):
+            raw[place] = random.integers(256)
+        path.write_bytes(raw)
+        try:
+            formats.load(path)
+        except FileFormatError:
+            refused += 1
+    assert refused > 50
+
+
+def test_a_motion_that_is_not_finite_is_refused_and_nothing_is_left(tmp_path):
+    bad = replace(example(), root_position=torch.full((5, 3), torch.nan, dtype=torch.float64))
+    with pytest.raises(RequestError, match="root_position_world is not finite"):
+        bad.save(tmp_path / "walk.npz")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(error, tmp_path):
+    path = tmp_path / "report.json"
+    write_text(path, "old")
+
+    def stop():
+        with atomic_path(path) as scratch:
+            assert scratch.suffix == ".json"
+            scratch.write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        stop()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_a_request_error_and_leaves_nothing(tmp_path):
+    with pytest.raises(RequestError, match=r"walk\.mp4: No space left"), atomic_path(tmp_path / "walk.mp4"):
+        raise OSError(28, "No space left on device")
+    assert not list(tmp_path.iterdir())
+
+
+def test_places_that_cannot_be_written_are_named(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder.bvh").mkdir()
+    places = {"missing/out.bvh": "does not exist", "file/out.bvh": "does not exist",
+              "folder.bvh": "is a folder",
+              "x" * 300 + ".bvh": "cannot write"}  # fmt: skip
+    for place, words in places.items():
+        for attempt in (check_writable, lambda path: write_text(path, "x"), example().save):
+            with pytest.raises(RequestError, match=words):
+                attempt(tmp_path / place)
+    with pytest.raises(RequestError, match="not a regular file"):
+        write_text(os.devnull, "x")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.bvh"]
+
+
+def test_a_link_is_followed_and_kept(tmp_path):
+    (tmp_path / "real.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    write_text(tmp_path / "link.txt", "new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_text() == "new"
