@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from mapctl import formats, rotations
 from mapctl.errors import MapctlError, RequestError
 from mapctl.formats import bvh, bvh_text
-from mapctl.formats.frame_rate import frame_rate
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -191,30 +190,6 @@ def test_a_name_in_an_old_encoding_goes_back_as_the_same_bytes(tmp_path):
     assert "Fuß".encode("latin-1") in (tmp_path / "out.bvh").read_bytes()
 
 
-RATES = {
-    "0.0333333": 30, "0.033333": 30, "0.0333": 30, "0.033": 30, "0.033333333333333333": 30, "3.33333e-2": 30,
-    "0.03333333507180214": 30, "0.00833333": 120, "0.0083333": 120, "0.008333": 120, "0.016667": 60,
-    "0.016666": 60, "0.0166667": 60, "0.0416667": 24, "0.041667": 24, "0.041708": Fraction(24000, 1001),
-    "0.0417083": Fraction(24000, 1001), "0.033367": Fraction(30000, 1001), "0.0166833": Fraction(60000, 1001),
-    "0.04": 25, "0.02": 50, "0.01": 100, "0.1": 10, "0.08": Fraction(25, 2), "1": 1, "0.0142857": 70,
-    "0.00694444": 144, "0.011111": 90,
-    "0.133333": Fraction(15, 2),
-    "0.033898305": Fraction(59, 2), "0.0345678": Fraction(10**7, 345678),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("text", RATES)
-def test_frame_time_is_read_as_the_rate_it_was_printed_from(text):
-    assert frame_rate(text) == RATES[text]
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(st.integers(1, 999), st.integers(6, 12))
-def test_every_whole_rate_survives_its_print(fps, digits):
-    assert abs(frame_rate(f"{1 / fps:.{digits}f}") - fps) / fps <= 0.5 * 10.0**-digits * fps
-    assert frame_rate(f"{1 / fps:.9f}") == fps
-
-
 @pytest.mark.parametrize("unit", [1.0, 0.01, 0.0254, 0.056444])
 @pytest.mark.parametrize("named", [True, False])
 def test_unit_is_found_by_the_size_of_the_body_and_undone(unit, named, tmp_path):
@@ -318,43 +293,6 @@ def test_resampled_motion_states_its_own_frame_time(tmp_path):
     (tmp_path / "in.bvh").write_text(PLAIN)
     bvh.load(tmp_path / "in.bvh").resample(120).save(tmp_path / "out.bvh")
     assert bvh.load(tmp_path / "out.bvh").fps == 120
-
-
-def written_angles(quat, order, tmp_path):
-    """What is written in the three channels of a single joint, degrees."""
-    tree = bvh_text.Hierarchy(
-        ("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {}
-    )
-    (tmp_path / "in.bvh").write_text(bvh_text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
-    source = bvh.load(tmp_path / "in.bvh")
-    root = torch.zeros(len(quat), 3, dtype=torch.float64)
-    replace(source, root_position=root, local_quat_xyzw=quat[:, None]).save(tmp_path / "out.bvh")
-    return bvh_text.read(tmp_path / "out.bvh").values
-
-
-def euler_quat(degrees, order):
-    """Quaternions of angles (frames, 3) by matrices."""
-    turns = [turn(order[0], a) @ turn(order[1], b) @ turn(order[2], c) for a, b, c in degrees]
-    return rotations.sign_continuous(rotations.from_matrix(torch.from_numpy(np.array(turns))))
-
-
-@pytest.mark.parametrize("order", EULER_ORDERS)
-def test_angles_are_written_continuous_through_turns_and_past_the_middle_axis_range(order, tmp_path):
-    # The middle angle leaves its principal range on the way, and the outer ones wind up.
-    steps = np.linspace(0, 1, 200)[:, None]
-    degrees = np.array([10.0, 20.0, -30.0]) + steps * np.array([800.0, 145.0, -500.0])
-    assert np.abs(written_angles(euler_quat(degrees, order), order, tmp_path) - degrees).max() < 1e-5
-
-
-@pytest.mark.parametrize("order", EULER_ORDERS)
-def test_gimbal_lock_keeps_the_rotation_and_does_not_jump(order, tmp_path):
-    steps = np.linspace(0, 1, 50)
-    locked = np.full(50, 0.0 if order[0] == order[2] else 90.0)
-    degrees = np.stack([20 + 100 * steps, locked, 40 - 10 * steps], axis=1)
-    quat = euler_quat(degrees, order)
-    written = written_angles(quat, order, tmp_path)
-    assert np.abs(np.diff(written, axis=0)).max() < 3
-    assert ((euler_quat(written, order) * quat).sum(-1).abs() > 1 - 1e-12).all()
 
 
 def test_the_same_motion_is_written_as_the_same_bytes_without_negative_zeros(tmp_path):
