@@ -11,7 +11,7 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.roles import find_hips
 from scenes.parts import Part, Role, Side, roles
-from scenes.shapes import Array, unit
+from scenes.shapes import Array, frame_along, unit
 
 _LEG = 0.80
 """Hip to ankle of the person whose measures this package is written for, metres."""
@@ -82,7 +82,7 @@ class Anatomy:
         return (k for k, parent in enumerate(self.points.parents) if parent == point)
 
     def left(self, part: Part) -> Array:
-        """(frames, 3) unit vectors from a part's right joint to its left; the hips' x axis if there is no pair."""
+        """(frames, 3) unit vectors from a part's right joint to its left; the hips' x axis without such."""
         pair = self.find(part, Side.LEFT), self.find(part, Side.RIGHT)
         if None in pair:
             return self.rotations[:, self.hips, :, 0]
@@ -155,9 +155,10 @@ class Anatomy:
 
 def _axes(*, up: Array, forward: Array) -> Array:
     """Columns left, up, forward; up is kept."""
-    up = unit(up)
-    left = unit(np.cross(up, forward))
-    return np.stack([left, up, np.cross(left, up)], axis=-1)
+    across = np.cross(up, forward)
+    if np.linalg.norm(across) < 1e-6 * np.linalg.norm(forward) + 1e-12:
+        across = np.array([1.0, 0.0, 0.0])  # any will do where the motion does not tell
+    return frame_along(up, across)
 
 
 def _hips(motion: Motion) -> int:
@@ -187,7 +188,7 @@ def _with_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poi
         offset = np.array(motion.skeleton.end_offsets.get(name, (0.0, 0.0, 0.0)))
         if np.linalg.norm(offset) > 0.01 * scale:
             extra.append((joint, joints[:, joint] + turns[:, joint] @ offset))
-        elif leaf and part in _TIP:
+        elif part in _TIP and (leaf or part is Part.HEAD):  # eyes and the like say nothing of the crown
             along = unit(joints[:, joint] - joints[:, parents[joint]])
             extra.append((joint, joints[:, joint] + along * _TIP[part] * scale))
     world = np.concatenate([joints, *(place[:, None] for _, place in extra)], axis=1)

@@ -18,7 +18,7 @@ _RADII = {
     Part.UPPER_LEG: (0.078, 0.057), Part.LOWER_LEG: (0.050, 0.034), Part.OTHER: (0.015, 0.012),
 }  # fmt: skip
 # Bones from the trunk to a limb, by the part they lead to.
-_LINKS = {Part.UPPER_LEG: (0.092, 0.086), Part.HIPS: (0.092, 0.086), Part.SHOULDER: (0.060, 0.056),
+_LINKS = {Part.UPPER_LEG: (0.092, 0.081), Part.HIPS: (0.092, 0.084), Part.SHOULDER: (0.060, 0.056),
           Part.UPPER_ARM: (0.060, 0.056), Part.OTHER: (0.015, 0.012)}  # fmt: skip
 _TRUNK = ((0.0, 0.35, 0.75, 1.0), (0.100, 0.096, 0.110, 0.060))
 """Radius of the trunk at shares of the way from hips to neck, metres."""
@@ -122,18 +122,17 @@ class Body:
 
 
 def _bones(anatomy: Anatomy, colour: Array) -> Bones:
+    parents = anatomy.points.parents
+    pairs = [(parent, child) for child, parent in enumerate(parents) if _drawn(anatomy, child, parent)]
+    ends = pairs or [(anatomy.hips, anatomy.hips)]  # a lone joint is a ball
     shares = _heights(anatomy)
-    ends, radius, squash, rgb = [], [], [], []
-    for child, parent in enumerate(anatomy.points.parents):
-        if not _drawn(anatomy, child, parent):
-            continue
-        ends.append((parent, child))
-        radius.append(_radii(anatomy, child, parent, shares))
-        squash.append(_squash(anatomy, child, parent))
-        rgb.append(_colour(anatomy, child, parent, colour))
-    joints = np.array(ends).reshape(-1, 2)
-    return Bones(joints, np.array(radius).reshape(-1, 2) * anatomy.scale, np.array(squash).reshape(-1, 3),
-                 np.array(rgb).reshape(-1, 3), shares[joints].mean(axis=1))  # fmt: skip
+    return Bones(
+        ends=np.array(ends),
+        radius=np.array([_radii(anatomy, child, parent, shares) for parent, child in ends]) * anatomy.scale,
+        squash=np.array([_squash(anatomy, child, parent) for parent, child in ends]),
+        rgb=np.array([_colour(anatomy, parent, colour) for parent, _ in ends]),
+        height=shares[np.array(ends)].mean(axis=1),
+    )
 
 
 def _drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
@@ -173,7 +172,7 @@ def _radii(anatomy: Anatomy, child: int, parent: int, shares: Array) -> tuple[fl
     if above in _TRUNK_PARTS and anatomy.points.roles[parent].side is Side.MIDDLE:
         start, stop = np.interp(shares[[parent, child]], *_TRUNK)
         return float(start) * _OVERLAP, float(stop)
-    return _RADII.get(above, _LINKS[Part.HIPS])
+    return _RADII.get(above, _LINKS[Part.UPPER_LEG])
 
 
 def _squash(anatomy: Anatomy, child: int, parent: int) -> tuple[float, float, float]:
@@ -183,7 +182,7 @@ def _squash(anatomy: Anatomy, child: int, parent: int) -> tuple[float, float, fl
     return _HAND_SQUASH if above.part is Part.HAND else (1.0, 1.0, 1.0)
 
 
-def _colour(anatomy: Anatomy, child: int, parent: int, colour: Array) -> Array:
+def _colour(anatomy: Anatomy, parent: int, colour: Array) -> Array:
     role = anatomy.points.roles[parent]
     if role.part in (*_TRUNK_PARTS, Part.SHOULDER) or role.side is Side.MIDDLE:
         return _pale(colour) if role.part is Part.NECK else colour

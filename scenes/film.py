@@ -12,10 +12,11 @@ import numpy as np
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
 from scenes.cameras import CameraSettings
+from scenes.content import Painter
 from scenes.painters import RendererName, painter
 from scenes.shapes import Array
 from scenes.sheet import contact_sheet
-from scenes.stage import Painter, Shot, Stage
+from scenes.stage import Shot, Stage
 from scenes.writers import gif_writer, mp4_writer, save_png
 
 WRITERS = {".mp4": mp4_writer, ".gif": gif_writer}

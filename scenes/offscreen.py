@@ -4,18 +4,16 @@ import os
 from collections.abc import Sequence
 from functools import cache
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mapctl.errors import MapctlError
 from scenes import colours
 from scenes.cameras import View
+from scenes.content import Content
 from scenes.lighting import shade
 from scenes.shapes import Array, Surface, merge
-
-if TYPE_CHECKING:
-    from scenes.stage import Content
 
 _NEAR, _FAR = 0.3, 400.0
 
@@ -39,7 +37,7 @@ class OffscreenPainter:
             baseColorFactor=[1.0] * 4, alphaMode="BLEND", doubleSided=True
         )
 
-    def paint(self, view: View, content: "Content") -> Array:
+    def paint(self, view: View, content: Content) -> Array:
         """The picture, (height, width, 3) uint8."""
         eye = view.pose[:3, 3]
         bodies = [figure.surface() for figure in content.figures]

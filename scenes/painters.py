@@ -5,8 +5,8 @@ import os
 from typing import Literal
 
 from mapctl.errors import RequestError
+from scenes.content import Painter
 from scenes.offscreen import NoGraphicsError, OffscreenPainter
-from scenes.stage import Painter
 from scenes.stick import StickPainter
 
 RendererName = Literal["auto", "egl", "stick"]

@@ -60,10 +60,12 @@ _PARTS = (
     (r"spine|chest|abdomen|torso|back|waist|thorax|belly", Part.TORSO),
 )
 # Spelled out; alone between separators; before a capital (`lThigh`); before a Latin name (`lfemur`).
-_SIDE = (r"{word}|{word_title}|{word_upper}|(?:^|[_.:\- ])[{letter}](?=[_.\- ]|$)|(?:^|:)[{letter}](?=[A-Z])"
-         r"|^{small}(?=femur|tibia|foot|toes|humerus|radius|wrist|hand|fingers|thumb|clav|hipjoint)")  # fmt: skip
+_SIDE = (
+    r"{word}|{title}|{upper}|(?:^|[_.:\- ])[{letter}](?=[_.\- ]|$)|(?:^|:)[{letter}](?=[A-Z])"
+    r"|^{small}(?=femur|tibia|foot|toes|humerus|radius|wrist|hand|fingers|thumb|clavicle|hipjoint)"
+)
 _SIDES = tuple(
-    (side, re.compile(_SIDE.format(word=word, word_title=word.title(), word_upper=word.upper(),
+    (side, re.compile(_SIDE.format(word=word, title=word.title(), upper=word.upper(),
                                    letter=word[0] + word[0].upper(), small=word[0])))
     for side, word in ((Side.LEFT, "left"), (Side.RIGHT, "right"))
 )  # fmt: skip

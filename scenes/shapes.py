@@ -97,7 +97,7 @@ class RoundedBoxes:
 
 def frame_along(axis: Array, across: Array) -> Array:
     """(..., 3, 3) rotations whose y column is `axis` and whose x column is as near to `across` as can be."""
-    y = unit(axis)
+    y = unit(np.where(np.linalg.norm(axis, axis=-1, keepdims=True) > 1e-9, axis, np.array([0.0, 1.0, 0.0])))
     z = np.cross(across, y)
     fallback = np.cross(np.where(np.abs(y[..., :1]) < 0.7, np.array([1.0, 0, 0]), np.array([0, 0, 1.0])), y)
     z = unit(np.where(np.linalg.norm(z, axis=-1, keepdims=True) > 1e-6, z, fallback))

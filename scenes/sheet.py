@@ -6,8 +6,9 @@ import numpy as np
 
 from scenes import colours
 from scenes.cameras import CameraSettings
+from scenes.content import Painter
 from scenes.shapes import Array
-from scenes.stage import Painter, Stage
+from scenes.stage import Stage
 
 _GAP = 0.008
 """Between pictures, as a share of the width."""
@@ -65,7 +66,9 @@ def _ghosts(stage: Stage) -> list[int]:
     paths = [player.body.anatomy.hips_world[:, [0, 2]] for player in stage.players]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
     most = max(4, _MOST_GHOSTS // len(paths))
-    count = int(np.clip(round(max(lengths) / _GHOST_STRIDE) + 1, 3, most))
+    count = min(round(max(lengths) / _GHOST_STRIDE) + 1, most)
+    if count == 1:
+        return [stage.num_frames // 2]
     furthest = paths[int(np.argmax(lengths))]
     loop = max(lengths) > 3 * _GHOST_STRIDE and np.linalg.norm(furthest[-1] - furthest[0]) < _GHOST_STRIDE
     return _spread(stage.num_frames - 1, count + 1)[1:] if loop else _spread(stage.num_frames - 1, count)

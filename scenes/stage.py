@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from mapctl.motion import Motion
 from scenes import colours, overlays
 from scenes.body import Body
 from scenes.cameras import CameraSettings, View, views
+from scenes.content import Content, Figure
 from scenes.parts import Side
 from scenes.shapes import Array, Surface, merge
 
@@ -32,42 +33,6 @@ class Shot(NamedTuple):
     """Name from `scenes.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
     start_seconds: float = 0.0
     """When the motion begins; until then the actor stands in its first pose."""
-
-
-@dataclass(frozen=True, eq=False)
-class Figure:
-    """One body in one pose."""
-
-    body: Body
-    frame: int
-    fade: float = 0.0
-    """Share of the background in its colours; ghosts have some."""
-
-    def surface(self) -> Surface:
-        """Its skin."""
-        skin = self.body.surface(self.frame)
-        rgba = skin.rgba.copy()
-        rgba[:, :3] = colours.mix(rgba[:, :3], colours.rgb(colours.BACKGROUND), self.fade)
-        return Surface(skin.vertices, skin.faces, rgba, skin.normals)
-
-
-@dataclass(frozen=True, eq=False)
-class Content:
-    """What one picture shows."""
-
-    ground: Sequence[Surface]
-    """Flat surfaces in the order in which they cover each other."""
-    figures: Sequence[Figure]
-
-
-class Painter(Protocol):
-    """Turns content into pixels."""
-
-    name: str
-
-    def paint(self, view: View, content: Content) -> Array:
-        """(height, width, 3) uint8."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +90,7 @@ class Stage:
             # A later ghost takes the place of one in the same pose: an actor who waits or has arrived.
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
-        trails = [overlays.part_of_ribbon(p.trail, p.frame(film_frames[-1]) + 1) for p in self.players]
+        trails = [player.trail for player in self.players]
         return Content([self._still, *trails, *_shadows(figures)], figures)
 
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:

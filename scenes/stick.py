@@ -1,15 +1,11 @@
 """Stick figures by matplotlib, for machines without OpenGL: the same cameras, ground and colours."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from scenes import colours
 from scenes.cameras import View
+from scenes.content import Content, Figure
 from scenes.shapes import Array, Surface
-
-if TYPE_CHECKING:
-    from scenes.stage import Content, Figure
 
 _NEAR = 0.1
 """Nothing closer to the camera than this is drawn, metres."""
@@ -28,7 +24,7 @@ class StickPainter:
         self._sheet = Sheet(dpi=_DPI, facecolor=colours.BACKGROUND)
         self._canvas = FigureCanvasAgg(self._sheet)
 
-    def paint(self, view: View, content: "Content") -> Array:
+    def paint(self, view: View, content: Content) -> Array:
         """The picture, (height, width, 3) uint8."""
         self._sheet.clear()
         self._sheet.set_size_inches(view.width / _DPI, view.height / _DPI)
@@ -55,7 +51,7 @@ def _draw_flat(axes, view: View, surface: Surface) -> None:
     )
 
 
-def _draw_figure(axes, view: View, figure: "Figure") -> None:
+def _draw_figure(axes, view: View, figure: Figure) -> None:
     from matplotlib.collections import LineCollection
 
     ends, radii, rgb = figure.body.sticks(figure.frame)

@@ -1,5 +1,6 @@
 """Pictures into files: MP4 (H.264), GIF and PNG."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -9,11 +10,18 @@ import numpy as np
 
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
+from scenes import colours
 from scenes.shapes import Array
 
 Write = Callable[[Array], None]
 _QUALITY = {"crf": "19", "preset": "veryfast"}
-_GIF_COLOURS = 128
+_BT709 = 1
+"""Code of the HD colour standard in the stream's tags; players that find none guess by the picture's size."""
+_GIF_COLOURS = 255
+_GIF_FPS = 50
+"""Browsers slow down GIFs that are faster."""
+_GIF_PIXELS = 6e8
+"""A GIF is held in memory until it is written."""
 
 
 @contextmanager
@@ -29,12 +37,14 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("libx264", rate=fps, options=_QUALITY)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.codec_context.thread_count = 1
+        context = stream.codec_context
+        context.thread_count = 1
+        context.colorspace = context.color_primaries = context.color_trc = _BT709
 
         def write(picture: Array) -> None:
             edges = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
-            even = np.pad(picture, edges, mode="edge")
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+            frame = av.VideoFrame.from_ndarray(np.pad(picture, edges, mode="edge"), format="rgb24")
+            container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
 
         yield write
         container.mux(stream.encode())
@@ -42,26 +52,52 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 
 @contextmanager
 def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
-    """Yield a function that adds a picture to a looping GIF. Its palette is the first picture's.
+    """Yield a function that adds a picture to a looping GIF. All share one palette.
 
-    GIF counts in hundredths of a second; the delays alternate so that the whole keeps the motion's time.
+    GIF counts in hundredths of a second; the delays alternate so that the whole keeps the motion's time. Over 50
+    pictures a second only every second, third, ... is kept. RequestError when it outgrows 600 megapixels.
     """
     image = _package("PIL.Image")
-    pictures = []
+    stride, count, pictures = math.ceil(fps / _GIF_FPS), 0, []
 
     def write(picture: Array) -> None:
-        whole = image.fromarray(picture)
-        if pictures:
-            pictures.append(whole.quantize(palette=pictures[0], dither=image.Dither.NONE))
-        else:
-            pictures.append(
-                whole.quantize(_GIF_COLOURS, method=image.Quantize.MEDIANCUT, dither=image.Dither.NONE)
-            )
+        nonlocal count
+        count += 1
+        if (count - 1) % stride == 0:
+            _check_room(len(pictures) + 1, size)
+            pictures.append(_quantized(image, picture, pictures[0] if pictures else None))
 
     yield write
-    ends = [round(100 * (k + 1) / fps) for k in range(len(pictures))]
-    delays = [10 * (stop - start) for start, stop in zip([0, *ends], ends, strict=False)]
+    ends = [round(100 * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
+    delays = [10 * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
     pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=delays, loop=0)
+
+
+def _check_room(pictures: int, size: tuple[int, int]) -> None:
+    most = int(_GIF_PIXELS) // (size[0] * size[1])
+    if pictures > most:
+        raise RequestError(
+            f"a GIF of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4"
+        )
+
+
+def _quantized(image, picture: Array, first):
+    """With the palette of the first picture, or for the first with one of its own."""
+    whole, plain = image.fromarray(picture), image.Dither.NONE
+    if first is None:
+        sample = image.fromarray(
+            np.concatenate([picture, _swatches(picture.shape[1], picture.shape[0] // 12)])
+        )
+        first = sample.quantize(_GIF_COLOURS, method=image.Quantize.MAXCOVERAGE, dither=plain)
+    return whole.quantize(palette=first, dither=plain)
+
+
+def _swatches(width: int, height: int) -> Array:
+    """(4 * ceil(height / 4), width, 3): colours in light and shade that the first picture may lack."""
+    shown = (colours.LEFT, colours.RIGHT, colours.WISH, colours.TRAIL)
+    light = np.linspace(0.55, 1.0, width)[:, None]
+    rows = np.stack([colours.rgb(colour) * light * 255 for colour in shown])
+    return np.repeat(rows.astype(np.uint8), math.ceil(height / len(shown)), axis=0)
 
 
 def save_png(path: Path, picture: Array) -> None:

@@ -1,0 +1,47 @@
+"""What one picture shows, and what it takes to paint it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from scenes import colours
+from scenes.body import Body
+from scenes.cameras import View
+from scenes.shapes import Array, Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """One body in one pose."""
+
+    body: Body
+    frame: int
+    fade: float = 0.0
+    """Share of the background in its colours; ghosts have some."""
+
+    def surface(self) -> Surface:
+        """Its skin."""
+        skin = self.body.surface(self.frame)
+        rgba = skin.rgba.copy()
+        rgba[:, :3] = colours.mix(rgba[:, :3], colours.rgb(colours.BACKGROUND), self.fade)
+        return Surface(skin.vertices, skin.faces, rgba, skin.normals)
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What one picture shows."""
+
+    ground: Sequence[Surface]
+    """Flat surfaces in the order in which they cover each other."""
+    figures: Sequence[Figure]
+
+
+@runtime_checkable
+class Painter(Protocol):
+    """Turns content into pixels."""
+
+    name: str
+
+    def paint(self, view: View, content: Content) -> Array:
+        """(height, width, 3) uint8."""
+        ...
