@@ -1,0 +1,136 @@
+"""Reports: what was asked, what came out and what it cost, as JSON that every parser reads."""
+
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch
+
+from mapctl import __version__, metrics
+from mapctl.curve import Curve
+from mapctl.formats.atomic import write_text
+from mapctl.motion import Motion
+from mapctl.solver.result import Solution, WindowRecord
+
+_PACKAGES = ("torch", "numpy", "scipy", "numba")
+
+
+def build(
+    solution: Solution, *, request: Mapping[str, Any], seed: int, measures: Mapping[str, float],
+    seconds: float, prior: Mapping[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    """Everything about one solve; `seconds` is its wall clock, `prior` its name, licence and quality.
+
+    Keys: mapctl, request, seed, versions, prior, status, motion, ledger, measures, mocap, timing.
+    """
+    return {
+        "mapctl": __version__,
+        "request": dict(request),
+        "seed": seed,
+        "versions": versions(),
+        "prior": {name: value for name, value in prior.items() if name != "quality"},
+        "status": status(solution),
+        "motion": outline(solution.motion),
+        "ledger": solution.ledger.summary(),
+        "measures": dict(measures),
+        "mocap": mocap_values(prior.get("quality", {})),
+        "timing": timing(solution.windows, seconds=seconds),
+    }
+
+
+def write(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
+    """Write a report whole or not at all; RequestError if the place cannot be written."""
+    write_text(path, as_json(report))
+
+
+def as_json(values: Any) -> str:
+    """Indented JSON that every parser reads: NaN and infinities are null."""
+    return json.dumps(_finite(values), indent=1, allow_nan=False) + "\n"
+
+
+def status(solution: Solution) -> dict[str, Any]:
+    """How the solve ended: text (the message), outcome, ok, notes."""
+    ended = solution.status
+    return {"text": ended.text, "outcome": ended.outcome.value, "ok": ended.ok, "notes": list(ended.notes)}
+
+
+def outline(motion: Motion) -> dict[str, float]:
+    """Frames, frames per second and seconds."""
+    return {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds}
+
+
+def path_measures(
+    motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None
+) -> dict[str, float]:
+    """All measures of a motion that was to go `wanted_m` metres along the curve, at whatever speed."""
+    seconds = (motion.num_frames - 1) / float(motion.fps)
+    return metrics.measure(motion, curve, speed=wanted_m / seconds, joint=joint)
+
+
+def mocap_values(quality: Mapping[str, Any]) -> dict[str, Any]:
+    """What held-out mocap shows, by measure: mean, p2, p98; empty where the prior's card has no table."""
+    return dict(quality.get("mocap", {}))
+
+
+def timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict[str, float | int | None]:
+    """Compute of each delivered frame (a window's time over the frames it commits), ms, and its company.
+
+    A followed curve has no due times, so there are no late frames to count.
+    """
+    frames = [window.frames for window in windows]
+    each = (
+        np.repeat([1000 * w.seconds / max(1, w.frames) for w in windows], frames)
+        if windows
+        else np.array([math.nan])
+    )
+    return {
+        "frame_ms_p50": float(np.percentile(each, 50)),
+        "frame_ms_p99": float(np.percentile(each, 99)),
+        "frame_ms_mean": float(each.mean()),
+        "evaluations_per_frame": sum(w.evaluations for w in windows) / max(1, sum(frames)),
+        "windows": len(windows),
+        "seconds": seconds,
+        "threads": torch.get_num_threads(),
+        "cores": os.cpu_count(),
+        "peak_memory_mb": peak_memory_mb(),
+    }
+
+
+def peak_memory_mb() -> float | None:
+    """Most memory the process ever held, MiB; None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+def versions() -> dict[str, str]:
+    """Of mapctl, Python and the packages that decide the numbers, and the platform."""
+    installed = {name: metadata.version(name) for name in _PACKAGES}
+    return {
+        "mapctl": __version__,
+        "python": platform.python_version(),
+        **installed,
+        "platform": platform.platform(),
+    }
+
+
+def _finite(values: Any) -> Any:
+    """The same tree with null for NaN and infinities."""
+    match values:
+        case float():
+            return values if math.isfinite(values) else None
+        case Mapping():
+            return {str(name): _finite(value) for name, value in values.items()}
+        case list() | tuple():
+            return [_finite(value) for value in values]
+        case _:
+            return values
