@@ -1,0 +1,137 @@
+"""The command line: parse, run one command, turn errors into exit statuses. Nothing imports this module.
+
+Exit status: 0 done; 1 nobody read the output; 2 the input or the command is wrong, with one line on standard
+error and nothing written; 3 done, but not all that was asked holds (--strict);
+130 interrupted, 143 terminated.
+"""
+
+import io
+import os
+import re
+import signal
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stderr
+from functools import reduce
+from operator import or_
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import tyro
+
+from mapctl import __version__
+from mapctl.commands import COMMANDS, Command
+from mapctl.errors import MapctlError, RequestError
+
+_WRONG, _UNREAD, _INTERRUPTED, _TERMINATED = 2, 1, 130, 143
+_EXTRAS = {
+    "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
+    "live": {"viser"},
+    "usd": {"pxr"},
+    "cluster": {"ray"},
+}
+"""Packages by the extra that installs them."""
+_PLAINER = (
+    (r" Got errors:.*", ""),
+    (r"no type matching (.+) could be instantiated from \[(.*?)\]", r"expected \1, got \2"),
+    (r"invalid literal for int\(\) with base 10: ", "expected a whole number, got "),
+    (r"could not convert string to float: ", "expected a number, got "),
+    (r"expected \{None\}\|FLOAT", "expected a number"),
+    (r"expected \{None\}\|INT", "expected a whole number"),
+    (r" \(required\)", ""),
+)
+"""What Python and tyro say, and what people understand."""
+_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `mapctl` with the given words (those of the process if None); returns the exit status."""
+    if argv is None:
+        signal.signal(signal.SIGTERM, _terminate)
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words in (["--version"], ["-V"]):
+        print(f"mapctl {__version__}")
+        return 0
+    try:
+        status = parse(words).run()
+        sys.stdout.flush()
+    except MapctlError as error:
+        status = _say(str(error), _WRONG)
+    except KeyboardInterrupt:
+        status = _say("interrupted", _INTERRUPTED)
+    except ModuleNotFoundError as error:
+        status = _say(_missing(error.name or str(error)), _WRONG)
+    except BrokenPipeError:
+        # As the Python documentation advises: the interpreter flushes standard output once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = _UNREAD
+    except OSError as error:
+        status = _say(f"{error.filename or 'input or output'}: {error.strerror or error}", _WRONG)
+    return status
+
+
+def parse(words: Sequence[str]) -> Command:
+    """The command that the words ask for. RequestError where there is none; SystemExit after --help."""
+    choices: Any = reduce(or_, (_subcommand(name, kind) for name, kind in COMMANDS.items()))
+    explained = io.StringIO()
+    try:
+        with redirect_stderr(explained):
+            return tyro.cli(choices, prog="mapctl", description=_DESCRIPTION, args=list(words), config=_STYLE)
+    except SystemExit as stop:
+        if stop.code == 0:
+            raise
+        raise RequestError(f"{_essence(explained.getvalue())} (see {_help(words)})") from None
+
+
+_DESCRIPTION = (
+    "Human motion that does what a person asks and still looks captured: BVH in, BVH out.\n"
+    "`mapctl COMMAND --help` shows a command's options; `mapctl --version` the version."
+)
+
+
+def _subcommand(name: str, kind: type[Command]) -> Any:
+    return Annotated[kind, tyro.conf.subcommand(name, prefix_name=False)]
+
+
+def _essence(box: str) -> str:
+    """What tyro explains in a box of many lines, in one: its first paragraph, and a hint if there is one."""
+    paragraphs = [""]
+    for line in box.splitlines():
+        text = line.strip("│| ")
+        if not line.startswith(("│", "|")):
+            continue
+        if text and not text.strip("─-"):
+            paragraphs.append("")
+        else:
+            paragraphs[-1] = f"{paragraphs[-1]} {text}".strip()
+    hints = (re.match(r"Available subcommands: .*|Perhaps you meant: -[\w-]+", p) for p in paragraphs[1:])
+    first = paragraphs[0] or "the command cannot be understood"
+    for pattern, plainer in _PLAINER:
+        first = re.sub(pattern, plainer, first)
+    return ". ".join([first.strip().rstrip("."), *(hint.group() for hint in hints if hint)])
+
+
+def _help(words: Sequence[str]) -> str:
+    return f"mapctl {words[0]} --help" if words and words[0] in COMMANDS else "mapctl --help"
+
+
+def _missing(module: str) -> str:
+    package = module.partition(".")[0]
+    for extra, packages in _EXTRAS.items():
+        if package in packages:
+            return f"this needs the package {package}: pip install 'mapctl[{extra}]'"
+    return f"this needs the package {package}, which is not installed"
+
+
+def _say(message: str, status: int) -> int:
+    print(f"mapctl: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:
+    """Leave by an exception, so that half-written files are removed on the way out."""
+    raise SystemExit(_TERMINATED)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,41 @@
+"""The sub-commands, one file each. Part of the command line: like `mapctl.cli` they may import every package,
+and nothing else imports them.
+
+Each is a frozen dataclass of options with a `run`; heavy imports wait until it is called.
+"""
+
+from typing import Protocol
+
+from mapctl.commands.bench import Bench
+from mapctl.commands.convert import Convert
+from mapctl.commands.demo import Demo
+from mapctl.commands.follow import FollowCurve
+from mapctl.commands.generate import Generate
+from mapctl.commands.info import Info
+from mapctl.commands.measure import Measure
+from mapctl.commands.render import Render
+from mapctl.commands.run import RunScene
+from mapctl.commands.train import Train
+
+
+class Command(Protocol):
+    """What every sub-command can do."""
+
+    def run(self) -> int:
+        """Do the work and return the exit status; MapctlError for what is wrong with the request."""
+        ...
+
+
+COMMANDS: dict[str, type[Command]] = {
+    "demo": Demo,
+    "follow": FollowCurve,
+    "run": RunScene,
+    "generate": Generate,
+    "render": Render,
+    "convert": Convert,
+    "measure": Measure,
+    "train": Train,
+    "info": Info,
+    "bench": Bench,
+}
+"""By the name the user types, in the order of the help."""

@@ -1,0 +1,81 @@
+"""`mapctl convert`: any format to any format, other bones, another frame rate."""
+
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands import options, outputs
+from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from mapctl.motion import Motion
+    from mapctl.retarget import RigMap
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write a motion in another format, on another skeleton or at another frame rate."""
+
+    source: options.InFile
+    """.bvh or .npz."""
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
+    """.bvh or .npz."""
+    rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
+    """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted."""
+    fps: Annotated[str | None, arg(metavar="F")] = None
+    """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
+
+    def run(self) -> int:
+        """Read, change, write."""
+        from mapctl import formats
+
+        formats.check_ending(self.out)
+        outputs.check_files([self.out])
+        fps = None if self.fps is None else parse_fps(self.fps)
+        motion = formats.load(self.source)
+        if self.rig is not None:
+            motion = on_rig(motion, self.rig)
+        if fps is not None:
+            motion = motion.resample(fps)
+        formats.save(motion, self.out)
+        rate = f"{float(motion.fps):.6g} frames a second"
+        print(f"{self.out}: {motion.num_frames} frames, {motion.num_joints} joints, {rate}")
+        return 0
+
+
+def parse_fps(text: str) -> Fraction:
+    """A frame rate in any of the usual spellings; RequestError for what is none or beyond 1000."""
+    try:
+        fps = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        raise RequestError(f"a frame rate is a number, as 30, 29.97 or 30000/1001, got {text!r}") from None
+    if not Fraction(1, 100) <= fps <= 1000:
+        raise RequestError(f"the frame rate must be 0.01 to 1000, got {text}")
+    return fps
+
+
+def on_rig(motion: "Motion", rig: str) -> "Motion":
+    """The motion on the canonical joints or on a clip's skeleton; RequestError for rigs that are not known.
+
+    Rotations stay. On other bones the hips' way is scaled by the legs' length, so that feet reach the ground.
+    """
+    from mapctl import formats, retarget, rigs
+
+    canonical, own = retarget.to_canonical(motion)
+    if rig == "canonical":
+        return canonical
+    if rig in {known.name for known in rigs.known()}:
+        raise RequestError(f"the bones of {rig} differ from performer to performer: name a clip of that rig")
+    wanted = retarget.map_rig(formats.load(rig).skeleton)
+    scale = _leg_length(wanted) / _leg_length(own)
+    canonical = replace(canonical, skeleton=wanted.skeleton, root_position=canonical.root_position * scale)
+    return retarget.from_canonical(canonical, wanted)
+
+
+def _leg_length(rigmap: "RigMap") -> float:
+    """From hip to ankle along the left leg, metres."""
+    bones = [rigmap.skeleton.index(name) for name in ("leftLowerLeg", "leftFoot")]
+    return float(rigmap.skeleton.offsets[bones].norm(dim=-1).sum())

@@ -1,0 +1,57 @@
+"""`mapctl demo`: path following on the bundled prior, from nothing to a film."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.commands.walks import Walk, as_follow, walk
+from mapctl.progress import bar
+
+CURVE, SPEED = "figure8:2", "1.2"
+_SIZE = (960, 540)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report."""
+
+    out: options.OutFolder = Path("demo-out")
+    """Folder for figure8.bvh, .mp4, .png and .json; made if it is not there."""
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+    seed: options.Count = 0
+    """Of everything random."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Walk, write, film, tell. Without OpenGL the film shows stick figures and says what is missing."""
+        compute_on_one()
+        options.check_seed(self.seed)
+        outputs.check_folder(self.out)
+        outputs.require_render("av")
+        request = as_follow(options.read_curve(CURVE, None), SPEED, None)
+        import priors
+
+        prior = priors.load(self.prior)
+        with bar("walking", quiet=self.quiet) as progress:
+            done = walk(prior, request, seed=self.seed, progress=progress)
+        with outputs.made_folder(self.out) as folder:
+            files = {ending: folder / f"figure8.{ending}" for ending in ("bvh", "json", "mp4", "png")}
+            self._write(done, files)
+        if not self.quiet:
+            print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
+        return 0
+
+    def _write(self, done: Walk, files: dict[str, Path]) -> None:
+        from mapctl import report
+        from scenes.cameras import CameraSettings
+        from scenes.film import film
+
+        done.solution.motion.save(files["bvh"])
+        request = options.as_request("demo", self) | {"curve": CURVE, "speed": SPEED}
+        report.write(done.report(request), files["json"])
+        with bar("filming", quiet=self.quiet) as progress:
+            actors, films = [(done.solution.motion, done.request.curve)], [files["mp4"], files["png"]]
+            film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)

@@ -1,0 +1,85 @@
+"""`mapctl follow`: a character walks a drawn curve."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.commands.walks import Walk, as_follow, walk
+from mapctl.progress import bar
+
+_NOT_ALL_HOLDS = 3
+
+
+@dataclass(frozen=True)
+class FollowCurve:
+    """A character walks a curve: BVH and, if asked for, a film and a report."""
+
+    curve: Positional[options.CurveText]
+    """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or x,y,z, or an SVG file."""
+    out: options.OutFile
+    """Where the motion goes: .bvh or .npz."""
+    speed: options.Speed = "1.2"
+    """Along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m."""
+    seconds: options.MaybeNumber = None
+    """How long to walk; once along the curve if not given."""
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+    seed: options.Count = 0
+    """Of everything random: the same seed gives the same file."""
+    video: options.MaybeFile = None
+    """Film of the walk: .mp4, .gif or .png (contact sheet)."""
+    camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
+    """Of the film."""
+    size: options.Size = "1280x720"
+    """Of the film's pictures, pixels."""
+    report: options.MaybeFile = None
+    """JSON with the request, status, ledger, measures and timing."""
+    metres_per_unit: options.MaybeNumber = None
+    """Scale of a CSV or SVG file; 1 for a CSV and 0.01 for an SVG if not given."""
+    strict: bool = False
+    """Exit with status 3 where not all that was asked holds."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, solve, write, tell."""
+        compute_on_one()
+        self._check()
+        request = as_follow(options.read_curve(self.curve, self.metres_per_unit), self.speed, self.seconds)
+        import priors
+
+        prior = priors.load(self.prior)
+        with bar("walking", quiet=self.quiet) as progress:
+            done = walk(prior, request, seed=self.seed, progress=progress)
+        self._write(done)
+        if not self.quiet:
+            files = ", ".join(map(str, options.given(self.out, self.video, self.report)))
+            print("\n".join([*done.summary(), f"wrote     {files}"]))
+        return _NOT_ALL_HOLDS if self.strict and not done.solution.status.ok else 0
+
+    def _check(self) -> None:
+        from mapctl import formats
+
+        options.check_seed(self.seed)
+        formats.check_ending(self.out)
+        outputs.check_files(options.given(self.out, self.video, self.report))
+        if self.video is not None:
+            outputs.check_film(self.video, options.parse_size(self.size))
+
+    def _write(self, done: Walk) -> None:
+        from mapctl import report
+
+        done.solution.motion.save(self.out)
+        if self.report is not None:
+            report.write(done.report(options.as_request("follow", self)), self.report)
+        if self.video is not None:
+            from scenes.cameras import CameraSettings
+            from scenes.film import film
+
+            actors, camera = [(done.solution.motion, done.request.curve)], CameraSettings(self.camera)
+            with bar("filming", quiet=self.quiet) as progress:
+                size = options.parse_size(self.size)
+                film(actors, self.video, camera=camera, size=size, progress=progress)

@@ -1,0 +1,100 @@
+"""`mapctl generate`: motion drawn from a prior, of any length."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.errors import RequestError
+from mapctl.progress import bar
+
+if TYPE_CHECKING:
+    from controllers.generate import GenerateSettings
+    from mapctl.motion import Motion
+
+_MOST_CLIPS = 10_000
+
+
+@dataclass(frozen=True)
+class Generate:
+    """Motion drawn from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
+
+    out: options.OutFolder
+    """Folder for the clips; made if it is not there."""
+    seconds: options.Number
+    """Length of each clip."""
+    count: options.Count = 1
+    """How many clips."""
+    seed: options.Count = 0
+    """Of everything random; each clip draws its own seed from it."""
+    temperature: options.Number = 1.0
+    """Spread of the draws, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
+    start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
+    """A clip (.bvh, .npz) to go on from, or the number of one of the prior's starts; drawn if not given."""
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+    no_refine: bool = False
+    """Leave the draws as they are. There is no refiner yet, so today this changes nothing."""
+    quiet: bool = False
+    """No lines on the clips and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, then write clip after clip; clips that are finished stay if it is interrupted."""
+        compute_on_one()
+        frames, settings, clip = options.frames_of(self.seconds), *self._checked()
+        import torch
+
+        import priors
+        from controllers.generate import stream
+
+        prior = priors.load(self.prior)
+        draw = partial(
+            stream, prior, seconds=self.seconds, settings=settings, start_clip=clip, fps=options.MOTION_FPS
+        )
+        with outputs.made_folder(self.out) as folder:
+            for number, seed in enumerate(self._seeds()):
+                pieces = draw(generator=torch.Generator().manual_seed(seed))
+                self._write(pieces, folder / f"generated_{number:03d}.bvh", frames)
+        return 0
+
+    def _checked(self) -> tuple["GenerateSettings", "Motion | None"]:
+        from controllers.generate import GenerateSettings
+
+        options.check_seed(self.seed)
+        if not 1 <= self.count <= _MOST_CLIPS:
+            raise RequestError(f"the count must be 1 to {_MOST_CLIPS}, got {self.count}")
+        outputs.check_folder(self.out)
+        numbered = self.start is not None and self.start.lstrip("-").isdecimal()
+        settings = GenerateSettings(self.temperature, int(self.start) if self.start and numbered else None)
+        if self.start is None or numbered:
+            return settings, None
+        from mapctl import formats
+
+        return settings, formats.load(self.start)
+
+    def _seeds(self) -> list[int]:
+        """One for each clip; the first clips are the same however many are asked for."""
+        import torch
+
+        draws = torch.Generator().manual_seed(self.seed)
+        return torch.randint(2**62, (self.count,), generator=draws).tolist()
+
+    def _write(self, pieces: Iterable["Motion"], path: Path, frames: int) -> None:
+        from mapctl.formats.bvh_stream import bvh_stream
+
+        began = time.perf_counter()
+        with bar(path.name, quiet=self.quiet) as progress, bvh_stream(path, frames) as file:
+            for piece in pieces:
+                file.append(piece)
+                if progress is not None:
+                    progress(file.written, frames)
+        if not self.quiet:
+            rate = frames / (time.perf_counter() - began)
+            seconds = frames / options.MOTION_FPS
+            print(f"{path}: {frames} frames, {seconds:.1f} s, drawn at {rate:.0f} frames a second")

@@ -1,0 +1,93 @@
+"""`mapctl info`: what is installed: priors and their cards, scenes, versions, rendering, threads."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from mapctl.commands import options
+from mapctl.commands.tables import print_table
+
+NOTICE = "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is."
+
+
+@dataclass(frozen=True)
+class Info:
+    """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads."""
+
+    name: Positional[options.MaybeName] = None
+    """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> int:
+        """Collect and print."""
+        from mapctl import report
+
+        if self.name is not None:
+            print(report.as_json(card(self.name)), end="")
+        elif self.json:
+            print(
+                report.as_json({"priors": priors_here(), "installation": installation(), "notice": NOTICE}),
+                end="",
+            )
+        else:
+            self._tables()
+        return 0
+
+    def _tables(self) -> None:
+        columns = ["prior", "kind", "size", "speeds", "licence of the weights"]
+        rows = [
+            [row["name"], row["kind"], f"{row['megabytes']:.1f} MB", _speeds(row), row["licence"]]
+            for row in priors_here()
+        ]
+        print_table(columns, rows or [["none is bundled", None, None, None, None]])
+        print_table(["installation", ""], [[name, str(value)] for name, value in installation().items()])
+        print(NOTICE)
+
+
+def card(name: str) -> dict[str, Any]:
+    """The whole card of a prior, and where it lies; CheckpointError if there is none."""
+    from priors import checkpoints
+
+    path = checkpoints.locate(name)
+    return {"file": str(path), **vars(checkpoints.read_card(path.with_suffix(".json")))}
+
+
+def priors_here() -> list[dict[str, Any]]:
+    """The bundled priors in short."""
+    from priors import checkpoints
+
+    return [_outline(name, card(name)) for name in checkpoints.bundled()]
+
+
+def installation() -> dict[str, Any]:
+    """Versions, scenes, rendering back end, threads and cores."""
+    import torch
+
+    import scenes
+    from mapctl import report
+
+    threads = {"threads of a solve": 1, "threads of torch": torch.get_num_threads(), "cores": os.cpu_count()}
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    return {
+        **report.versions(),
+        **threads,
+        "GPU": gpu,
+        "rendering": scenes.back_end(),
+        "scenes": ", ".join(scenes.ready()),
+    }
+
+
+def _outline(name: str, whole: Mapping[str, Any]) -> dict[str, Any]:
+    size = Path(whole["file"]).stat().st_size / 1e6
+    kept = {key: whole[key] for key in ("kind", "licence", "abilities", "config")}
+    return {"name": name, **kept, "megabytes": size}
+
+
+def _speeds(row: Mapping[str, Any]) -> str:
+    able = row["abilities"]
+    return f"{able['slowest']:.1f} to {able['fastest']:.1f} m/s" if able else "-"

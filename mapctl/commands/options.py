@@ -1,0 +1,77 @@
+"""Options that several commands share: their types for tyro, and the reading of their values."""
+
+import os
+import re
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from mapctl.errors import RequestError
+
+OutFile = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
+OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+DataFolder = Annotated[Path, arg(metavar="DIR")]
+File = Annotated[Path, arg(metavar="FILE")]
+InFile = Positional[Annotated[Path, arg(metavar="IN")]]
+CurveText = Annotated[str, arg(metavar="CURVE")]
+Speed = Annotated[str, arg(metavar="M/S|ARC:M/S,...")]
+Number = Annotated[float, arg(metavar="NUMBER")]
+Count = Annotated[int, arg(metavar="N")]
+Name = Annotated[str, arg(metavar="NAME")]
+MaybeFile = Annotated[Path | None, arg(metavar="FILE")]
+MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
+MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
+MaybeCount = Annotated[int | None, arg(metavar="N")]
+MaybeName = Annotated[str | None, arg(metavar="NAME")]
+CameraKind = Literal["follow", "fixed", "top"]
+Size = Annotated[str, arg(metavar="WxH")]
+
+MOTION_FPS = 30
+"""Frames per second that priors run at."""
+MOST_FRAMES = 3_600_000
+"""Longest motion asked for in one go: 33 hours at 30 fps."""
+
+
+def check_seed(seed: int) -> None:
+    """RequestError unless torch can take the seed."""
+    if not 0 <= seed < 2**63:
+        raise RequestError(f"the seed must be a whole number from 0 to 2^63 - 1, got {seed}")
+
+
+def frames_of(seconds: float) -> int:
+    """Frames of a motion of so many seconds at the priors' rate; RequestError for none or too many."""
+    if not seconds > 0:
+        raise RequestError(f"seconds must be positive, got {seconds:g}")
+    if seconds * MOTION_FPS > MOST_FRAMES:
+        raise RequestError(f"seconds must be at most {MOST_FRAMES // MOTION_FPS}, got {seconds:g}")
+    return max(2, round(seconds * MOTION_FPS))
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """`1280x720` as width and height in pixels."""
+    found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
+    if found is None:
+        raise RequestError(f"the size is WIDTHxHEIGHT in pixels, as 1280x720, got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def read_curve(text: str, metres_per_unit: float | None):
+    """The curve of a CURVE option. A file that is not there is said to be so, not taken for a shape."""
+    from mapctl import curves
+
+    if os.sep in text and not Path(text).exists():
+        raise RequestError(f"{text}: no such file")
+    return curves.read(text, metres_per_unit=metres_per_unit)
+
+
+def as_request(name: str, command: Any) -> dict[str, Any]:
+    """A command and its options as a report shows them."""
+    values = {field.name: getattr(command, field.name) for field in fields(command)}
+    return {"command": name} | {key: str(v) if isinstance(v, Path) else v for key, v in values.items()}
+
+
+def given(*paths: Path | None) -> list[Path]:
+    """The paths that were asked for."""
+    return [path for path in paths if path is not None]

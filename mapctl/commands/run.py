@@ -1,0 +1,89 @@
+"""`mapctl run`: a scripted scene."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.commands.walks import Walk, as_follow, walk
+from mapctl.progress import bar
+
+if TYPE_CHECKING:
+    from scenes.description import SceneDescription
+
+
+@dataclass(frozen=True)
+class RunScene:
+    """A scripted scene of several actors, from a TOML file or a ready one by name."""
+
+    scene: Positional[Annotated[str, arg(metavar="SCENE.toml")]]
+    """The scene file, or the name of a scene that comes with mapctl (`mapctl info` lists them)."""
+    out: options.OutFolder = Path()
+    """Folder for the scene's outputs; made if it is not there."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, let every actor walk, write the outputs."""
+        compute_on_one()
+        import priors
+        import scenes
+        from scenes.description import load
+
+        scene, curves = load(scenes.find(self.scene))
+        requests = [
+            as_follow(curve, actor.speed, actor.seconds)
+            for actor, curve in zip(scene.actors, curves, strict=True)
+        ]
+        outputs.check_folder(self.out)
+        for path in scene.films(self.out):
+            outputs.require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
+        prior = priors.load(scene.prior)
+        walks = []
+        for actor, request in zip(scene.actors, requests, strict=True):
+            with bar(actor.name, quiet=self.quiet) as progress:
+                walks.append(walk(prior, request, seed=actor.seed, progress=progress))
+            if not self.quiet:
+                print("\n".join([f"{actor.name}:", *(f"  {line}" for line in walks[-1].summary())]))
+        with outputs.made_folder(self.out):
+            self._write(scene, walks)
+        return 0
+
+    def _write(self, scene: "SceneDescription", walks: Sequence[Walk]) -> None:
+        from mapctl import report
+
+        motions, films, reports = scene.motions(self.out), scene.films(self.out), scene.reports(self.out)
+        written = [*chain.from_iterable(motions.values()), *films, *reports]
+        for path in {path.parent for path in written}:
+            path.mkdir(parents=True, exist_ok=True)
+        outputs.check_files(written)
+        for actor, done in zip(scene.actors, walks, strict=True):
+            for path in motions[actor.name]:
+                done.solution.motion.save(path)
+        for path in reports:
+            report.write(self._report(scene, walks), path)
+        if films:
+            self._film(scene, walks, films)
+        if not self.quiet:
+            print(f"wrote {', '.join(map(str, written))}")
+
+    def _film(self, scene: "SceneDescription", walks: Sequence[Walk], films: Sequence[Path]) -> None:
+        from scenes.film import film
+        from scenes.stage import Shot
+
+        shots = [Shot(done.solution.motion, done.request.curve, actor.colour, actor.start_seconds)
+                 for actor, done in zip(scene.actors, walks, strict=True)]  # fmt: skip
+        with bar("filming", quiet=self.quiet) as progress:
+            film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, progress=progress)
+
+    def _report(self, scene: "SceneDescription", walks: Sequence[Walk]) -> dict[str, Any]:
+        """By actor, the report of each walk."""
+        request = options.as_request("run", self) | {"title": scene.title}
+        actors = {actor.name: done.report(options.as_request("follow", actor))
+                  for actor, done in zip(scene.actors, walks, strict=True)}  # fmt: skip
+        return {"request": request, "actors": actors}

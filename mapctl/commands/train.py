@@ -1,0 +1,102 @@
+"""`mapctl train`: a prior from a folder of BVH."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands import options, outputs
+from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from priors.lstm_gmm import LstmGmmConfig
+    from priors.training.lstm_gmm import TrainingSettings
+    from priors.training.run import TrainRequest
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a prior on a folder of BVH; killed and resumed, a run gives the same weights."""
+
+    model: Positional[Annotated[Literal["lstm-gmm"], arg(metavar="lstm-gmm")]]
+    """What to train: lstm-gmm is the density that follow and generate use."""
+    data: options.DataFolder
+    """Folder of .bvh files, searched with everything below it."""
+    out: options.OutFolder
+    """Run folder: checkpoints, training curve, and at the end model.safetensors with its card."""
+    match: Annotated[str, arg(metavar="REGEX")] = ""
+    """Only clips whose path below the data folder holds this regular expression."""
+    width: options.MaybeCount = None
+    """Units of every hidden layer."""
+    components: options.MaybeCount = None
+    """Gaussians in the mixture."""
+    steps: options.MaybeCount = None
+    """Optimiser steps in all."""
+    batch: options.MaybeCount = None
+    """Windows a step."""
+    window: options.MaybeCount = None
+    """Frames a window."""
+    paper: bool = False
+    """The paper's own network and recipe instead of the measured better one; other options still hold."""
+    seed: options.MaybeCount = None
+    """Of weights, windows, noise and the split of the clips."""
+    resume: bool = False
+    """Go on from the run folder's last checkpoint."""
+    device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
+    """Where to compute."""
+    minutes_between_checkpoints: options.Number = 3.0
+    """How much a kill may cost."""
+    skip_first: bool = False
+    """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
+    licence: Annotated[str, arg(metavar="TEXT")] = "that of the training data"
+    """Of the weights, for their card."""
+    quiet: bool = False
+    """No lines of news."""
+
+    def run(self) -> int:
+        """Check, train, name the result."""
+        request = self.request()
+        outputs.check_folder(self.out)
+        from priors.training import run
+
+        path = run.train(request, (lambda line: None) if self.quiet else _say)
+        if not self.quiet:
+            print(f"wrote {path}; use it with --prior {self.out}")
+        return 0
+
+    def request(self) -> "TrainRequest":
+        """The options as the trainer takes them; RequestError for numbers that make no sense."""
+        from priors.training.run import TrainRequest
+
+        config, settings = self._recipe()
+        if not self.minutes_between_checkpoints > 0:
+            raise RequestError(
+                f"minutes between checkpoints must be positive, got {self.minutes_between_checkpoints:g}"
+            )
+        return TrainRequest(
+            data=self.data, out=self.out, match=self.match, config=config, settings=settings,
+            resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
+            licence=self.licence, skip_first=self.skip_first,
+        )  # fmt: skip
+
+    def _recipe(self) -> tuple["LstmGmmConfig", "TrainingSettings"]:
+        from priors.lstm_gmm import LstmGmmConfig
+        from priors.training.lstm_gmm import PAPER, TrainingSettings
+
+        config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
+        shape = {"width": self.width, "components": self.components}
+        recipe = {"steps": self.steps, "batch": self.batch, "window": self.window}
+        for name, value in (shape | recipe).items():
+            if value is not None and value < 1:
+                raise RequestError(f"--{name} must be at least 1, got {value}")
+        if self.seed is not None:
+            options.check_seed(self.seed)
+        given = {name: value for name, value in (recipe | {"seed": self.seed}).items() if value is not None}
+        return replace(config, **{k: v for k, v in shape.items() if v is not None}), replace(
+            settings, **given
+        )
+
+
+def _say(line: str) -> None:
+    # Flushed, so that a log file shows how far a run of hours has come.
+    print(line, flush=True)
