@@ -66,7 +66,9 @@ def test_no_limits_never_refuse():
     assert meter.reason == ""
 
 
-@pytest.mark.parametrize("limits", [{"evaluations": -1}, {"seconds": -0.1}, {"seconds": math.nan}])
-def test_impossible_limits_are_refused(limits: dict[str, float]):
-    with pytest.raises(RequestError, match=f"{next(iter(limits))} must be 0 or more"):
-        Budget(**limits)
+def test_impossible_limits_are_refused():
+    with pytest.raises(RequestError, match="evaluations must be 0 or more"):
+        Budget(evaluations=-1)
+    for seconds in (-0.1, math.nan):
+        with pytest.raises(RequestError, match="seconds must be 0 or more"):
+            Budget(seconds=seconds)

@@ -202,10 +202,11 @@ class _Problem:
         if not here.finite:
             return LbfgsStatus.NOT_FINITE
         self.start_energy = energy
+        length = settings.initial_step or min(1.0, float(np.linalg.norm(gradient)))
         while here.gradient_norm > settings.gradient_tolerance:
             if self.iterations == settings.max_iterations:
                 return LbfgsStatus.OUT_OF_BUDGET
-            direction, first = self._direction(here, pairs)
+            direction, first = _direction(here, pairs, length)
             found = yield from _line_search(here, direction, first, settings)
             if found is None:
                 if not pairs:
@@ -214,21 +215,13 @@ class _Problem:
                 continue
             guessed = not pairs  # a first step's length is a guess, so how little it wins says nothing
             won, scale = here.energy - found.energy, max(abs(here.energy), abs(found.energy), 1.0)
-            pairs.learn(found.x.astype(np.float64) - here.x, found.gradient - here.gradient)
+            step = found.x.astype(np.float64) - here.x
+            length = float(np.linalg.norm(step))
+            pairs.learn(step, found.gradient - here.gradient)
             here, self.iterations = found, self.iterations + 1
             if won <= settings.relative_energy_tolerance * scale and not guessed:
                 return LbfgsStatus.CONVERGED
         return LbfgsStatus.CONVERGED
-
-    def _direction(self, here: _Point, pairs: "_Pairs") -> tuple[Vector, float]:
-        """A descent direction, and the first step to try along it."""
-        if pairs:
-            direction = -pairs.apply(here.gradient)
-            if -math.inf < direction @ here.gradient < 0:
-                return direction, 1.0
-            pairs.clear()
-        length = float(np.linalg.norm(here.gradient))
-        return -here.gradient, (self.settings.initial_step or min(1.0, length)) / length
 
 
 class _Pairs:
@@ -261,6 +254,16 @@ class _Pairs:
         for (step, change, product), weight in zip(self._pairs, reversed(weights), strict=True):
             result += (weight - float(change @ result) / product) * step
         return result
+
+
+def _direction(here: _Point, pairs: _Pairs, length: float) -> tuple[Vector, float]:
+    """A descent direction and the first step along it; without a model, one of the given length."""
+    if pairs:
+        direction = -pairs.apply(here.gradient)
+        if -math.inf < direction @ here.gradient < 0:
+            return direction, 1.0
+        pairs.clear()
+    return -here.gradient, length / float(np.linalg.norm(here.gradient))
 
 
 def _line_search(
