@@ -17,7 +17,7 @@ from mapctl.intent import Follow, SpeedProfile
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.methods import LatentMethod, Method
 from mapctl.solver.result import Outcome, Solution, Status
-from mapctl.solver.window import Committed, WindowSettings, WindowSolver
+from mapctl.solver.window import Committed, TermsOf, WindowSettings, WindowSolver
 from mapctl.terms import Footing, Noise, Path, Term
 
 
@@ -25,9 +25,9 @@ from mapctl.terms import Footing, Noise, Path, Term
 class FollowSettings:
     """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
 
-    path_sigma_slow: float = 0.01
+    path_sigma_slow: float = 0.02
     """Sideways offset after its slow part is taken, metres."""
-    path_sigma_raw: float = 0.06
+    path_sigma_raw: float = 0.2
     """Sideways offset itself, metres."""
     path_sigma_progress: float = 0.08
     """Arc missing or too much, metres."""
@@ -57,21 +57,24 @@ def follow(
     make no sense; wishes that cannot hold are named with numbers in the solution's status.
     """
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
-    request, settings = Follow(curve, profile, seconds), settings or FollowSettings()
+    request, lowered = Follow(curve, profile, seconds).fitted(fps)
+    settings = settings or FollowSettings()
     generator = generator or torch.Generator().manual_seed(0)
     frames = request.frames(fps)
     # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
     arcs = request.arcs(frames + settings.window.frames, fps)
-    terms_of = _terms_of(curve, arcs, settings)
+    terms_of = follow_terms(curve, arcs, settings)
     start = choose_start(prior, curve, arcs, terms_of, skeleton=skeleton, fps=fps, generator=generator)
     solver = WindowSolver(prior, settings.window, skeleton, fps, settings.method)
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
                                  deadline=deadline)  # fmt: skip
-    return _solution(done, outcome, start, request, prior, arcs, skeleton, fps)
+    known = (*start.notes, *([lowered] if lowered else ()), *in_advance(request, arcs[:frames], prior.abilities))
+    return _solution(done, Status(outcome), start, known, curve, arcs, skeleton, fps)
 
 
-def _terms_of(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings):
+def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
+    """The terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
     path = Path(curve, arcs, joint=settings.joint, sigma_slow=settings.path_sigma_slow,
                 sigma_raw=settings.path_sigma_raw, sigma_progress=settings.path_sigma_progress)  # fmt: skip
 
@@ -82,12 +85,9 @@ def _terms_of(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSett
 
 
 def _solution(
-    done: Committed, outcome: Outcome, start: Start, request: Follow, prior: Any, arcs: Tensor, skeleton: Skeleton,
-    fps: float,
+    done: Committed, status: Status, start: Start, known: Sequence[str], curve: Curve, arcs: Tensor,
+    skeleton: Skeleton, fps: float,
 ) -> Solution:  # fmt: skip
     motion = decode(done.features, start.before_first, skeleton=skeleton, fps=round(fps))
-    status = Status(outcome).with_notes(start.notes)
-    ahead = in_advance(request, arcs[: len(done.features)], prior.abilities)
-    missed = after_the_fact(motion, request.curve, arcs, fps)
-    status = status.with_notes((*ahead, *missed), infeasible=bool(ahead or missed))
-    return Solution(motion, status, done.ledger, done.windows, done.features)
+    notes = (*known, *after_the_fact(motion, curve, arcs, fps))
+    return Solution(motion, status.with_notes(notes, infeasible=bool(notes)), done.ledger, done.windows, done.features)

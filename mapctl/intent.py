@@ -82,6 +82,22 @@ class Follow:
             raise RequestError(f"{count} frames are more than the {most} allowed; ask for fewer seconds")
         return max(2, count)
 
+    def fitted(self, fps: float, *, slowest_share: float = 0.6) -> tuple["Follow", str | None]:
+        """The request with speeds lowered so that an open curve lasts for the whole duration, and a sentence if so.
+
+        Speeds are lowered to `slowest_share` of the wanted ones at most; what is then left goes on straight.
+        """
+        if self.seconds is None or self.curve.closed:
+            return self, None
+        wanted = float(self.arcs(self.frames(fps), fps)[-1])
+        if wanted <= self.curve.length + 0.01:
+            return self, None
+        share = max(slowest_share, self.curve.length / wanted)
+        slower = SpeedProfile(self.profile.arcs, tuple(v * share for v in self.profile.speeds))
+        note = (f"the curve is {self.curve.length:.1f} m long and would be over after {self.seconds * share:.1f} of "
+                f"{self.seconds:.1f} s: speeds are lowered to {100 * share:.0f} %")  # fmt: skip
+        return Follow(self.curve, slower, self.seconds), note
+
     def arcs(self, frames: int, fps: float) -> Float[Tensor, " frames"]:
         """Wanted arc at each frame, metres, the first 0: the integral of speed."""
         arcs = [0.0]

@@ -1,0 +1,129 @@
+"""What the solver costs and which of its choices pay: the tables behind `mapctl bench`. Ratios within one run."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from controllers.follow import FollowSettings, follow, follow_terms
+from controllers.starting import choose_start
+from mapctl import curves
+from mapctl.curves import Curve
+from mapctl.features import LAYOUT
+from mapctl.metrics import measure
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.methods import LatentMethod, Method, StateMethod
+from mapctl.solver.objective import Objective
+from mapctl.solver.proposals import BestOf, Swarm
+from mapctl.solver.result import Solution
+from mapctl.solver.variables import Context, Latents
+from mapctl.terms import Likelihood, Noise
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class BenchSettings:
+    """How long to measure."""
+
+    seconds: float = 5.0
+    """Of motion in each solve of the ablation."""
+    repeats: int = 15
+    """Evaluations timed; the fastest counts, since other work on the machine only adds."""
+    particles: tuple[int, ...] = (1, 4, 16, 32)
+    """Batch sizes."""
+    lengths: tuple[float, ...] = (4.0, 8.0, 16.0)
+    """Seconds of motion, to show that cost grows linearly."""
+    seed: int = 0
+    """Of starts and draws."""
+
+
+def speed(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
+    """Energy and gradient of one window on the fast path and on the torch reference, then whole solves."""
+    reference = replace(prior, use_fast=False)
+    rows = [_evaluation(prior, reference, count, settings) for count in settings.particles]
+    return rows + [_solve(prior, seconds, settings) for seconds in settings.lengths]
+
+
+def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
+    """Starts and unknowns compared: energy, path error and time on three curves."""
+    shapes = {"circle:4": curves.circle(radius=4.0), "figure8:2": curves.figure8(radius=2.0), "s:6": curves.s(length=6.0)}
+    return [
+        {"curve": name, **_ablated(prior, curve, method, label, settings)}
+        for name, curve in shapes.items()
+        for label, method in methods(prior).items()
+    ]
+
+
+def methods(prior: Any) -> dict[str, Method]:
+    """The variants of the ablation by name."""
+    plain = LatentMethod()
+    size = LAYOUT.continuous
+    mean, std = prior.feature_mean[:size], prior.feature_std[:size]
+    return {
+        "latents, zero start": plain,
+        "latents, best of 32": replace(plain, proposal=BestOf(count=32), budget=Budget(evaluations=64)),
+        "latents, swarm 16 x 6": replace(plain, proposal=Swarm(), budget=Budget(evaluations=128)),
+        "states, 160 evaluations": StateMethod(std, mean),
+    }
+
+
+def _ablated(prior: Any, curve: Curve, method: Method, label: str, settings: BenchSettings) -> Row:
+    wishes = FollowSettings(method=method)
+    if isinstance(method, StateMethod):  # its noise is the network's input noise, in units of sigma, and states need a density
+        wishes = replace(wishes, noise=Noise(sigma=1.0), extra=(Likelihood(),))
+    began = time.process_time()
+    solution = follow(prior, curve, seconds=settings.seconds, settings=wishes,
+                      generator=torch.Generator().manual_seed(settings.seed))  # fmt: skip
+    spent = time.process_time() - began
+    found = measure(solution.motion, curve)
+    return {"method": label, "energy_nats": _wish_energy(solution), "path_error_mean_cm": found["path_error_mean_cm"],
+            "path_error_max_cm": found["path_error_max_cm"], "contact_speed_cm_s": found["contact_speed_cm_s"],
+            "jitter_m_s3": found["jitter_m_s3"], "ms_per_frame": 1000 * spent / solution.motion.num_frames}  # fmt: skip
+
+
+def _wish_energy(solution: Solution) -> float:
+    """Nats of the wishes, which all variants share (the prior's part is measured in different spaces)."""
+    return float(sum(e.energy.sum() for e in solution.ledger.entries if e.name in ("path", "footing")))
+
+
+def _evaluation(prior: Any, reference: Any, count: int, settings: BenchSettings) -> Row:
+    fast, slow = (_timed_evaluation(p, count, settings) for p in (prior, reference))
+    return {"what": f"energy and gradient, 34 frames, {count} candidates", "fast_ms": fast, "reference_ms": slow,
+            "times_faster": slow / fast, "fast_ms_per_candidate": fast / count}  # fmt: skip
+
+
+def _timed_evaluation(prior: Any, count: int, settings: BenchSettings) -> float:
+    curve, wishes = curves.circle(radius=4.0), FollowSettings()
+    frames = wishes.window.frames
+    arcs = torch.arange(2 * frames, dtype=torch.float64) * 1.2 / 30
+    terms_of = follow_terms(curve, arcs, wishes)
+    generator = torch.Generator().manual_seed(settings.seed)
+    start = choose_start(prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator).committed
+    context = Context(prior, start.state, start.place, start.joints_world, frames)
+    unknowns = 0.1 * torch.randn(count, frames * LAYOUT.continuous, generator=generator)
+    objective = Objective(Latents.planned(context, unknowns).build, terms_of(1, frames))
+    return 1000 * _fastest(lambda: objective.energy_and_gradient(unknowns), settings.repeats)
+
+
+def _solve(prior: Any, seconds: float, settings: BenchSettings) -> Row:
+    began = time.process_time()
+    solution = follow(prior, curves.circle(radius=4.0), seconds=seconds,
+                      generator=torch.Generator().manual_seed(settings.seed))  # fmt: skip
+    frames = solution.motion.num_frames
+    windows = solution.windows
+    return {"what": f"follow a circle for {seconds:g} s", "ms_per_frame": 1000 * (time.process_time() - began) / frames,
+            "evaluations_per_window": sum(w.evaluations for w in windows) / len(windows)}  # fmt: skip
+
+
+def _fastest(run: Callable[[], object], repeats: int) -> float:
+    run()
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - began)
+    return min(times)
