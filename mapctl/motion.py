@@ -84,7 +84,8 @@ class Motion:
         """This motion followed by `other`, which must have the same skeleton and frame rate; nothing is moved."""
         if not self.skeleton.matches(other.skeleton) or self.fps != other.fps:
             raise MapctlError("only motions of one skeleton and frame rate can be joined")
-        moving = {j: torch.cat([v, other.moving_offsets[j]]) for j, v in self.moving_offsets.items()}
+        travelling = sorted({*self.moving_offsets, *other.moving_offsets})
+        moving = {j: torch.cat([self._offset(j), other._offset(j)]) for j in travelling}
         root = torch.cat([self.root_position, other.root_position])
         return replace(self, root_position=root, moving_offsets=moving,
                        local_quat_xyzw=torch.cat([self.local_quat_xyzw, other.local_quat_xyzw]))  # fmt: skip
@@ -134,6 +135,10 @@ class Motion:
         from mapctl import formats
 
         formats.save(self, path)
+
+    def _offset(self, joint: int) -> Float[Tensor, "frames 3"]:
+        """A joint's offset in every frame, animated or not."""
+        return self.moving_offsets.get(joint, self.skeleton.offsets[joint].expand(self.num_frames, 3))
 
     def _with_frames(self, pick) -> "Motion":
         moving = {j: pick(v) for j, v in self.moving_offsets.items()}
