@@ -1,0 +1,196 @@
+"""Tiny synthetic motions, rigs, densities and corpora: no data set is needed to test the code that learns from one."""
+
+import math
+from dataclasses import asdict
+from fractions import Fraction
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from mapctl import retarget, rigs
+from mapctl.features import LAYOUT, encode
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+from priors.checkpoints import Card
+from priors.density import LstmGmmDensity
+from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.training.corpus import Corpus
+from priors.training.lstm_gmm import statistics
+from priors.training.starts import abilities, choose
+
+STRIDE = 0.25
+"""Swing of the upper legs, radians."""
+CADENCE = 0.9
+"""Strides a second: with the legs' length they give the speed of `walk`, about 1.2 m/s."""
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    """A seeded generator."""
+    return torch.Generator().manual_seed(seed)
+
+
+def quat_xyzw(rotation_vectors: Tensor) -> Tensor:
+    """Quaternions of rotation vectors by scipy, which shares no code with the project."""
+    flat = Rotation.from_rotvec(rotation_vectors.reshape(-1, 3).numpy()).as_quat()
+    return torch.from_numpy(flat).reshape(*rotation_vectors.shape[:-1], 4)
+
+
+def walk(
+    frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, seed: int = 0, fps: int = 30
+) -> Motion:
+    """A procedural walk on the canonical skeleton: legs and arms swing, knees lift, the lower toe is on the floor."""
+    time = torch.arange(frames, dtype=torch.float64) / fps
+    phase = 2 * math.pi * cadence * time
+    vectors = _swing(phase, seed)
+    heading = turn_rate * time
+    vectors[:, 0] = 0.03 * torch.stack([torch.sin(phase), 0 * phase, torch.cos(phase)], -1)
+    turn = quat_xyzw(torch.stack([0 * heading, heading, 0 * heading], -1))
+    local = quat_xyzw(vectors)
+    local[:, 0] = torch.from_numpy((Rotation.from_quat(turn) * Rotation.from_quat(local[:, 0])).as_quat())
+    root = _root(heading, speed=0.876 * STRIDE * 2 * math.pi * cadence, fps=fps)
+    motion = Motion(CANONICAL, Fraction(fps), root, local)
+    toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+    root[:, 1] += TOE_REST_HEIGHT - motion.joint_positions()[:, toes, 1].amin(-1)
+    return Motion(CANONICAL, Fraction(fps), root, local)
+
+
+def _swing(phase: Tensor, seed: int) -> Tensor:
+    """Rotation vectors (frames, joints, 3) of a gait, with a smooth wobble of every joint that the seed draws."""
+    offset = 6.3 * torch.rand(CANONICAL.num_joints, 3, generator=generator(seed), dtype=torch.float64)
+    vectors = 0.04 * torch.sin(phase[:, None, None] + offset)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        swing = -sign * STRIDE * torch.sin(phase)
+        knee = 0.6 * torch.clamp(sign * torch.cos(phase), min=0) ** 2
+        for joint, angle in (
+            ("UpperLeg", swing),
+            ("LowerLeg", knee),
+            ("Foot", -swing - knee),
+            ("LowerArm", 0 * knee),
+        ):
+            vectors[:, CANONICAL.index(side + joint), 0] = angle
+        vectors[:, CANONICAL.index(side + "UpperArm"), 2] -= sign * 1.2
+    return vectors
+
+
+def _root(heading: Tensor, *, speed: float, fps: int) -> Tensor:
+    velocity = speed / fps * torch.stack([torch.sin(heading), 0 * heading, torch.cos(heading)], -1)
+    return torch.cat([torch.zeros(1, 3, dtype=torch.float64), velocity[:-1].cumsum(0)])
+
+
+def walks(count: int = 5, frames: int = 100) -> list[Motion]:
+    """Different walks: to the left, straight, to the right; slower and faster."""
+    return [
+        walk(frames, turn_rate=0.3 * (k % 3 - 1), cadence=CADENCE * (0.8 + 0.1 * k), seed=k)
+        for k in range(count)
+    ]
+
+
+def random_motion(
+    skeleton: Skeleton, frames: int = 5, *, seed: int = 0, fps: Fraction = Fraction(30)
+) -> Motion:
+    """Every joint in any rotation, the root anywhere."""
+    local = torch.from_numpy(Rotation.random(frames * skeleton.num_joints, rng=seed).as_quat())
+    root = torch.randn(frames, 3, generator=generator(seed), dtype=torch.float64)
+    return Motion(skeleton, fps, root, local.reshape(frames, -1, 4))
+
+
+def turn_between(a_xyzw: Tensor, b_xyzw: Tensor) -> float:
+    """The largest angle between two sets of rotations, radians."""
+    first, second = (Rotation.from_quat(q.reshape(-1, 4).numpy()) for q in (a_xyzw, b_xyzw))
+    return float((first.inv() * second).magnitude().max())
+
+
+def bandai_skeleton() -> Skeleton:
+    """Canonical bones under Bandai Namco names and joint frames, below a static root."""
+    rig = next(r for r in rigs.known() if r.name == "bandai-namco")
+    frames = [Rotation.identity()]
+    for name in CANONICAL.names:
+        x, y = (torch.tensor(rig.tpose[name][axis], dtype=torch.float64) for axis in ("x", "y"))
+        x = x / x.norm()
+        y = y / y.norm()
+        frames.append(Rotation.from_matrix(torch.stack([x, y, torch.linalg.cross(x, y)], dim=1).numpy()))
+    parents = (-1, *(parent + 1 for parent in CANONICAL.parents))
+    offsets = [torch.zeros(3, dtype=torch.float64)]
+    for offset, parent in zip(CANONICAL.offsets, parents[1:], strict=True):
+        offsets.append(torch.from_numpy(frames[parent].inv().apply(offset.numpy())))
+    names = ("joint_Root", *(rig.joints[name] for name in CANONICAL.names))
+    return Skeleton(names, parents, torch.stack(offsets))
+
+
+def cmu_skeleton() -> Skeleton:
+    """Canonical bones under CMU (Daz) names with bent limbs, one finger, and End Sites for the toes."""
+    rig = next(r for r in rigs.known() if r.name == "cmu-daz")
+    kept = [name for name in CANONICAL.names if name in rig.joints]
+    names = [rig.joints[name] for name in kept]
+    parents = [kept.index(CANONICAL.names[p]) if p >= 0 else -1 for p in
+               (CANONICAL.parents[CANONICAL.index(name)] for name in kept)]  # fmt: skip
+    offsets = torch.stack([CANONICAL.offsets[CANONICAL.index(name)] for name in kept])
+    bend = torch.tensor([0.0, -0.017, 0.03], dtype=torch.float64)
+    for limb in ("LowerArm", "Hand", "LowerLeg", "Foot"):
+        offsets[[kept.index("left" + limb), kept.index("right" + limb)]] += bend
+    names.append("lThumb1")
+    parents.append(names.index("lHand"))
+    offsets = torch.cat([offsets, offsets.new_tensor([[0.03, -0.01, 0.04]])])
+    toe = (0.01, -0.07, 0.09)
+    return Skeleton(
+        tuple(names), tuple(parents), offsets, {"lFoot": toe, "rFoot": toe, "head": (0.0, 0.2, 0.0)}
+    )
+
+
+def corpus(count: int = 5, frames: int = 100) -> Corpus:
+    """The features of `walks`."""
+    clips = [encode(motion)[0].float() for motion in walks(count, frames)]
+    return Corpus(
+        tuple(f"walk-{k}.bvh" for k in range(count)), tuple(len(c) for c in clips), torch.cat(clips)
+    )
+
+
+def write_corpus(folder: Path, count: int = 5, frames: int = 80) -> Path:
+    """The walks as BVH files of the Bandai Namco rig."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rigmap = retarget.map_rig(bandai_skeleton())
+    for number, motion in enumerate(walks(count, frames)):
+        retarget.from_canonical(motion, rigmap).save(folder / f"walk-{number}.bvh")
+    return folder
+
+
+def tiny_model(*, width: int = 8, components: int = 3, seed: int = 0, retain: float = 0.9,
+               dtype: torch.dtype = torch.float32) -> LstmGmm:  # fmt: skip
+    """An untrained network with the statistics of the walks: it walks on at their mean pose and speed."""
+    mean, std = statistics(corpus().features, LAYOUT.continuous)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = LstmGmm(LstmGmmConfig(width=width, components=components, retain=retain), mean=mean, std=std)
+    return model.to(dtype).eval().requires_grad_(False)
+
+
+def tiny_density(*, width: int = 8, components: int = 3, seed: int = 0, starts: int = 4,
+                 dtype: torch.dtype = torch.float32) -> LstmGmmDensity:  # fmt: skip
+    """The network as the solver takes it, on the reference path, with starts from the walks."""
+    model = tiny_model(width=width, components=components, seed=seed)
+    data = corpus()
+    found = choose(model, data, count=starts, generator=generator(seed))
+    card = Card(kind="lstm-gmm", config=asdict(model.config), licence="none", data={"starts": list(found.names)},
+                abilities=asdict(abilities(data)), **Card.of_layout())  # fmt: skip
+    density = LstmGmmDensity("tiny", model.to(dtype), found, card, use_fast=False)
+    if dtype is not torch.float32:
+        for part in ("previous", "hidden", "cell"):
+            object.__setattr__(found.state, part, getattr(found.state, part).to(dtype))
+    return density
+
+
+def noise(
+    batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "b f c"]:
+    """Latents of a rollout."""
+    return torch.randn(batch, frames, LAYOUT.continuous, generator=generator(seed), dtype=torch.float64).to(
+        dtype
+    )
+
+
+def finite_difference(function, at: Tensor, direction: Tensor, *, step: float = 1e-6) -> float:
+    """Central difference of a scalar function along a direction."""
+    return float((function(at + step * direction) - function(at - step * direction)) / (2 * step))

@@ -1,0 +1,140 @@
+"""Motion: slices, joins, other frame rates, mirror images."""
+
+from dataclasses import FrozenInstanceError
+from fractions import Fraction
+
+import pytest
+import torch
+from helpers import bandai_skeleton, generator, quat_xyzw, random_motion, turn_between, walk
+
+from mapctl.errors import MapctlError, RequestError
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
+
+
+def travelling(frames=6, seed=0):
+    """A motion whose joint 1 travels within its parent."""
+    motion = random_motion(bandai_skeleton(), frames, seed=seed)
+    track = torch.randn(frames, 3, generator=generator(seed), dtype=torch.float64)
+    return Motion(
+        motion.skeleton, motion.fps, motion.root_position, motion.local_quat_xyzw, {1: track}, "layout"
+    )
+
+
+def same(a, b, tolerance=1e-9):
+    torch.testing.assert_close(a.joint_positions(), b.joint_positions(), atol=tolerance, rtol=0)
+    assert turn_between(a.joint_rotations(), b.joint_rotations()) < 1e-6
+
+
+def test_parts_joined_are_the_whole():
+    motion = travelling()
+    whole = motion.slice(0, 2).join(motion.slice(2, 6))
+    same(whole, motion)
+    assert whole.source == motion.source == "layout"
+    assert (whole.num_frames, whole.num_joints, whole.seconds) == (6, 22, 0.2)
+
+
+@pytest.mark.parametrize("first_travels", [True, False])
+def test_a_travelling_joint_is_joined_to_one_at_rest(first_travels):
+    moving, still = travelling(3), random_motion(bandai_skeleton(), 4, seed=9)
+    pair = (moving, still) if first_travels else (still, moving)
+    joined = pair[0].join(pair[1])
+    torch.testing.assert_close(joined.joint_positions(), torch.cat([m.joint_positions() for m in pair]))
+
+
+def test_a_travelling_joint_moves_what_hangs_on_it():
+    motion = travelling()
+    offset = motion.joint_positions()[:, 1] - motion.joint_positions()[:, 0]
+    torch.testing.assert_close(offset.norm(dim=-1), motion.moving_offsets[1].norm(dim=-1))
+
+
+@pytest.mark.parametrize("other", ["fps", "skeleton"])
+def test_unlike_motions_are_not_joined(other):
+    motion = random_motion(CANONICAL, 3)
+    fps = Fraction(60) if other == "fps" else Fraction(30)
+    longer = Skeleton(
+        CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * (1.1 if other == "skeleton" else 1)
+    )
+    with pytest.raises(MapctlError, match="one skeleton and frame rate"):
+        motion.join(random_motion(longer, 3, fps=fps))
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, 3), (2, 2), (3, 2), (0, 7)])
+def test_slices_beyond_the_frames_are_refused(start, stop):
+    with pytest.raises(RequestError, match=f"frames {start}:{stop} are not within 0:6"):
+        travelling().slice(start, stop)
+
+
+def test_a_motion_is_frozen_and_has_frames():
+    motion = travelling()
+    with pytest.raises(FrozenInstanceError):
+        motion.fps = Fraction(1)  # pyright: ignore
+    with pytest.raises(MapctlError, match="at least one frame"):
+        Motion(CANONICAL, Fraction(30), motion.root_position[:0], torch.zeros(0, 21, 4).double())
+    with pytest.raises(MapctlError, match="21 joints needs"):
+        Motion(CANONICAL, Fraction(30), motion.root_position, motion.local_quat_xyzw)
+
+
+def test_twice_the_rate_keeps_every_frame_and_puts_one_midway():
+    motion = travelling()
+    fine = motion.resample(60)
+    assert (fine.num_frames, fine.fps) == (11, Fraction(60))
+    torch.testing.assert_close(fine.root_position[::2], motion.root_position)
+    torch.testing.assert_close(fine.moving_offsets[1][::2], motion.moving_offsets[1])
+    assert turn_between(fine.local_quat_xyzw[::2], motion.local_quat_xyzw) < 1e-6
+    middle = (motion.root_position[:-1] + motion.root_position[1:]) / 2
+    torch.testing.assert_close(fine.root_position[1::2], middle)
+    left = turn_between(fine.local_quat_xyzw[1], fine.local_quat_xyzw[0])
+    right = turn_between(fine.local_quat_xyzw[1], fine.local_quat_xyzw[2])
+    assert left == pytest.approx(right, abs=1e-6)
+    same(fine.resample(30), motion)
+
+
+@pytest.mark.parametrize("fps", [25, 29.97, Fraction(24000, 1001), 120])
+def test_other_rates_keep_the_duration_and_follow_a_steady_turn(fps):
+    frames, rate = 61, 2.0
+    at = torch.arange(frames, dtype=torch.float64) / 30
+    local = quat_xyzw(torch.stack([0 * at, rate * at, 0 * at], -1))[:, None].expand(-1, 21, -1).clone()
+    motion = Motion(CANONICAL, Fraction(30), torch.stack([at, at, -at], -1), local).resample(fps)
+    times = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
+    assert 2 - 1 / float(fps) < float(times[-1]) <= 2 + 1e-9
+    torch.testing.assert_close(motion.root_position[:, 0], times)
+    expected = quat_xyzw(torch.stack([0 * times, rate * times, 0 * times], -1))
+    assert turn_between(motion.local_quat_xyzw[:, 5], expected) < 1e-6
+
+
+@pytest.mark.parametrize("fps", [0, -30])
+def test_impossible_rates_are_refused(fps):
+    with pytest.raises(RequestError, match="must be positive"):
+        travelling().resample(fps)
+
+
+def test_mirrored_twice_is_the_motion_itself():
+    motion = walk(20, turn_rate=0.5)
+    twice = motion.mirror().mirror()
+    torch.testing.assert_close(twice.root_position, motion.root_position)
+    torch.testing.assert_close(twice.local_quat_xyzw, motion.local_quat_xyzw)
+    torch.testing.assert_close(twice.skeleton.offsets, motion.skeleton.offsets)
+    assert twice.skeleton.end_offsets == motion.skeleton.end_offsets
+
+
+def test_a_mirror_image_has_every_joint_on_the_other_side():
+    bones = CANONICAL.offsets * (1 + 0.2 * torch.rand(21, 1, generator=generator(), dtype=torch.float64))
+    motion = random_motion(Skeleton(CANONICAL.names, CANONICAL.parents, bones))
+    image = motion.mirror()
+    for name, other in (
+        ("hips", "hips"),
+        ("head", "head"),
+        ("leftHand", "rightHand"),
+        ("rightToes", "leftToes"),
+    ):
+        place = motion.joint_positions()[:, CANONICAL.index(name)] * torch.tensor([-1.0, 1, 1])
+        torch.testing.assert_close(
+            image.joint_positions()[:, CANONICAL.index(other)], place, atol=1e-9, rtol=0
+        )
+
+
+def test_a_side_without_partner_cannot_be_mirrored():
+    one_armed = Skeleton(("hips", "leftHand"), (-1, 0), torch.zeros(2, 3).double())
+    with pytest.raises(MapctlError, match="no joint 'rightHand'"):
+        random_motion(one_armed).mirror()

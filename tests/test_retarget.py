@@ -1,0 +1,142 @@
+"""Known rigs to canonical joint frames and back, without loss."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import bandai_skeleton, cmu_skeleton, random_motion, turn_between, walk
+
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
+
+SKELETONS = {"bandai-namco": bandai_skeleton(), "cmu-daz": cmu_skeleton(), "canonical": CANONICAL}
+each_rig = pytest.mark.parametrize("rig", SKELETONS)
+
+
+def random_on(rig, frames=6):
+    """Any rotations everywhere, and the hips anywhere, by the root or below it."""
+    skeleton = SKELETONS[rig]
+    motion = random_motion(skeleton, frames)
+    if rig == "bandai-namco":
+        return replace(motion, moving_offsets={1: motion.root_position.flip(0)}, source="layout")
+    return replace(motion, source="layout")
+
+
+@each_rig
+def test_rigs_are_recognised(rig):
+    assert retarget.map_rig(SKELETONS[rig]).rig.name == rig
+
+
+@each_rig
+def test_there_and_back_is_the_motion_itself(rig):
+    motion = random_on(rig)
+    canonical, rigmap = retarget.to_canonical(motion)
+    back = retarget.from_canonical(canonical, rigmap, motion)
+    assert turn_between(back.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
+    torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-9, rtol=0)
+    assert back.source == "layout"
+    assert back.skeleton is motion.skeleton
+
+
+@each_rig
+def test_back_and_there_is_the_canonical_motion(rig):
+    rigmap = retarget.map_rig(SKELETONS[rig])
+    wanted = replace(random_motion(rigmap.skeleton, seed=3))
+    if rig == "cmu-daz":  # it has no toe joints: the toes cannot turn on their own
+        toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+        wanted.local_quat_xyzw[:, toes] = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
+    canonical, _ = retarget.to_canonical(retarget.from_canonical(wanted, rigmap))
+    assert turn_between(canonical.local_quat_xyzw, wanted.local_quat_xyzw) < 1e-6
+    torch.testing.assert_close(canonical.joint_positions(), wanted.joint_positions(), atol=1e-9, rtol=0)
+
+
+@each_rig
+def test_canonical_joints_are_where_the_rigs_are(rig):
+    motion = random_on(rig)
+    canonical, rigmap = retarget.to_canonical(motion)
+    for c, joint in enumerate(rigmap.joint_of):
+        if joint is not None:
+            places = canonical.joint_positions()[:, c], motion.joint_positions()[:, joint]
+            torch.testing.assert_close(*places, atol=1e-9, rtol=0, msg=CANONICAL.names[c])
+
+
+@each_rig
+def test_the_t_pose_comes_out_as_identity(rig):
+    rigmap = retarget.map_rig(SKELETONS[rig])
+    tpose = Motion(rigmap.skeleton, random_on(rig).fps, torch.zeros(1, 3).double(),
+                   torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4))  # fmt: skip
+    on_rig = retarget.from_canonical(tpose, rigmap)
+    world = on_rig.joint_rotations()[0]
+    for c, joint in enumerate(rigmap.joint_of):
+        if joint is not None:
+            assert turn_between(world[joint], rigmap.tpose_quat_xyzw[c]) < 1e-6
+    local = retarget.to_canonical(on_rig)[0].local_quat_xyzw
+    assert turn_between(local, tpose.local_quat_xyzw) < 1e-6
+
+
+def test_bandai_bones_are_the_canonical_ones():
+    np.testing.assert_allclose(
+        retarget.map_rig(bandai_skeleton()).skeleton.offsets, CANONICAL.offsets, atol=1e-9
+    )
+
+
+def test_bent_limbs_of_cmu_are_straight_in_its_t_pose():
+    bones = retarget.map_rig(cmu_skeleton()).skeleton
+    for child in ("leftLowerArm", "rightHand", "leftLowerLeg", "rightFoot"):
+        joint = CANONICAL.index(child)
+        bone, wanted = bones.offsets[joint], CANONICAL.offsets[joint]
+        torch.testing.assert_close(bone / bone.norm(), wanted / wanted.norm(), atol=1e-9, rtol=0)
+
+
+def test_missing_toes_of_cmu_are_the_feets_end_sites():
+    motion = random_motion(cmu_skeleton())
+    canonical, rigmap = retarget.to_canonical(motion)
+    toe, foot = CANONICAL.index("leftToes"), CANONICAL.index("leftFoot")
+    assert rigmap.joint_of[toe] is None
+    apart = canonical.joint_positions()[:, toe] - canonical.joint_positions()[:, foot]
+    site = torch.tensor(cmu_skeleton().end_offsets["lFoot"], dtype=torch.float64)
+    torch.testing.assert_close(apart.norm(dim=-1), site.norm().expand(5), atol=1e-9, rtol=0)
+    assert turn_between(canonical.joint_rotations()[:, toe], canonical.joint_rotations()[:, foot]) < 1e-9
+
+
+def test_joints_beyond_the_canonical_ones_keep_the_originals_rotation_or_rest():
+    motion = random_motion(cmu_skeleton())
+    canonical, rigmap = retarget.to_canonical(motion)
+    thumb = motion.skeleton.index("lThumb1")
+    kept = retarget.from_canonical(canonical, rigmap, motion).local_quat_xyzw[:, thumb]
+    assert turn_between(kept, motion.local_quat_xyzw[:, thumb]) < 1e-9
+    longer = retarget.from_canonical(canonical.join(canonical), rigmap, motion)
+    assert (
+        turn_between(longer.local_quat_xyzw[:, thumb], torch.tensor([0.0, 0, 0, 1]).double().expand(10, 4))
+        < 1e-9
+    )
+
+
+def test_the_static_root_of_an_original_stays():
+    motion = random_on("bandai-namco")
+    canonical, rigmap = retarget.to_canonical(motion)
+    moved = retarget.from_canonical(
+        replace(canonical, root_position=canonical.root_position + 1), rigmap, motion
+    )
+    torch.testing.assert_close(moved.root_position, motion.root_position)
+    hips = motion.joint_positions()[:, 1] + 1
+    torch.testing.assert_close(moved.joint_positions()[:, 1], hips, atol=1e-9, rtol=0)
+
+
+def test_one_walk_on_two_rigs_goes_the_same_way():
+    motion = walk(10)
+    for skeleton in (bandai_skeleton(), cmu_skeleton()):
+        rigmap = retarget.map_rig(skeleton)
+        again, _ = retarget.to_canonical(retarget.from_canonical(motion, rigmap))
+        hand = CANONICAL.index("leftHand")
+        assert turn_between(again.joint_rotations()[:, hand], motion.joint_rotations()[:, hand]) < 1e-6
+        torch.testing.assert_close(again.root_position, motion.root_position, atol=1e-9, rtol=0)
+
+
+def test_an_unknown_rig_is_refused_with_the_known_ones():
+    strange = Skeleton(("bone_1", "bone_2"), (-1, 0), torch.zeros(2, 3).double())
+    with pytest.raises(RequestError, match=r"bone_1, bone_2.*canonical, bandai-namco, cmu-daz"):
+        retarget.map_rig(strange)

@@ -1,0 +1,112 @@
+"""Rotation maths against scipy, and its gradients where formulas usually break."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import generator, turn_between
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from mapctl import rotations
+
+ANGLE = st.floats(-20, 20)
+
+
+def random_quats(count, seed=0):
+    return torch.from_numpy(Rotation.random(count, rng=seed).as_quat())
+
+
+def test_products_actions_and_matrices_are_scipys():
+    a, b = random_quats(50, 1), random_quats(50, 2)
+    v = torch.randn(50, 3, generator=generator(), dtype=torch.float64)
+    ours, theirs = Rotation.from_quat(a), Rotation.from_quat(b)
+    assert turn_between(rotations.multiply(a, b), torch.from_numpy((ours * theirs).as_quat())) < 1e-7
+    assert turn_between(rotations.inverse(a), torch.from_numpy(ours.inv().as_quat())) < 1e-7
+    np.testing.assert_allclose(rotations.rotate(a, v), ours.apply(v.numpy()), atol=1e-12)
+    np.testing.assert_allclose(rotations.to_matrix(a), ours.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotations.to_rotation_vector(a), ours.as_rotvec(), atol=1e-9)
+    assert turn_between(rotations.from_matrix(rotations.to_matrix(a)), a) < 1e-7
+
+
+def test_rotation_vectors_are_the_short_ones_whatever_the_sign():
+    quats = random_quats(100)
+    vectors = rotations.to_rotation_vector(quats)
+    assert float(vectors.norm(dim=-1).max()) <= math.pi + 1e-9
+    torch.testing.assert_close(rotations.to_rotation_vector(-quats), vectors, atol=1e-9, rtol=0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(angle=ANGLE)
+def test_a_turn_about_y_takes_z_toward_x(angle):
+    turned = rotations.rotate(
+        rotations.about_y(torch.tensor(angle, dtype=torch.float64)), torch.tensor([0.0, 0, 1]).double()
+    )
+    torch.testing.assert_close(
+        turned, torch.tensor([math.sin(angle), 0, math.cos(angle)], dtype=torch.float64), atol=1e-9, rtol=0
+    )
+    ground = rotations.rotate_ground(
+        torch.tensor([0.0, 1.0]).double(), torch.tensor(angle, dtype=torch.float64)
+    )
+    torch.testing.assert_close(ground, turned[::2], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_split_heading_gives_back_the_rotation_and_a_tilt_without_turn(seed):
+    quats = random_quats(200, seed)
+    heading, tilt = rotations.split_heading(quats)
+    assert turn_between(rotations.multiply(rotations.about_y(heading), tilt), quats) < 1e-7
+    assert float(rotations.to_rotation_vector(tilt)[:, 1].abs().max()) < 1e-9
+    assert bool(((heading >= -math.pi) & (heading < math.pi)).all())
+
+
+def test_heading_of_a_turned_tilt_moves_with_the_turn():
+    quats = random_quats(100)
+    turned = rotations.multiply(rotations.about_y(torch.full((100,), 2.5, dtype=torch.float64)), quats)
+    (before, tilt), (after, same) = rotations.split_heading(quats), rotations.split_heading(turned)
+    assert float(rotations.wrap_angle(after - before - 2.5).abs().max()) < 1e-9
+    assert turn_between(tilt, same) < 1e-7
+
+
+@settings(max_examples=50, deadline=None)
+@given(angle=ANGLE)
+def test_wrapped_angles_are_the_same_angle(angle):
+    wrapped = float(rotations.wrap_angle(torch.tensor(angle, dtype=torch.float64)))
+    assert -math.pi <= wrapped < math.pi
+    assert math.isclose(math.cos(wrapped - angle), 1, abs_tol=1e-9)
+
+
+def test_unwrapping_undoes_wrapping_of_slow_angles():
+    slow = torch.linspace(-9, 14, 60, dtype=torch.float64).expand(2, -1)
+    unwrapped = rotations.unwrap_angle(rotations.wrap_angle(slow))
+    torch.testing.assert_close(unwrapped - unwrapped[:, :1], slow - slow[:, :1])
+
+
+def test_sign_continuity_changes_no_rotation_and_leaves_no_jump():
+    smooth = rotations.from_rotation_vector(
+        torch.linspace(0, 6, 50, dtype=torch.float64)[:, None, None] * torch.ones(1, 2, 3)
+    )
+    signs = torch.randint(0, 2, (50, 2, 1), generator=generator()) * 2.0 - 1
+    fixed = rotations.sign_continuous(smooth * signs)
+    assert float((fixed[1:] * fixed[:-1]).sum(-1).min()) > 0
+    assert turn_between(fixed, smooth) < 1e-7
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.25, 1.0])
+def test_slerp_is_scipys(weight):
+    pair = random_quats(2, 7)
+    expected = Slerp([0, 1], Rotation.from_quat(pair))([weight]).as_quat()[0]
+    got = rotations.slerp(pair[0], -pair[1], torch.tensor(weight, dtype=torch.float64))
+    assert turn_between(got, torch.from_numpy(expected)) < 1e-7
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 1.0, math.pi - 1e-4])
+def test_gradients_are_exact_at_rest_and_near_a_half_turn(size):
+    vector = torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64) * size
+    for function in (rotations.from_rotation_vector, rotations.rotation_vector_to_matrix):
+        assert torch.autograd.gradcheck(function, vector.clone().requires_grad_(True), eps=1e-7, atol=1e-5)
+    if size:  # beyond a half turn the vector flips, so the difference must stay on one side
+        back = lambda v: rotations.to_rotation_vector(rotations.from_rotation_vector(v))  # noqa: E731
+        assert torch.autograd.gradcheck(back, vector.clone().requires_grad_(True), eps=1e-8, atol=1e-4)
