@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from controllers.follow import FollowSettings, follow, follow_terms
+from controllers.generate import GenerateSettings, begin
 from controllers.starting import choose_start
 from mapctl import curves
 from mapctl.curves import Curve
@@ -48,9 +50,48 @@ def speed(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
     return rows + [_solve(prior, seconds, settings) for seconds in settings.lengths]
 
 
+def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) -> list[Row]:
+    """Long free runs at temperature 1: a row each, and one of their means beside the training data's own values.
+
+    `stuck` is the lowest one-second speed over the median one; 0 would be a character that has stopped.
+    """
+    rows, everything = [], []
+    for run in range(runs):
+        features = _free_run(prior, frames, seed + run)
+        everything.append(features)
+        pace = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * 30
+        seconds = pace[: len(pace) // 30 * 30].unflatten(0, (-1, 30)).mean(-1)
+        rows.append({"run": str(run), **_free_run_values(features), "slowest_second_m_s": float(seconds.min()),
+                     "fastest_second_m_s": float(seconds.max()),
+                     "largest_feature_sigma": float(_in_sigmas(prior, features).abs().max())})  # fmt: skip
+    data = prior.card.quality["data"]
+    return [*rows, {"run": "all", **_free_run_values(torch.cat(everything))}, {"run": "training data", **data}]
+
+
+def _free_run(prior: Any, frames: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    state, _ = begin(prior, GenerateSettings(), None, generator)
+    return prior.sample(state, frames, generator)[0][0]
+
+
+def _free_run_values(features: Tensor) -> Row:
+    return {"speed": float(LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean() * 30),
+            "height": float(LAYOUT.pick(features, "root_height").mean()),
+            "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean())}  # fmt: skip
+
+
+def _in_sigmas(prior: Any, features: Tensor) -> Tensor:
+    size = LAYOUT.continuous
+    return ((features - prior.feature_mean) / prior.feature_std)[..., :size]
+
+
 def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
     """Starts and unknowns compared: energy, path error and time on three curves."""
-    shapes = {"circle:4": curves.circle(radius=4.0), "figure8:2": curves.figure8(radius=2.0), "s:6": curves.s(length=6.0)}
+    shapes = {
+        "circle:4": curves.circle(radius=4.0),
+        "figure8:2": curves.figure8(radius=2.0),
+        "s:6": curves.s(length=6.0),
+    }
     return [
         {"curve": name, **_ablated(prior, curve, method, label, settings)}
         for name, curve in shapes.items()
@@ -73,7 +114,9 @@ def methods(prior: Any) -> dict[str, Method]:
 
 def _ablated(prior: Any, curve: Curve, method: Method, label: str, settings: BenchSettings) -> Row:
     wishes = FollowSettings(method=method)
-    if isinstance(method, StateMethod):  # its noise is the network's input noise, in units of sigma, and states need a density
+    if isinstance(
+        method, StateMethod
+    ):  # its noise is the network's input noise, in units of sigma, and states need a density
         wishes = replace(wishes, noise=Noise(sigma=1.0), extra=(Likelihood(),))
     began = time.process_time()
     solution = follow(prior, curve, seconds=settings.seconds, settings=wishes,

@@ -25,7 +25,9 @@ def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abili
     notes += _corners(request, arcs, abilities)
     if not request.curve.closed and float(arcs[-1]) > request.curve.length + 0.05:
         over = float(arcs[-1]) - request.curve.length
-        notes.append(f"the curve is {request.curve.length:.1f} m long; the last {over:.1f} m go straight on beyond its end")
+        notes.append(
+            f"the curve is {request.curve.length:.1f} m long; the last {over:.1f} m go straight on beyond its end"
+        )
     return notes
 
 
@@ -39,7 +41,9 @@ def after_the_fact(motion: Motion, curve: Curve, arcs: Float[Tensor, " frames"],
         return []
     off = (error * 100 > _TOLERATED_CM).nonzero()[:, 0]
     first, last = int(off[0]), int(off[-1])
-    return [f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first / fps:.1f} and {last / fps:.1f} s"]
+    return [
+        f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first / fps:.1f} and {last / fps:.1f} s"
+    ]
 
 
 def _corners(request: Follow, arcs: Tensor, abilities: Abilities) -> list[str]:

@@ -40,7 +40,7 @@ def stream(
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * fps))
-    state, place = _begin(prior, settings, start_clip, generator)
+    state, place = begin(prior, settings, start_clip, generator)
     while frames > 0:
         features, state = prior.sample(state, min(frames, _CHUNK), generator, temperature=settings.temperature)
         yield decode(features[0], place, fps=fps)
@@ -60,10 +60,8 @@ def generate(
     return motion
 
 
-def _begin(
-    prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator
-) -> tuple[Any, Place]:
-    """The prior's state and the place (float64) before the first frame."""
+def begin(prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator) -> tuple[Any, Place]:
+    """The prior's state and the place (float64) before the first frame: a start of its own, or the end of a clip."""
     if clip is not None:
         canonical, _ = retarget.to_canonical(clip)
         features, place = encode(canonical.resample(30))

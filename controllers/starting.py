@@ -61,7 +61,9 @@ def choose_start(
 
 def _standing(state: Any, place: Place, skeleton: Skeleton, notes: tuple[str, ...]) -> Start:
     first = state.previous
-    before = place.before(LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0])
+    before = place.before(
+        LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
+    )
     joints = decode(first, before, skeleton=skeleton).joint_positions().to(first.dtype)
     return Start(Committed(state, place, first, joints, first.new_zeros(0, LAYOUT.continuous)), before, notes)
 

@@ -31,6 +31,8 @@ _EXTRAS = {
     "cluster": {"ray"},
 }
 """Packages by the extra that installs them."""
+_COLOURS = re.compile(r"\x1b\[[\d;]*m")
+_HINT = re.compile(r"Available subcommands: .*|Perhaps you meant: -[\w-]+")
 _PLAINER = (
     (r" Got errors:.*", ""),
     (r"no type matching (.+) could be instantiated from \[(.*?)\]", r"expected \1, got \2"),
@@ -49,11 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         signal.signal(signal.SIGTERM, _terminate)
     words = list(sys.argv[1:] if argv is None else argv)
-    if words in (["--version"], ["-V"]):
-        print(f"mapctl {__version__}")
-        return 0
     try:
-        status = parse(words).run()
+        status = _version() if words == ["--version"] else parse(words).run()
         sys.stdout.flush()
     except MapctlError as error:
         status = _say(str(error), _WRONG)
@@ -89,26 +88,32 @@ _DESCRIPTION = (
 )
 
 
+def _version() -> int:
+    print(f"mapctl {__version__}")
+    return 0
+
+
 def _subcommand(name: str, kind: type[Command]) -> Any:
     return Annotated[kind, tyro.conf.subcommand(name, prefix_name=False)]
 
 
 def _essence(box: str) -> str:
-    """What tyro explains in a box of many lines, in one: its first paragraph, and a hint if there is one."""
+    """What tyro explains in a box of many lines, in one: its first paragraph, and a hint if there is one.
+
+    The box has a title line, and rules between its paragraphs; colours where standard output is a terminal.
+    """
     paragraphs = [""]
-    for line in box.splitlines():
-        text = line.strip("│| ")
-        if not line.startswith(("│", "|")):
-            continue
-        if text and not text.strip("─-"):
+    for line in _COLOURS.sub("", box).splitlines()[1:]:
+        text = line.strip("│ ")
+        if text and not text.strip("─-╰╯"):
             paragraphs.append("")
         else:
             paragraphs[-1] = f"{paragraphs[-1]} {text}".strip()
-    hints = (re.match(r"Available subcommands: .*|Perhaps you meant: -[\w-]+", p) for p in paragraphs[1:])
-    first = paragraphs[0] or "the command cannot be understood"
+    first, *others = [*filter(None, paragraphs)] or ["the command cannot be understood"]
+    hints = filter(None, (_HINT.match(paragraph) for paragraph in others))
     for pattern, plainer in _PLAINER:
         first = re.sub(pattern, plainer, first)
-    return ". ".join([first.strip().rstrip("."), *(hint.group() for hint in hints if hint)])
+    return ". ".join([first.strip().rstrip("."), *(hint.group() for hint in hints)])
 
 
 def _help(words: Sequence[str]) -> str:

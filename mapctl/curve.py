@@ -17,9 +17,7 @@ from mapctl.rotations import unwrap_angle
 
 Arc = Float[Tensor, "*batch"] | float
 
-_NEIGHBOURS = (
-    16  # vertices looked at around a point: enough to hold an end of the nearest segment (1 cm apart)
-)
+_NEIGHBOURS = 16  # vertices looked at around a point: enough to hold an end of the nearest segment (1 cm apart)
 _SEARCH_STEP = 0.04  # metres between the arcs that a local search tries first
 _REFINEMENT = 10  # a local search's second grid is this much finer
 _RUN_ON = 1.0  # metres of straight extension in the tables; beyond them the line goes on all the same
@@ -125,11 +123,7 @@ class Curve:
         laps = torch.floor(arc.detach() / self.length) if self.closed else torch.zeros_like(arc)
         within = torch.remainder(arc, self.length) if self.closed else arc.clamp(0, self.length)
         vertex = _piece(self._arcs, within)
-        return (
-            heading[vertex]
-            + (within - self._arcs[vertex]) * slope[vertex]
-            + laps * (heading[-1] - heading[0])
-        )
+        return heading[vertex] + (within - self._arcs[vertex]) * slope[vertex] + laps * (heading[-1] - heading[0])
 
     def curvature(self, arc: Arc, *, base: float = 0.3) -> Float[Tensor, "*batch"]:
         """Turn of the heading per metre, 1/m, over `base` metres around the arc; left is positive.
@@ -165,9 +159,7 @@ class Curve:
         segments = segment.unsqueeze(-1) + torch.tensor([-1, 0, 1])
         return (guess + self._project(points, segments, within)).to(points.dtype)
 
-    def _project(
-        self, points: Tensor, segments: Int[Tensor, "*batch tried"], within: Tensor | float
-    ) -> Tensor:
+    def _project(self, points: Tensor, segments: Int[Tensor, "*batch tried"], within: Tensor | float) -> Tensor:
         """Metres from the arc `within` to the nearest place on the best of each point's segments."""
         knots, corners, directions = self._tables
         last = len(directions) - 1

@@ -84,9 +84,7 @@ def _header(path: str | PathLike[str], words: list[str], number: int) -> list[in
 
 def _plain_order(path: str | PathLike[str], words: list[str], number: int) -> list[int]:
     if len(words) not in map(len, _COLUMNS):
-        raise FileFormatError(
-            path, f"found {len(words)} column{'s' * (len(words) != 1)}, {_EXPECTED}", number
-        )
+        raise FileFormatError(path, f"found {len(words)} column{'s' * (len(words) != 1)}, {_EXPECTED}", number)
     return list(range(len(words)))
 
 

@@ -21,9 +21,7 @@ _SAME_PLACE = 1e-6  # metres; nearer neighbours are one point
 _CLOSED_GAP = 1e-3  # metres; ends nearer than this meet
 
 
-def dense_polyline(
-    points: ndarray | Tensor, closed: bool | None = None
-) -> tuple[Float[Tensor, "dense dims"], bool]:
+def dense_polyline(points: ndarray | Tensor, closed: bool | None = None) -> tuple[Float[Tensor, "dense dims"], bool]:
     """The polyline through `points` (n, 2 or 3; metres), vertices about 1 cm apart, and whether it is closed.
 
     Straight pieces are divided evenly; of points denser than 1 cm the one that bends the curve most is kept
@@ -40,9 +38,7 @@ def dense_polyline(
         distinct = _closed(distinct)
     length = _spans(distinct).sum()
     if not MIN_LENGTH <= length <= MAX_LENGTH:
-        raise RequestError(
-            f"the curve is {length:.6g} m long, allowed are {MIN_LENGTH:g} to {MAX_LENGTH:g} m"
-        )
+        raise RequestError(f"the curve is {length:.6g} m long, allowed are {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
     spacing = max(SPACING, length / MAX_POINTS)
     return torch.from_numpy(_divided(_thinned(distinct, spacing), spacing)), closed
 
@@ -57,9 +53,7 @@ def _checked(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
     if wrong.any():
         first = int(wrong.argmax())
         place = ", ".join(f"{value:g}" for value in given[first])
-        raise RequestError(
-            f"point {first} of the curve is ({place}), expected numbers up to {MAX_LENGTH:g} m"
-        )
+        raise RequestError(f"point {first} of the curve is ({place}), expected numbers up to {MAX_LENGTH:g} m")
     return given
 
 

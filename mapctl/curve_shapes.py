@@ -35,9 +35,7 @@ def _turns(*arcs: tuple[float, float]) -> ndarray:
         # At least one vertex a degree, so that a tiny circle is round as well.
         count = min(math.ceil(max(abs(radius) * angle / SPACING, math.degrees(angle))), MAX_POINTS // 2)
         turned = heading + np.sign(radius) * np.linspace(0, angle, count + 1)[1:]
-        across = radius * np.stack(
-            [np.cos(heading) - np.cos(turned), np.sin(turned) - np.sin(heading)], axis=1
-        )
+        across = radius * np.stack([np.cos(heading) - np.cos(turned), np.sin(turned) - np.sin(heading)], axis=1)
         pieces.append(place + across)
         place, heading = pieces[-1][-1], turned[-1]
     return np.concatenate(pieces)

@@ -62,9 +62,7 @@ class Motion:
             offsets = offsets.expand(self.num_frames, -1, -1).clone()
             for joint, values in self.moving_offsets.items():
                 offsets[:, joint] = values
-        return kinematics.forward_kinematics(
-            offsets, self.skeleton.parents, self.root_position, self.local_quat_xyzw
-        )
+        return kinematics.forward_kinematics(offsets, self.skeleton.parents, self.root_position, self.local_quat_xyzw)
 
     def joint_positions(self) -> Float[Tensor, "frames joints 3"]:
         """World positions in metres, joints in file order."""

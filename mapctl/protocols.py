@@ -54,7 +54,10 @@ class Inbetweener(Protocol):
     """Proposes the frames between known ones."""
 
     def propose(
-        self, features: Float[Tensor, "batch frames size"], known: Bool[Tensor, "batch frames"], generator: torch.Generator
+        self,
+        features: Float[Tensor, "batch frames size"],
+        known: Bool[Tensor, "batch frames"],
+        generator: torch.Generator,
     ) -> Float[Tensor, "batch frames size"]:
         """The frames with unknown ones filled in; known ones may move."""
         ...

@@ -65,9 +65,7 @@ def outline(motion: Motion) -> dict[str, float]:
     return {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds}
 
 
-def path_measures(
-    motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None
-) -> dict[str, float]:
+def path_measures(motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None) -> dict[str, float]:
     """All measures of a motion that was to go `wanted_m` metres along the curve, at whatever speed."""
     seconds = (motion.num_frames - 1) / float(motion.fps)
     return metrics.measure(motion, curve, speed=wanted_m / seconds, joint=joint)
@@ -85,9 +83,7 @@ def timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict[str, floa
     """
     frames = [window.frames for window in windows]
     each = (
-        np.repeat([1000 * w.seconds / max(1, w.frames) for w in windows], frames)
-        if windows
-        else np.array([math.nan])
+        np.repeat([1000 * w.seconds / max(1, w.frames) for w in windows], frames) if windows else np.array([math.nan])
     )
     return {
         "frame_ms_p50": float(np.percentile(each, 50)),

@@ -37,9 +37,7 @@ class RigMap:
 def map_rig(skeleton: Skeleton) -> RigMap:
     """Recognise the rig and measure its bones; RequestError if no known rig fits."""
     rig = recognise(skeleton)
-    joint_of = tuple(
-        skeleton.index(rig.joints[name]) if name in rig.joints else None for name in CANONICAL.names
-    )
+    joint_of = tuple(skeleton.index(rig.joints[name]) if name in rig.joints else None for name in CANONICAL.names)
     tpose = _tpose(rig, skeleton, joint_of)
     bones, ends = _bones(skeleton, joint_of, tpose)
     return RigMap(rig, skeleton, joint_of, tpose, Skeleton(CANONICAL.names, CANONICAL.parents, bones, ends))

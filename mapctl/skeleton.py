@@ -87,5 +87,5 @@ def mirrored_name(name: str) -> str:
     """The joint of the other side: `leftHand` for `rightHand`; other names are their own mirror image."""
     for side, other in (("left", "right"), ("right", "left")):
         if name.startswith(side):
-            return other + name[len(side):]
+            return other + name[len(side) :]
     return name

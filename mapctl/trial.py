@@ -67,12 +67,17 @@ class Trial:
     def step(self, joint: int) -> Float[Tensor, "batch frames 3"]:
         """Displacement of a joint since the frame before, metres; the first frame's is from the past, if there is one."""
         places = self.joints_world[..., joint, :]
-        past = self.before[-1:, joint].to(places.dtype) if len(self.before) else places[0, :1].detach()
+        past = self.before[-1:, joint].to(places.dtype) if len(self.before) else places[:, :1].detach()
         return torch.diff(places, dim=-2, prepend=past.expand(len(places), 1, 3))
 
 
 def heading_matrix(heading: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of turns about +Y."""
-    sine, cosine, zero, one = torch.sin(heading), torch.cos(heading), torch.zeros_like(heading), torch.ones_like(heading)
+    sine, cosine, zero, one = (
+        torch.sin(heading),
+        torch.cos(heading),
+        torch.zeros_like(heading),
+        torch.ones_like(heading),
+    )
     rows = torch.stack([cosine, zero, sine, zero, one, zero, -sine, zero, cosine], dim=-1)
     return rows.unflatten(-1, (3, 3))

@@ -95,7 +95,9 @@ def locate(name: str) -> Path:
     if name in bundled():
         with as_file(files("priors.weights") / f"{name}.safetensors") as place:
             return place
-    raise CheckpointError(f"no prior {name!r}: neither a file nor one of {', '.join(bundled()) or 'the bundled (none)'}")
+    raise CheckpointError(
+        f"no prior {name!r}: neither a file nor one of {', '.join(bundled()) or 'the bundled (none)'}"
+    )
 
 
 def half_precision_error(tensors: dict[str, Tensor]) -> float:

@@ -22,7 +22,9 @@ _LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), n
 _EXP_LOW, _EXP_HIGH = np.float32(-87.0), np.float32(88.0)
 _EXP = tuple(np.float32(1 / math.factorial(k)) for k in range(8))
 
-_inner = njit(error_model="numpy", fastmath=_RELAXED)
+# Called from compiled code only: leaving the wrappers for Python out makes the first use quicker.
+_INNER = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_inner = njit(fastmath=_RELAXED, **_INNER)
 
 
 def _entry(function):
@@ -34,7 +36,7 @@ def _entry(function):
         return njit(**options)(function)
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(fastmath={"contract"}, **_INNER)
 def exp(x):
     """e^x to 2 ulp by range reduction and a Taylor polynomial: unlike libm's, it runs in vector registers."""
     x = _EXP_LOW if x < _EXP_LOW else (_EXP_HIGH if x > _EXP_HIGH else x)

@@ -128,13 +128,9 @@ class FastRollout:
         lanes = len(self._weights.fc2)
         hidden = run.tape.lstm_input[slot, :, :batch, lanes : lanes + width]
         cell = run.tape.cell[slot, :, :batch, :width]
-        return LstmState(
-            previous, *(torch.from_numpy(part.copy()).to(previous.dtype) for part in (hidden, cell))
-        )
+        return LstmState(previous, *(torch.from_numpy(part.copy()).to(previous.dtype) for part in (hidden, cell)))
 
-    def _pullback(
-        self, run: _Run, d_features: Tensor, d_density: Tensor
-    ) -> tuple[Array, Array, Array, Array]:
+    def _pullback(self, run: _Run, d_features: Tensor, d_density: Tensor) -> tuple[Array, Array, Array, Array]:
         """Gradients on the noise, the previous frame (physical units), h and C."""
         batch, rows, lanes = len(d_features), len(run.noise), len(self._weights.fc2)
         width, size = self._config.width, self._layout.size
@@ -156,9 +152,7 @@ class FastRollout:
 
 class _Rollout(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, noise: Tensor, previous: Tensor, hidden: Tensor, cell: Tensor, plan: Plan, fast: FastRollout
-    ):
+    def forward(ctx: Any, noise: Tensor, previous: Tensor, hidden: Tensor, cell: Tensor, plan: Plan, fast: FastRollout):
         batch, frames, _ = noise.shape
         choices = Choices(plan.component.numpy(), plan.contacts.numpy(), _NO_UNIFORM)
         # Only a pullback needs every frame's activations; else they would but push the weights out of cache.

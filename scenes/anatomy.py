@@ -140,7 +140,7 @@ class Anatomy:
     def _flat(self, ankle: int, ball: int) -> Array:
         """Frames in which the foot most likely stands flat: ankle and ball together at their lowest."""
         height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
-        return height <= np.quantile(height, 0.2)
+        return height <= np.quantile(height, 0.1)
 
     def _height(self, point: int, flat: Array) -> float:
         """Of a point over the ground y = 0 in the flat frames, kept to what a foot can have."""

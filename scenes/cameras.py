@@ -1,5 +1,6 @@
 """Cameras: where to look from so that everything is in the picture. Pure functions, no graphics library."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal, cast
 
@@ -146,7 +147,7 @@ def views(
     axes, fov = orientation(settings), np.radians(settings.fov_deg)
     centre = np.zeros_like(targets)
     if settings.kind == "follow":
-        centre = gaussian_filter1d(targets, settings.smooth_seconds * fps, axis=0, mode="nearest")
+        centre = _smooth(targets, settings.smooth_seconds * fps)
         centre[:, 1] = np.median(targets[:, 1])
     seen = points - (centre[:, None] if len(points) == len(centre) else 0.0)
     seen = seen[:: max(1, len(seen) // _MOST_FRAMES)].reshape(-1, 3)
@@ -155,6 +156,13 @@ def views(
     pose = np.eye(4)
     pose[:3, :3] = axes
     return [View(_moved(pose, eye + shift), float(fov), *size) for shift in centre]
+
+
+def _smooth(path: Array, sigma: float) -> Array:
+    """The path (frames, 3) without its quick part; it goes on straight at both ends, lest it lag there."""
+    margin = math.ceil(3 * sigma)
+    longer = np.pad(path, ((margin, margin), (0, 0)), mode="reflect", reflect_type="odd")
+    return gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]
 
 
 def _moved(pose: Array, eye: Array) -> Array:

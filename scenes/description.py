@@ -3,7 +3,7 @@
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path, PurePath
 from typing import Annotated, Any
@@ -143,8 +143,10 @@ def _first_fault(error: ValidationError) -> str:
 
 
 def _words(fault: Mapping[str, Any]) -> str:
-    if fault["type"] == "extra_forbidden":
-        return "there is no such key"
+    if fault["type"] == "unexpected_keyword_argument":
+        known = {"actors": Actor, "camera": CameraSettings} if len(fault["loc"]) > 1 else {}
+        table = known.get(fault["loc"][0], SceneDescription)
+        return f"there is no such key; allowed: {', '.join(item.name for item in fields(table))}"
     if fault["type"] == "missing":
         return "this key is needed"
     came = json.dumps(fault["input"], default=str)

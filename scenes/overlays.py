@@ -39,7 +39,7 @@ def grid(places: Array) -> Surface:
     x, z = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
     tree = KDTree(places)
     tiles = _tiles(x, z, step)
-    lines = [_lines(x, z, step), _lines(z, x, step)[..., ::-1]]
+    lines = [_lines(x, z, step), _lines(z, x, step)[:, ::-1, ::-1]]
     strong = np.concatenate([np.repeat(x % 5 == 0, len(z) - 1), np.repeat(z % 5 == 0, len(x) - 1)])
     quads = np.concatenate([tiles, *lines])
     height = np.repeat([TILE_HEIGHT, LINE_HEIGHT], [len(tiles), len(strong)])

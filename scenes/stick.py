@@ -1,5 +1,7 @@
 """Stick figures by matplotlib, for machines without OpenGL: the same cameras, ground and colours."""
 
+from typing import Any
+
 import numpy as np
 
 from scenes import colours
@@ -45,10 +47,10 @@ def _draw_flat(axes, view: View, surface: Surface) -> None:
     corners = view.project(surface.vertices)[surface.faces]
     rgba = surface.rgba[surface.faces].mean(axis=1)
     shown = (corners[..., 2] > _NEAR).all(axis=1) & (rgba[:, 3] > 0.02)
-    # Without antialiasing neighbours meet without a seam, which smooth shadows need.
-    axes.add_collection(
-        PolyCollection(list(corners[shown, :, :2]), facecolors=rgba[shown], linewidths=0, antialiaseds=False)
-    )
+    # One array is several times faster than a list of triangles. Without antialiasing neighbours meet without a
+    # seam, which smooth shadows need.
+    triangles: Any = corners[shown, :, :2]
+    axes.add_collection(PolyCollection(triangles, facecolors=rgba[shown], linewidths=0, antialiaseds=False))
 
 
 def _draw_figure(axes, view: View, figure: Figure) -> None:

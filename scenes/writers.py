@@ -54,7 +54,7 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
     """Yield a function that adds a picture to a looping GIF. All share one palette.
 
-    GIF counts in hundredths of a second; the delays alternate so that the whole keeps the motion's time. Over 50
+    GIF counts in hundredths of a second; the delays alternate so that the whole keeps its time. Over 50
     pictures a second only every second, third, ... is kept. RequestError when it outgrows 600 megapixels.
     """
     image = _package("PIL.Image")

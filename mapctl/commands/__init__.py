@@ -4,7 +4,7 @@ and nothing else imports them.
 Each is a frozen dataclass of options with a `run`; heavy imports wait until it is called.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from mapctl.commands.bench import Bench
 from mapctl.commands.convert import Convert
@@ -18,6 +18,7 @@ from mapctl.commands.run import RunScene
 from mapctl.commands.train import Train
 
 
+@runtime_checkable
 class Command(Protocol):
     """What every sub-command can do."""
 

@@ -14,8 +14,9 @@ from mapctl.commands.threads import compute_on_one
 class Bench:
     """Cost of the solver on this machine, or the ablation of its choices."""
 
-    what: Positional[Annotated[Literal["speed", "ablation"], arg(metavar="speed|ablation")]] = "speed"
-    """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared."""
+    what: Positional[Annotated[Literal["speed", "ablation", "free-run"], arg(metavar="speed|ablation|free-run")]] = "speed"
+    """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
+    `free-run`: 8 random motions of 10,000 frames beside the training data."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     json: bool = False
@@ -28,7 +29,7 @@ class Bench:
         from controllers import bench
         from mapctl import report
 
-        measure = {"speed": bench.speed, "ablation": bench.ablation}[self.what]
+        measure = {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what]
         rows = measure(priors.load(self.prior))
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")

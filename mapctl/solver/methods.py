@@ -116,7 +116,9 @@ class StateMethod:
         features, plan = _continued(context, tail)
         states = States(context, self.scale, self.centre, plan.contacts)
         objective, meter = Objective(states.build, terms), Meter(self.budget)
-        result = minimise(objective.energy_and_gradient, states.from_features(features), settings=self.lbfgs, meter=meter)
+        result = minimise(
+            objective.energy_and_gradient, states.from_features(features), settings=self.lbfgs, meter=meter
+        )
         carry = states.build(result.x).features[0].detach()
         return _solved(objective, result, carry, meter, float(result.start_energy[0]))
 

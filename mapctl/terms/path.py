@@ -46,8 +46,7 @@ class Path:
         energy = energy + 0.5 * (self._slow(trial, sideways) / self.sigma_slow).square()
         energy = energy + 0.5 * (self._missing(places, arcs) / self.sigma_progress).square()
         if self.curve.dims == 3:
-            height = places[..., 1] - self.curve.point(arcs)[..., 1]
-            energy = energy + 0.5 * (height / self.sigma_height).square()
+            energy = energy + 0.5 * (self._height(places, arcs) / self.sigma_height).square()
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
@@ -64,11 +63,17 @@ class Path:
 
     def _nearest(self, places: Tensor) -> Tensor:
         with torch.no_grad():
-            return self.curve.nearest(places, around=self.arcs.to(places.dtype), reach=0.6)
+            around = self.arcs.to(places.dtype).expand(places.shape[:-1])
+            return self.curve.nearest(places, around=around, reach=0.6)
 
     def _missing(self, places: Tensor, arcs: Tensor) -> Tensor:
         along = ((self._flat(places) - self.curve.point(arcs)) * self.curve.tangent(arcs)).sum(-1)
         return arcs - self.arcs.to(places.dtype) + along
+
+    def _height(self, places: Tensor, arcs: Tensor) -> Tensor:
+        """Over the curve in space; the arc is held in the gradient, so what lies along a slope is taken off here."""
+        apart, tangent = places - self.curve.point(arcs), self.curve.tangent(arcs)
+        return apart[..., 1] - (apart * tangent).sum(-1) * tangent[..., 1]
 
     def _flat(self, places: Tensor) -> Tensor:
         return places[..., ::2] if self.curve.dims == 2 else places

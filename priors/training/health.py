@@ -34,6 +34,5 @@ def free_run(
 
 def summary(features: Float[Tensor, "frames size"]) -> dict[str, float]:
     """Mean speed (m/s), mean root height (m) and mean spread of the joint rotations (rad)."""
-    joints = LAYOUT.pick(features, "joint_rotations")
     return {"speed": float(speed(features).mean()), "height": float(LAYOUT.pick(features, "root_height").mean()),
-            "pose": float(joints.std(0).mean())}  # fmt: skip
+            "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean())}  # fmt: skip

@@ -46,7 +46,9 @@ def load(run: Path, trainer: Trainer) -> list[dict[str, float]]:
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise CheckpointError(f"{run}: no readable checkpoint ({error})") from error
     for part, ours in (("settings", trainer.settings), ("config", trainer.model.config)):
-        changed = [f"{k}: {index[part].get(k)} then, {v} now" for k, v in asdict(ours).items() if index[part].get(k) != v]
+        changed = [
+            f"{k}: {index[part].get(k)} then, {v} now" for k, v in asdict(ours).items() if index[part].get(k) != v
+        ]
         if changed:
             raise CheckpointError(f"{run}: the run was begun with other settings ({'; '.join(changed)})")
     state: dict[int, dict[str, torch.Tensor]] = {}

@@ -1,6 +1,7 @@
 """`mapctl train lstm-gmm`: from a folder of BVH to a run folder with checkpoints, a training curve and a loadable prior."""
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -9,11 +10,13 @@ from pathlib import Path
 import torch
 
 from mapctl.errors import CheckpointError, RequestError
+from mapctl.features import Place, decode
+from mapctl.metrics import reference
 from priors import checkpoints
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import resume
-from priors.training.health import free_run
+from priors.training.health import free_run, summary
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
 from priors.training.starts import abilities, choose
 
@@ -73,7 +76,9 @@ def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path
 def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: list[dict[str, float]]) -> Path:
     """Write the model in float16 with its starts and card."""
     model = trainer.model.cpu().eval()
-    found = choose(model, parts.train, count=request.starts, generator=torch.Generator().manual_seed(request.settings.seed))
+    found = choose(
+        model, parts.train, count=request.starts, generator=torch.Generator().manual_seed(request.settings.seed)
+    )
     tensors = dict(model.state_dict())
     tensors |= {"starts.previous": found.state.previous, "starts.hidden": found.state.hidden,
                 "starts.cell": found.state.cell, "starts.speed": found.speed}  # fmt: skip
@@ -89,12 +94,20 @@ def _card(
             "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
             "match": request.match, "split_seed": request.settings.seed, "starts": list(starts),
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
-    training = {"settings": asdict(request.settings), "steps": request.settings.steps, "curve": curve}
-    quality = {"test_nats_per_frame": validation_nats(model, parts.test), "free_run": free_run(model, parts.validation)}
+    training = {"settings": asdict(request.settings), "curve": curve}
+    quality = {"test_nats_per_frame": validation_nats(model, parts.test), "mocap": _mocap(parts),
+               "data": summary(parts.train.features)}  # fmt: skip
     return checkpoints.Card(
         kind="lstm-gmm", config=asdict(request.config), licence=request.licence, data=data, training=training,
         quality=quality, abilities=asdict(abilities(parts.train)), **checkpoints.Card.of_layout(),
     )  # fmt: skip
+
+
+def _mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
+    """What the clips kept from training show in every measure: mean, 2nd and 98th percentile (NaN left out)."""
+    held = [decode(clip, Place.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
+    table = {name: asdict(spread) for name, spread in reference(held).items()}
+    return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
 
 
 def _loop(

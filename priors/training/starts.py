@@ -20,7 +20,9 @@ def choose(model: LstmGmm, corpus: Corpus, *, count: int, generator: torch.Gener
     shuffled = [clips[i] for i in torch.randperm(len(clips), generator=generator).tolist()]
     ends = [_WARM_UP + int(torch.randint(len(features[i]) - _WARM_UP - _SECOND // 2, (1,), generator=generator))
             for i in shuffled]  # fmt: skip
-    speeds = torch.stack([speed(features[i][end - _SECOND : end]).mean() for i, end in zip(shuffled, ends, strict=True)])
+    speeds = torch.stack(
+        [speed(features[i][end - _SECOND : end]).mean() for i, end in zip(shuffled, ends, strict=True)]
+    )
     picked = _spread(speeds, count)
     states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]
     state = LstmState(torch.cat([s.previous for s in states]), torch.cat([s.hidden for s in states], 1),
