@@ -40,9 +40,7 @@ def __getattr__(name: str):
 
 def ready() -> tuple[str, ...]:
     """Names of the scenes that come with mapctl."""
-    return tuple(
-        sorted(p.name.removesuffix(".toml") for p in files("scenes").iterdir() if p.name.endswith(".toml"))
-    )
+    return tuple(sorted(p.name.removesuffix(".toml") for p in files("scenes").iterdir() if p.name.endswith(".toml")))
 
 
 def find(scene: str) -> Path:

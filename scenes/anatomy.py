@@ -118,14 +118,10 @@ class Anatomy:
         tip = next(self.children(ball), None) if ball < self.joints else None
         flat = self._flat(ankle, ball)
         along = self.points.world[:, ball] - self.points.world[:, ankle]
-        axes = _axes(
-            up=self._local(ankle, _UP)[flat].mean(0), forward=self._local(ankle, along)[flat].mean(0)
-        )
+        axes = _axes(up=self._local(ankle, _UP)[flat].mean(0), forward=self._local(ankle, along)[flat].mean(0))
         toe = ball if ball < self.joints else ankle
         level = np.einsum("fij,j->fi", self.rotations[:, ankle], axes[:, 2])
-        toe_axes = _axes(
-            up=self._local(toe, _UP)[flat].mean(0), forward=self._local(toe, level)[flat].mean(0)
-        )
+        toe_axes = _axes(up=self._local(toe, _UP)[flat].mean(0), forward=self._local(toe, level)[flat].mean(0))
         heights = tuple(self._height(point, flat) for point in (ankle, ball))
         return Foot(
             side,
@@ -173,9 +169,7 @@ def _leg_length(rest: Array, parents: tuple[int, ...], found: tuple[Role, ...]) 
     for foot, role in enumerate(found):
         if role.part is Part.FOOT:
             knee = parents[foot]
-            length = np.linalg.norm(rest[foot] - rest[knee]) + np.linalg.norm(
-                rest[knee] - rest[parents[knee]]
-            )
+            length = np.linalg.norm(rest[foot] - rest[knee]) + np.linalg.norm(rest[knee] - rest[parents[knee]])
             return float(length) if length > 0.05 else _LEG
     return _LEG
 

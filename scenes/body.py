@@ -76,9 +76,7 @@ class Body:
         """The whole body in one frame."""
         boxes = self.boxes(frame)
         names = ("centre", "frame", "half", "radius", "squash", "rgb")
-        return RoundedBoxes(
-            *(np.concatenate([getattr(box, name) for box in boxes]) for name in names)
-        ).surface()
+        return RoundedBoxes(*(np.concatenate([getattr(box, name) for box in boxes]) for name in names)).surface()
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
         """All bones with those of head and feet: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3)."""
@@ -90,11 +88,7 @@ class Body:
         anatomy, bones = self.anatomy, self.bones
         shoes = [(joints, foot) for foot in anatomy.feet for joints in _bones_of(foot)]
         head = anatomy.find(Part.HEAD)
-        crown = (
-            [(head, tip) for tip in anatomy.children(head) if tip >= anatomy.joints][:1]
-            if head is not None
-            else []
-        )
+        crown = [(head, tip) for tip in anatomy.children(head) if tip >= anatomy.joints][:1] if head is not None else []
         ends = np.array([*map(tuple, bones.ends), *(joints for joints, _ in shoes), *crown]).reshape(-1, 2)
         wide = np.array([0.045] * len(shoes) + [0.09] * len(crown)) * anatomy.scale
         rgb = [*bones.rgb, *(_limb(foot.side) for _, foot in shoes), *(self.colour for _ in crown)]

@@ -51,9 +51,7 @@ class CameraSettings:
             raise RequestError(f"the camera must be fixed, follow or top, got {self.kind!r}")
         for name, low, high in _BOUNDS:
             if not low <= getattr(self, name) <= high:
-                raise RequestError(
-                    f"the camera's {name} must be {low:g} to {high:g}, got {getattr(self, name):g}"
-                )
+                raise RequestError(f"the camera's {name} must be {low:g} to {high:g}, got {getattr(self, name):g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +134,7 @@ def _centred(across: Array, depth: Array) -> float:
     return cast(float, brentq(lopsided, across.min() - 1e-6, across.max() + 1e-6, xtol=1e-6))
 
 
-def views(
-    settings: CameraSettings, points: Array, targets: Array, *, fps: float, size: tuple[int, int]
-) -> list[View]:
+def views(settings: CameraSettings, points: Array, targets: Array, *, fps: float, size: tuple[int, int]) -> list[View]:
     """One view a frame.
 
     `points` (frames or 1, n, 3) must be seen; a following camera follows `targets` (frames, 3). `size` is

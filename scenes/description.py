@@ -172,10 +172,6 @@ def _check(path: str | PathLike[str], scene: SceneDescription) -> None:
                 raise FileFormatError(path, f"actors[{number}].colour: {error}") from error
     for number, name in enumerate(scene.outputs):
         if PurePath(name).name != name or name in scene.outputs[:number]:
-            raise FileFormatError(
-                path, f"outputs[{number}]: {name!r} must be a file name of its own, without folders"
-            )
+            raise FileFormatError(path, f"outputs[{number}]: {name!r} must be a file name of its own, without folders")
         if PurePath(name).suffix.lower() not in _ENDINGS:
-            raise FileFormatError(
-                path, f"outputs[{number}]: {name!r} must end in one of {', '.join(_ENDINGS)}"
-            )
+            raise FileFormatError(path, f"outputs[{number}]: {name!r} must end in one of {', '.join(_ENDINGS)}")

@@ -27,9 +27,7 @@ def shade(surface: Surface, eye: Array) -> Array:
     sky = (normals[:, 1:2] + 1) / 2
     light = key[:, None] + _FLOOR + (_SKY - _FLOOR) * sky
     halfway = unit(to_eye + towards_lamp)
-    shine = (
-        _HIGHLIGHT * np.clip(np.einsum("ij,ij->i", normals, halfway), 0, None) ** _SHARPNESS * (facing > 0)
-    )
+    shine = _HIGHLIGHT * np.clip(np.einsum("ij,ij->i", normals, halfway), 0, None) ** _SHARPNESS * (facing > 0)
     rim = _RIM * (1 - np.clip(np.einsum("ij,ij->i", normals, to_eye), 0, 1)) ** 3 * sky[:, 0]
     linear = surface.rgba[:, :3] ** _GAMMA * light + (shine + rim)[:, None]
     return np.column_stack([np.clip(linear, 0, 1) ** (1 / _GAMMA), surface.rgba[:, 3]])

@@ -33,9 +33,7 @@ class OffscreenPainter:
         self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
         self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_NEAR, zfar=_FAR))
         self._solid = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4)
-        self._sheer = gl.MetallicRoughnessMaterial(
-            baseColorFactor=[1.0] * 4, alphaMode="BLEND", doubleSided=True
-        )
+        self._sheer = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, alphaMode="BLEND", doubleSided=True)
 
     def paint(self, view: View, content: Content) -> Array:
         """The picture, (height, width, 3) uint8."""

@@ -43,9 +43,7 @@ def grid(places: Array) -> Surface:
     strong = np.concatenate([np.repeat(x % 5 == 0, len(z) - 1), np.repeat(z % 5 == 0, len(x) - 1)])
     quads = np.concatenate([tiles, *lines])
     height = np.repeat([TILE_HEIGHT, LINE_HEIGHT], [len(tiles), len(strong)])
-    rgb = np.where(
-        np.arange(len(quads))[:, None] < len(tiles), colours.rgb(colours.TILE), colours.rgb(colours.GRID)
-    )
+    rgb = np.where(np.arange(len(quads))[:, None] < len(tiles), colours.rgb(colours.TILE), colours.rgb(colours.GRID))
     strength = np.concatenate([np.ones(len(tiles)), np.where(strong, 1.0, 0.62)])
     return _faded(quads, height, rgb, strength, tree)
 
@@ -64,9 +62,7 @@ def _lines(x: Array, z: Array, step: float) -> Array:
     half = np.where(a % 5 == 0, _MAJOR_LINE, _LINE).reshape(-1, 1) / 2 * step**0.5
     left, right = a.reshape(-1, 1) * step - half, a.reshape(-1, 1) * step + half
     near, far = b.reshape(-1, 1) * step, (b.reshape(-1, 1) + 1) * step
-    return np.stack(
-        [np.concatenate([left, left, right, right], 1), np.concatenate([near, far, far, near], 1)], axis=-1
-    )
+    return np.stack([np.concatenate([left, left, right, right], 1), np.concatenate([near, far, far, near], 1)], axis=-1)
 
 
 def _faded(quads: Array, height: Array, rgb: Array, strength: Array, tree: KDTree) -> Surface:
@@ -98,9 +94,7 @@ def ribbon(points: Array, *, width: float, rgb: Array, height: float) -> Surface
 
 def part_of_ribbon(whole: Surface, points: int) -> Surface:
     """The first `points` points of a ribbon."""
-    return Surface(
-        whole.vertices[: 2 * points], whole.faces[: 2 * max(points - 1, 0)], whole.rgba[: 2 * points]
-    )
+    return Surface(whole.vertices[: 2 * points], whole.faces[: 2 * max(points - 1, 0)], whole.rgba[: 2 * points])
 
 
 def discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: int = 24) -> Surface:
@@ -137,9 +131,7 @@ def shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
     index = np.arange(len(places)).reshape(_SHADOW_CELLS, _SHADOW_CELLS)
     quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
     shown = alpha[quads].max(axis=1) > 0.004
-    return Surface(
-        np.insert(places, 1, SHADOW_HEIGHT + 0.0005 * layer, axis=1), _quad_faces(quads[shown]), rgba
-    )
+    return Surface(np.insert(places, 1, SHADOW_HEIGHT + 0.0005 * layer, axis=1), _quad_faces(quads[shown]), rgba)
 
 
 def _light_left(places: Array, flat: Array, blur: Array, radii: Array) -> Array:

@@ -48,6 +48,4 @@ def _sticks() -> Painter:
     try:
         return StickPainter()
     except ImportError as error:
-        raise RequestError(
-            f"films need matplotlib or pyrender ({error}): pip install 'mapctl[render]'"
-        ) from error
+        raise RequestError(f"films need matplotlib or pyrender ({error}): pip install 'mapctl[render]'") from error

@@ -43,9 +43,7 @@ def contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tu
     views = stage.views(replace(camera, kind=row.kind), (width, height))
     for k, moment in enumerate(_spread(stage.num_frames - 1, row.count)):
         left = round(k * (size[0] - width) / (row.count - 1))
-        still = _labelled(
-            brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s"
-        )
+        still = _labelled(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
         sheet[size[1] + gap :, left : left + width] = still
     return sheet
 
@@ -80,7 +78,5 @@ def _labelled(picture: Array, text: str) -> Array:
     image = Image.fromarray(picture)
     height = max(9, round(picture.shape[0] * 0.07))
     draw = ImageDraw.Draw(image)
-    draw.text(
-        (height * 0.6, height * 0.4), text, fill=colours.VISOR, font=ImageFont.load_default(size=height)
-    )
+    draw.text((height * 0.6, height * 0.4), text, fill=colours.VISOR, font=ImageFont.load_default(size=height))
     return np.asarray(image)

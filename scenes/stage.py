@@ -73,9 +73,7 @@ class Stage:
     def content(self, film_frame: int) -> Content:
         """Everything at one frame."""
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
-        trails = [
-            overlays.part_of_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)
-        ]
+        trails = [overlays.part_of_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
         ground = [self._still, *trails, *(m for m in marks if m is not None), *_shadows(figures)]
         return Content(ground, figures)
@@ -144,9 +142,7 @@ def _planted(body: Body, fps: float) -> Array:
 
 def _marks(player: Player, frame: int) -> Surface | None:
     """A disc under the ball of every foot that stands, in its side's colour."""
-    feet = [
-        foot for foot, stands in zip(player.body.anatomy.feet, player.planted[frame], strict=True) if stands
-    ]
+    feet = [foot for foot, stands in zip(player.body.anatomy.feet, player.planted[frame], strict=True) if stands]
     if not feet:
         return None
     centres = player.body.anatomy.points.world[frame, [foot.ball for foot in feet]][:, [0, 2]]

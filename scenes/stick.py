@@ -64,7 +64,5 @@ def _draw_figure(axes, view: View, figure: Figure) -> None:
     points = np.maximum(1.0, 1.3 * radii * focal / np.maximum(depth, _NEAR)) * 72 / _DPI
     shown = colours.mix(rgb, colours.rgb(colours.BACKGROUND), figure.fade)
     axes.add_collection(
-        LineCollection(
-            list(flat[order, :, :2]), linewidths=points[order], colors=shown[order], capstyle="round"
-        )
+        LineCollection(list(flat[order, :, :2]), linewidths=points[order], colors=shown[order], capstyle="round")
     )

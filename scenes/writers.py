@@ -76,18 +76,14 @@ def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 def _check_room(pictures: int, size: tuple[int, int]) -> None:
     most = int(_GIF_PIXELS) // (size[0] * size[1])
     if pictures > most:
-        raise RequestError(
-            f"a GIF of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4"
-        )
+        raise RequestError(f"a GIF of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4")
 
 
 def _quantized(image, picture: Array, first):
     """With the palette of the first picture, or for the first with one of its own."""
     whole, plain = image.fromarray(picture), image.Dither.NONE
     if first is None:
-        sample = image.fromarray(
-            np.concatenate([picture, _swatches(picture.shape[1], picture.shape[0] // 12)])
-        )
+        sample = image.fromarray(np.concatenate([picture, _swatches(picture.shape[1], picture.shape[0] // 12)]))
         first = sample.quantize(_GIF_COLOURS, method=image.Quantize.MAXCOVERAGE, dither=plain)
     return whole.quantize(palette=first, dither=plain)
 
@@ -113,6 +109,4 @@ def _package(name: str):
     try:
         return import_module(name)
     except ImportError as error:
-        raise RequestError(
-            f"films need {name.split('.')[0]} ({error}): pip install 'mapctl[render]'"
-        ) from error
+        raise RequestError(f"films need {name.split('.')[0]} ({error}): pip install 'mapctl[render]'") from error

@@ -19,9 +19,7 @@ def walk(frames: int = 12, *, fps: int = 12, speed: float = 1.0, skeleton: Skele
     angles = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
     for name, amplitude in _SWING.items():
         angles[:, CANONICAL.index(name), 0] = amplitude * torch.sin(2 * torch.pi * time)
-    root = torch.stack(
-        [torch.zeros(frames), torch.full((frames,), HIPS_HEIGHT), speed * time], dim=-1
-    ).double()
+    root = torch.stack([torch.zeros(frames), torch.full((frames,), HIPS_HEIGHT), speed * time], dim=-1).double()
     return Motion(skeleton, Fraction(fps), root, rotations.from_rotation_vector(angles))
 
 

@@ -55,9 +55,7 @@ def test_a_rounded_box_has_the_volume_of_box_plus_ball(half, radius, axis):
 def test_a_capsules_skin_lies_a_radius_from_its_axis_and_its_normals_point_away_from_it():
     surface = one((0, 0.4, 0), (0.1, 0.1))
     local = surface.vertices - np.array([0.3, 1, -2])
-    away = local - np.stack(
-        [np.zeros(len(local)), np.clip(local[:, 1], -0.4, 0.4), np.zeros(len(local))], axis=1
-    )
+    away = local - np.stack([np.zeros(len(local)), np.clip(local[:, 1], -0.4, 0.4), np.zeros(len(local))], axis=1)
     assert np.linalg.norm(away, axis=1) == pytest.approx(0.1)
     assert surface.normals == pytest.approx(away / 0.1)
 
@@ -102,10 +100,7 @@ def test_the_mirrored_motions_body_is_the_mirror_image():
 
 def test_left_is_blue_and_right_is_orange_and_the_torso_is_the_actors():
     skin = Body(walk(), colours.rgb("green")).surface(0)
-    hands = {
-        side: skin.rgba[np.argmax(sign * skin.vertices[:, 0]), :3]
-        for side, sign in (("left", 1), ("right", -1))
-    }
+    hands = {side: skin.rgba[np.argmax(sign * skin.vertices[:, 0]), :3] for side, sign in (("left", 1), ("right", -1))}
     assert hands["left"] == pytest.approx(colours.rgb(colours.LEFT))
     assert hands["right"] == pytest.approx(colours.rgb(colours.RIGHT))
     belly = np.linalg.norm(skin.vertices - np.array([0, 1.1, 0.1]), axis=1).argmin()

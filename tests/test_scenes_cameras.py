@@ -53,9 +53,7 @@ def test_fit_sees_everything_and_touches_two_opposite_edges(seed, kind, azimuth,
 @pytest.mark.parametrize("kind", KINDS)
 def test_everybody_is_in_every_picture(kind):
     frames = 30
-    path = np.stack(
-        [np.linspace(0, 9, frames), np.full(frames, 0.9), np.sin(np.linspace(0, 6, frames))], axis=1
-    )
+    path = np.stack([np.linspace(0, 9, frames), np.full(frames, 0.9), np.sin(np.linspace(0, 6, frames))], axis=1)
     points = path[:, None] + cloud(1, 8) * 0.2
     for k, view in enumerate(views(CameraSettings(kind=kind), points, path, fps=30.0, size=(160, 90))):
         seen = view.project(points[k])
@@ -66,10 +64,7 @@ def test_a_following_camera_moves_and_a_fixed_one_does_not():
     path = np.linspace([0, 1, 0], [10, 1, 0], 50)
     eyes = {
         kind: np.array(
-            [
-                v.pose[:3, 3]
-                for v in views(CameraSettings(kind=kind), path[:, None], path, fps=30.0, size=(64, 64))
-            ]
+            [v.pose[:3, 3] for v in views(CameraSettings(kind=kind), path[:, None], path, fps=30.0, size=(64, 64))]
         )
         for kind in KINDS
     }

@@ -30,9 +30,7 @@ def has_graphics() -> bool:
 
 
 RENDERERS = [
-    pytest.param(
-        "egl", marks=pytest.mark.skipif(not has_graphics(), reason="no OpenGL without a window here")
-    ),
+    pytest.param("egl", marks=pytest.mark.skipif(not has_graphics(), reason="no OpenGL without a window here")),
     "stick",
 ]
 

@@ -18,9 +18,7 @@ def area(surface) -> float:
 @given(st.floats(0.5, 4.0), st.floats(0.02, 0.3))
 def test_a_ribbon_has_the_area_of_its_length_times_its_width(radius, width):
     turn = np.linspace(0, 2 * np.pi, 400)
-    ring = overlays.ribbon(
-        radius * np.stack([np.sin(turn), np.cos(turn)], 1), width=width, rgb=np.ones(3), height=0.01
-    )
+    ring = overlays.ribbon(radius * np.stack([np.sin(turn), np.cos(turn)], 1), width=width, rgb=np.ones(3), height=0.01)
     assert area(ring) == pytest.approx(2 * np.pi * radius * width, rel=0.01)
     assert (ring.vertices[:, 1] == 0.01).all()
 
