@@ -1,4 +1,4 @@
-"""Tiny synthetic motions, rigs, densities and corpora: no data set is needed to test the code that learns from one."""
+"""Tiny synthetic motions, rigs, densities and corpora, so that no test needs a data set."""
 
 import math
 from dataclasses import asdict
@@ -41,7 +41,7 @@ def quat_xyzw(rotation_vectors: Tensor) -> Tensor:
 def walk(
     frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, seed: int = 0, fps: int = 30
 ) -> Motion:
-    """A procedural walk on the canonical skeleton: legs and arms swing, knees lift, the lower toe is on the floor."""
+    """A procedural walk: legs and arms swing, knees lift, the lower toe is on the floor."""
     time = torch.arange(frames, dtype=torch.float64) / fps
     phase = 2 * math.pi * cadence * time
     vectors = _swing(phase, seed)
@@ -58,7 +58,7 @@ def walk(
 
 
 def _swing(phase: Tensor, seed: int) -> Tensor:
-    """Rotation vectors (frames, joints, 3) of a gait, with a smooth wobble of every joint that the seed draws."""
+    """Rotation vectors (frames, joints, 3) of a gait, with a smooth wobble that the seed draws."""
     offset = 6.3 * torch.rand(CANONICAL.num_joints, 3, generator=generator(seed), dtype=torch.float64)
     vectors = 0.04 * torch.sin(phase[:, None, None] + offset)
     for side, sign in (("left", 1.0), ("right", -1.0)):
@@ -173,8 +173,8 @@ def tiny_density(*, width: int = 8, components: int = 3, seed: int = 0, starts: 
     model = tiny_model(width=width, components=components, seed=seed)
     data = corpus()
     found = choose(model, data, count=starts, generator=generator(seed))
-    card = Card(kind="lstm-gmm", config=asdict(model.config), licence="none", data={"starts": list(found.names)},
-                abilities=asdict(abilities(data)), **Card.of_layout())  # fmt: skip
+    shown, names = asdict(abilities(data)), {"starts": list(found.names)}
+    card = Card("lstm-gmm", asdict(model.config), licence="none", data=names, abilities=shown, **Card.of_layout())
     density = LstmGmmDensity("tiny", model.to(dtype), found, card, use_fast=False)
     if dtype is not torch.float32:
         for part in ("previous", "hidden", "cell"):

@@ -1,0 +1,56 @@
+"""One instance of every term, and small densities: what the contract tests, and only they, must know of them."""
+
+import torch
+from helpers import generator, tiny_model
+
+from mapctl import curves
+from mapctl.curves import Curve
+from mapctl.terms import Footing, Likelihood, Noise, Path, Seam, Term
+from priors.lstm_gmm import LstmGmm
+
+FRAMES = 12
+"""Of the windows that the terms are tried on."""
+
+_ARCS = 0.3 + 0.04 * torch.arange(FRAMES, dtype=torch.float64)
+_RISING = torch.linspace(0, 3, 400, dtype=torch.float64)
+_IN_SPACE = curves.from_points(torch.stack([0.1 * torch.sin(_RISING), 0.1 + 0.2 * _RISING, _RISING], -1))
+
+TERMS: dict[str, Term] = {
+    "likelihood": Likelihood(temperature=2.0),
+    "noise": Noise(sigma=0.7),
+    "path of the hips": Path(curves.line(length=3), _ARCS),
+    "path of a hand": Path(curves.circle(radius=3), _ARCS, joint="leftHand"),
+    "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
+    "footing": Footing(),
+    "seam": Seam(sigma=300.0),
+}
+"""Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
+
+
+def densities(dtype: torch.dtype = torch.float64) -> dict[str, LstmGmm]:
+    """Random networks: one Gaussian, several, and the paper's variant, which predicts frames absolutely."""
+    networks = {
+        "one": tiny_model(components=1, dtype=dtype),
+        "several": tiny_model(components=3, seed=1, dtype=dtype),
+        "absolute": tiny_model(components=2, seed=2, retain=0.0, dtype=dtype),
+    }
+    for seed, network in enumerate(networks.values()):
+        excite(network, seed)
+    return networks
+
+
+def excite(network: LstmGmm, seed: int) -> None:
+    """Larger output weights, so that components and contact bits change along a rollout."""
+    with torch.no_grad():
+        for values in (network.out.weight, network.out.bias):
+            values += 0.3 * torch.randn(values.shape, generator=generator(seed), dtype=values.dtype)
+
+
+def moved_curve(curve: Curve, turn: float, shift: tuple[float, float]) -> Curve:
+    """The curve turned about +Y, then shifted over the ground."""
+    angle = torch.tensor(turn, dtype=torch.float64)
+    points = curve.points.clone()
+    x, z = curve.points[:, 0], curve.points[:, -1]
+    points[:, 0] = torch.cos(angle) * x + torch.sin(angle) * z + shift[0]
+    points[:, -1] = torch.cos(angle) * z - torch.sin(angle) * x + shift[1]
+    return Curve(points, curve.closed)

@@ -1,0 +1,226 @@
+"""What every term must keep: the contract that the objective, the solver and the ledger rest on."""
+
+import math
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+
+import pytest
+import torch
+from catalogue import FRAMES, TERMS, moved_curve
+from helpers import generator, walk
+
+from mapctl import terms
+from mapctl.curves import line
+from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.rotations import rotate_ground
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+from mapctl.terms import Footing, Likelihood, Noise, Path, Seam
+from mapctl.trial import Trial
+
+PAST = 8
+each_term = pytest.mark.parametrize("name", TERMS)
+EXACT = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+
+
+def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
+    """Windows of a walk, each disturbed on its own, with the frames of the walk before it."""
+    motion = walk(PAST + FRAMES, turn_rate=0.2)
+    vectors, start = encode(motion)
+    ground, heading = root_places(vectors[:PAST], start)
+    scale = disturbed * vectors.std(0)
+    features = (
+        vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
+    )
+    draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
+    bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
+    place = Place(ground[-1].to(dtype), heading[-1].to(dtype))
+    before = motion.joint_positions()[PAST - past : PAST].to(dtype)
+    return Trial(
+        features.to(dtype), place, draw[..., 1:].to(dtype), 30 * draw[..., 0].to(dtype), bits, before
+    )
+
+
+def rows(whole, picked):
+    """The trial of some candidates."""
+    parts = ("features", "noise", "log_density", "contacts")
+    return replace(whole, **{part: getattr(whole, part)[picked] for part in parts})
+
+
+def test_the_catalogue_has_every_term():
+    assert {type(term) for term in TERMS.values()} == set(terms.ALL)
+
+
+@each_term
+def test_a_term_is_frozen_named_and_in_a_unit(name):
+    term = TERMS[name]
+    assert is_dataclass(term)
+    with pytest.raises(FrozenInstanceError):
+        term.name = "other"
+    assert term.name
+    assert term.unit
+    assert len({t.name for t in TERMS.values() if type(t) is type(term)}) == 1
+
+
+@each_term
+@EXACT
+def test_energies_and_residuals_are_one_finite_number_a_frame(name, dtype):
+    for batch in (1, 3):
+        for past in (0, 1, PAST):
+            for values in (
+                TERMS[name](trial(batch, dtype=dtype, past=past)),
+                TERMS[name].residual(trial(batch, dtype=dtype, past=past)),
+            ):
+                assert values.shape == (batch, FRAMES)
+                assert values.dtype == dtype
+                assert bool(torch.isfinite(values).all())
+
+
+@each_term
+def test_energies_and_residuals_are_not_negative_but_for_densities(name):
+    if isinstance(TERMS[name], Likelihood):
+        assert float(TERMS[name](trial(8)).min()) < 0
+        return
+    assert float(TERMS[name](trial(8)).min()) >= 0
+    assert float(TERMS[name].residual(trial(8)).min()) >= 0
+
+
+@each_term
+def test_some_disturbance_costs_more(name):
+    if not isinstance(TERMS[name], Footing | Seam):
+        return  # likelihood and noise do not judge the pose, and the walk is not on the paths to begin with
+    calm, wild = (TERMS[name](trial(16, disturbed=size)).sum() for size in (0.0, 1.0))
+    assert float(wild) > float(calm)
+
+
+@each_term
+@pytest.mark.parametrize("past", [0, PAST])
+def test_candidates_know_nothing_of_each_other(name, past):
+    whole, term = trial(4, past=past), TERMS[name]
+    for row in range(4):
+        alone = rows(whole, slice(row, row + 1))
+        torch.testing.assert_close(term(whole)[row], term(alone)[0], atol=1e-9, rtol=1e-9)
+        torch.testing.assert_close(term.residual(whole)[row], term.residual(alone)[0], atol=1e-9, rtol=1e-9)
+
+
+@each_term
+def test_single_precision_is_enough(name):
+    single, double = (TERMS[name](trial(dtype=dtype)) for dtype in (torch.float32, torch.float64))
+    torch.testing.assert_close(single.double(), double, rtol=2e-3, atol=2e-2)
+    single, double = (TERMS[name](trial(dtype=dtype)).sum() for dtype in (torch.float32, torch.float64))
+    assert math.isclose(float(single), float(double), rel_tol=1e-4)
+
+
+@each_term
+@pytest.mark.parametrize("past", [0, PAST])
+def test_the_gradient_is_that_of_finite_differences(name, past):
+    whole, term = trial(2, past=past), TERMS[name]
+    parts = [getattr(whole, part) for part in ("features", "noise", "log_density")]
+    directions = [
+        torch.randn(part.shape, generator=generator(k), dtype=torch.float64) for k, part in enumerate(parts)
+    ]
+    directions[0] = 0.1 * directions[0]
+
+    def energy(step):
+        moved = [part + step * direction for part, direction in zip(parts, directions, strict=True)]
+        return term(replace(whole, features=moved[0], noise=moved[1], log_density=moved[2])).sum() + 0 * step
+
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(energy(step), step)
+    difference = float(energy(1e-6) - energy(-1e-6)) / 2e-6
+    # A path's nearest arc is held while it is differentiated: exact but for offset times curvature (about 1 % here).
+    tolerance = 2e-2 if isinstance(term, Path) else 1e-5
+    assert math.isclose(float(slope), difference, rel_tol=tolerance, abs_tol=1e-6)
+
+
+@each_term
+def test_the_gradient_is_finite_where_nothing_is_wrong(name):
+    """Norms have no slope at zero; a term must not answer NaN there."""
+    still = trial(1, disturbed=0.0)
+    features = still.features[:, :1].expand(1, FRAMES, LAYOUT.size).clone()
+    features[..., : LAYOUT.slices["root_height"].start] = 0
+    calm = replace(still, features=features.requires_grad_(True), noise=torch.zeros_like(still.noise))
+    calm = replace(calm, before=calm.joints_world.detach()[0, :1].expand(PAST, -1, -1))
+    (gradient,) = torch.autograd.grad(TERMS[name](calm).sum() + 0 * features.sum(), features)
+    assert bool(torch.isfinite(gradient).all())
+
+
+@each_term
+@pytest.mark.parametrize("turn", [0.9, -2.5])
+def test_moving_the_whole_scene_changes_nothing(name, turn):
+    here, term, shift = trial(), TERMS[name], (3.0, -2.0)
+    angle = torch.tensor(turn, dtype=torch.float64)
+    place = Place(
+        rotate_ground(here.start.position_xz, angle) + torch.tensor(shift).double(), here.start.heading + turn
+    )
+    before = here.before.clone()
+    before[..., ::2] = (
+        rotate_ground(before[..., ::2], angle.expand(before.shape[:-1])) + torch.tensor(shift).double()
+    )
+    there = replace(here, start=place, before=before)
+    if "curve" in {field.name for field in fields(term)}:
+        term = replace(term, curve=moved_curve(term.curve, turn, shift))
+    torch.testing.assert_close(term(there), TERMS[name](here), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(term.residual(there), TERMS[name].residual(here), rtol=1e-6, atol=1e-6)
+
+
+def test_world_joints_are_those_of_the_motion():
+    whole = trial(2, disturbed=0.0)
+    expected = walk(PAST + FRAMES, turn_rate=0.2).joint_positions()[PAST:]
+    torch.testing.assert_close(whole.joints_world, expected.expand(2, -1, -1, -1), atol=1e-9, rtol=0)
+    hips = whole.joint_world("hips")
+    torch.testing.assert_close(hips[..., ::2], whole.root_xz_world)
+    toe = CANONICAL.index("leftToes")
+    past = walk(PAST, turn_rate=0.2).joint_positions()[-1, toe]
+    torch.testing.assert_close(whole.step(toe)[1, 0], whole.joints_world[1, 0, toe] - past)
+    torch.testing.assert_close(
+        replace(whole, before=whole.before[:0]).step(toe)[1, 0], torch.zeros(3).double()
+    )
+
+
+def test_likelihood_and_noise_are_their_formulas():
+    whole = trial()
+    torch.testing.assert_close(Likelihood(3.0)(whole), -whole.log_density / 3)
+    torch.testing.assert_close(Likelihood(3.0).residual(whole), -whole.log_density)
+    normal = torch.distributions.Normal(0.0, 0.2)
+    relative = normal.log_prob(torch.zeros(())) * LAYOUT.continuous - normal.log_prob(whole.noise).sum(-1)
+    torch.testing.assert_close(Noise(0.2)(whole), relative)
+
+
+def test_a_walk_to_the_left_of_a_line_is_off_by_as_much():
+    whole = trial(1, disturbed=0.0)
+    beside = replace(whole, start=Place(torch.tensor([0.25, 0.0]).double(), torch.tensor(0.0).double()))
+    straight = walk(FRAMES + 1)
+    vectors, start = encode(straight)
+    beside = replace(beside, features=vectors[None, 1:], before=whole.before[:0])
+    hips = beside.root_xz_world[0]
+    term = Path(line(length=3), hips[:, 1].clone())
+    torch.testing.assert_close(term.residual(beside)[0], hips[:, 0].abs(), atol=1e-6, rtol=0)
+    late = replace(term, arcs=term.arcs + 0.16)
+    gained = late(beside) - term(beside)
+    torch.testing.assert_close(
+        gained, torch.full((1, FRAMES), 0.5 * (0.16 / 0.08) ** 2).double(), atol=1e-4, rtol=0
+    )
+
+
+def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():
+    whole = trial(1, disturbed=0.0)
+    planted = torch.ones_like(whole.contacts)
+    resting = replace(whole, contacts=planted)
+    toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+    places = torch.cat([whole.before[-1:, toes], whole.joints_world[0][:, toes]])
+    speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
+    above = places[1:, :, 1] - TOE_REST_HEIGHT
+    expected = 0.5 * ((speed / 0.03) ** 2 + (above / 0.01) ** 2 + (above.clamp(max=0) / 0.005) ** 2).sum(-1)
+    torch.testing.assert_close(Footing()(resting)[0], expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(Footing().residual(resting)[0], speed.amax(-1), rtol=1e-4, atol=1e-5)
+    free = replace(whole, contacts=~planted)
+    assert float(Footing().residual(free).abs().max()) == 0
+    assert float(Footing()(free).max()) < float(Footing()(resting).min()) + 1e-6
+
+
+def test_the_seam_sees_a_jump_at_its_start_and_nothing_beyond():
+    smooth = trial(1, disturbed=0.0)
+    jumped = replace(smooth, before=smooth.before + torch.tensor([0.0, 0.05, 0.0]).double())
+    calm, loud = Seam().residual(smooth)[0], Seam().residual(jumped)[0]
+    assert float(loud[:3].min()) > 10 * float(calm.max())
+    assert float(loud[3:].abs().max()) == 0
+    assert float(Seam()(replace(smooth, before=smooth.before[:2])).abs().max()) == 0
