@@ -18,6 +18,7 @@ _MOST_FRAMES = 400
 """Frames looked at to find the distance; more of a long motion would not change it."""
 
 
+_AZIMUTH_DEG = 30.0
 _BOUNDS = (
     ("azimuth_deg", -360, 360),
     ("elevation_deg", 0, 89),
@@ -35,8 +36,9 @@ class CameraSettings:
 
     kind: Literal["fixed", "follow", "top"] = "fixed"
     """Fixed: everything in view all the time. Follow: with the actors, smoothly. Top: fixed, from above."""
-    azimuth_deg: float = 30.0
-    """Where the camera stands, degrees about +Y: 0 is +Z, 90 is +X. From the top: what is at the bottom."""
+    azimuth_deg: float | None = None
+    """Where the camera stands, degrees about +Y: 0 is +Z, 90 is +X. From the top it is what lies at the bottom.
+    If not given, 30, and 0 from the top."""
     elevation_deg: float = 24.0
     """How high it stands over the horizon, degrees, 0 to 89. Ignored from the top."""
     fov_deg: float = 32.0
@@ -50,8 +52,9 @@ class CameraSettings:
         if self.kind not in ("fixed", "follow", "top"):
             raise RequestError(f"the camera must be fixed, follow or top, got {self.kind!r}")
         for name, low, high in _BOUNDS:
-            if not low <= getattr(self, name) <= high:
-                raise RequestError(f"the camera's {name} must be {low:g} to {high:g}, got {getattr(self, name):g}")
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise RequestError(f"the camera's {name} must be {low:g} to {high:g}, got {value:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,8 @@ def look_at(eye: Array, target: Array, up: Array = _UP) -> Array:
 
 def orientation(settings: CameraSettings) -> Array:
     """(3, 3) columns right, up and back of the camera."""
-    azimuth = np.radians(settings.azimuth_deg)
+    usual = 0.0 if settings.kind == "top" else _AZIMUTH_DEG
+    azimuth = np.radians(usual if settings.azimuth_deg is None else settings.azimuth_deg)
     if settings.kind == "top":
         bottom = np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
         return np.stack([np.cross(-bottom, _UP), -bottom, _UP], axis=1)
@@ -155,7 +159,7 @@ def views(settings: CameraSettings, points: Array, targets: Array, *, fps: float
 
 
 def _smooth(path: Array, sigma: float) -> Array:
-    """The path (frames, 3) without its quick part; it goes on straight at both ends, lest it lag there."""
+    """The path (frames, 3) without its quick part; it goes on straight at both ends, so that it does not lag there."""
     margin = math.ceil(3 * sigma)
     longer = np.pad(path, ((margin, margin), (0, 0)), mode="reflect", reflect_type="odd")
     return gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]

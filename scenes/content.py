@@ -15,7 +15,9 @@ class Figure:
     """One body in one pose."""
 
     body: Body
+    """Whose."""
     frame: int
+    """Of its own motion."""
     fade: float = 0.0
     """Share of the background in its colours; ghosts have some."""
 
@@ -32,8 +34,9 @@ class Content:
     """What one picture shows."""
 
     ground: Sequence[Surface]
-    """Flat surfaces in the order in which they cover each other."""
+    """Flat surfaces in the order in which they cover each other; the figures' shadows fall on them."""
     figures: Sequence[Figure]
+    """Bodies above the ground."""
 
 
 @runtime_checkable

@@ -13,6 +13,7 @@ from scenes import colours
 from scenes.cameras import View
 from scenes.content import Content
 from scenes.lighting import shade
+from scenes.overlays import shadow
 from scenes.shapes import Array, Surface, merge
 
 _NEAR, _FAR = 0.3, 400.0
@@ -39,7 +40,8 @@ class OffscreenPainter:
         """The picture, (height, width, 3) uint8."""
         eye = view.pose[:3, 3]
         bodies = [figure.surface() for figure in content.figures]
-        groups = ((content.ground, self._sheer), (bodies, self._solid))
+        shadows = [shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
+        groups = (([*content.ground, *shadows], self._sheer), (bodies, self._solid))
         nodes = [self._scene.add(self._mesh(group, material, eye)) for group, material in groups if group]
         camera = self._camera.camera
         camera.yfov, camera.aspectRatio = view.fov, view.width / view.height

@@ -75,7 +75,7 @@ class Stage:
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
         trails = [overlays.part_of_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
-        ground = [self._still, *trails, *(m for m in marks if m is not None), *_shadows(figures)]
+        ground = [self._still, *trails, *(m for m in marks if m is not None)]
         return Content(ground, figures)
 
     def ghosts(self, film_frames: Sequence[int]) -> Content:
@@ -89,7 +89,7 @@ class Stage:
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
         trails = [player.trail for player in self.players]
-        return Content([self._still, *trails, *_shadows(figures)], figures)
+        return Content([self._still, *trails], figures)
 
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
         """One view a frame that shows all actors, and all curves unless the camera follows."""
@@ -148,7 +148,3 @@ def _marks(player: Player, frame: int) -> Surface | None:
     centres = player.body.anatomy.points.world[frame, [foot.ball for foot in feet]][:, [0, 2]]
     sides = [colours.rgb(colours.LEFT if foot.side is Side.LEFT else colours.RIGHT) for foot in feet]
     return overlays.discs(centres, np.array(sides), radius=0.1 * player.body.anatomy.scale)
-
-
-def _shadows(figures: Sequence[Figure]) -> list[Surface]:
-    return [overlays.shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(figures)]

@@ -84,7 +84,7 @@ def test_left_and_right_can_be_told_by_their_pixels(renderer):
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_the_curve_and_the_growing_trail_are_seen(renderer):
     stage = Stage([Shot(walk(24, speed=2.0), curves.line(length=4.0))])
-    views, brush = stage.views(CameraSettings(kind="top"), (160, 120)), painter(renderer)
+    views, brush = stage.views(CameraSettings(kind="top", azimuth_deg=90.0), (400, 120)), painter(renderer)
     seen = [
         [len(near(brush.paint(views[k], stage.content(k)), c, 0.985)) for c in (colours.WISH, colours.TRAIL)]
         for k in (1, 12, 23)
