@@ -14,7 +14,9 @@ from mapctl.commands.threads import compute_on_one
 class Bench:
     """Cost of the solver on this machine, or the ablation of its choices."""
 
-    what: Positional[Annotated[Literal["speed", "ablation", "free-run"], arg(metavar="speed|ablation|free-run")]] = "speed"
+    what: Positional[Annotated[Literal["speed", "ablation", "free-run"], arg(metavar="speed|ablation|free-run")]] = (
+        "speed"
+    )
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
     `free-run`: 8 random motions of 10,000 frames beside the training data."""
     prior: options.Name = "locomotion"

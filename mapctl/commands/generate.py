@@ -54,9 +54,7 @@ class Generate:
         from controllers.generate import stream
 
         prior = priors.load(self.prior)
-        draw = partial(
-            stream, prior, seconds=self.seconds, settings=settings, start_clip=clip, fps=options.MOTION_FPS
-        )
+        draw = partial(stream, prior, seconds=self.seconds, settings=settings, start_clip=clip, fps=options.MOTION_FPS)
         with outputs.made_folder(self.out) as folder:
             for number, seed in enumerate(self._seeds()):
                 pieces = draw(generator=torch.Generator().manual_seed(seed))

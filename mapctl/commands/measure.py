@@ -45,9 +45,7 @@ class Measure:
             values = {"clip": str(self.clip), "measures": ours, "reference": reference, "mocap": mocap}
             print(report.as_json(values), end="")
         else:
-            rows = [
-                [name, value, reference.get(name), _spread(mocap.get(name))] for name, value in ours.items()
-            ]
+            rows = [[name, value, reference.get(name), _spread(mocap.get(name))] for name, value in ours.items()]
             print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows)
         return 0
 
@@ -65,9 +63,7 @@ def _mocap(prior: str) -> Mapping[str, Any]:
     from priors import checkpoints
 
     try:
-        return report.mocap_values(
-            checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality
-        )
+        return report.mocap_values(checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality)
     except CheckpointError:
         return {}
 

@@ -37,8 +37,7 @@ class RunScene:
 
         scene, curves = load(scenes.find(self.scene))
         requests = [
-            as_follow(curve, actor.speed, actor.seconds)
-            for actor, curve in zip(scene.actors, curves, strict=True)
+            as_follow(curve, actor.speed, actor.seconds) for actor, curve in zip(scene.actors, curves, strict=True)
         ]
         outputs.check_folder(self.out)
         for path in scene.films(self.out):

@@ -5,9 +5,7 @@ from collections.abc import Mapping, Sequence
 NUMBER_FORMAT = "{:.4g}"
 
 
-def print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[object]], *, title: str | None = None
-) -> None:
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, title: str | None = None) -> None:
     """Numbers to the right with four digits, the rest as text; None and NaN as a dash."""
     from rich import box
     from rich.console import Console

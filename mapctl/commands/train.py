@@ -92,9 +92,7 @@ class Train:
         if self.seed is not None:
             options.check_seed(self.seed)
         given = {name: value for name, value in (recipe | {"seed": self.seed}).items() if value is not None}
-        return replace(config, **{k: v for k, v in shape.items() if v is not None}), replace(
-            settings, **given
-        )
+        return replace(config, **{k: v for k, v in shape.items() if v is not None}), replace(settings, **given)
 
 
 def _say(line: str) -> None:

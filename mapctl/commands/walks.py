@@ -62,8 +62,7 @@ class Walk:
         )
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
-            f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; "
-            f"sway {m['sway_cm']} cm",
+            f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
             f"progress  {m['travelled_m']} of {m['wanted_m']} m",
             f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
             f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
