@@ -1,0 +1,298 @@
+"""The command line: every command does its job and says so; `--help` imports nothing heavy."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from tiny_prior import save_tiny_prior
+
+import mapctl
+from mapctl import cli
+from mapctl.commands import COMMANDS
+from mapctl.commands.options import parse_size
+from mapctl.commands.train import Train
+
+HEAVY = (
+    "torch",
+    "numpy",
+    "scipy",
+    "rich",
+    "pydantic",
+    "numba",
+    "pyrender",
+    "av",
+    "matplotlib",
+    "mapctl.formats",
+)
+
+
+@pytest.fixture(scope="session")
+def prior(tmp_path_factory) -> str:
+    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
+
+
+@pytest.fixture(scope="session")
+def walk(prior, tmp_path_factory) -> Path:
+    """Two seconds on a circle, with its report beside it."""
+    path = tmp_path_factory.mktemp("walk") / "walk.bvh"
+    report = str(path.with_suffix(".json"))
+    assert run("follow", "circle:3", "-o", path, "--seconds", 2, "--prior", prior, "--report", report) == 0
+    return path
+
+
+def run(*words: object) -> int:
+    return cli.main([str(word) for word in words])
+
+
+def python(*words: object, **more) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **more)
+
+
+def test_version_is_told(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"mapctl {mapctl.__version__}\n"
+
+
+def test_help_imports_nothing_heavy():
+    script = (
+        "import sys\nfrom mapctl import cli\n"
+        "try:\n    cli.main(['--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
+        f"print(sorted(set({HEAVY!r}) & sys.modules.keys()))"
+    )
+    done = python("-c", script)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert all(name in done.stdout for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(name, "--help")
+    assert stop.value.code == 0
+    assert f"mapctl {name}" in capsys.readouterr().out
+
+
+def test_follow_writes_motion_and_report(walk, prior):
+    motion, report = mapctl.load(walk), json.loads(walk.with_suffix(".json").read_text())
+    assert motion.num_frames == 60
+    assert report["motion"] == {"frames": 60, "fps": 30.0, "seconds": 2.0}
+    assert report["request"]["command"] == "follow"
+    assert report["request"]["curve"] == "circle:3"
+    assert report["prior"]["licence"] == "none, it is made up"
+    assert report["timing"]["threads"] == 1
+
+
+def test_follow_tells_in_short(prior, tmp_path, capsys):
+    out = tmp_path / "walk.bvh"
+    assert run("follow", "line:2", "-o", out, "--prior", prior) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    for word in ("cm mean", "ms a frame", "status", str(out)):
+        assert word in told.out
+    assert run("follow", "line:2", "-o", out, "--prior", prior, "--quiet") == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_the_curve_is_walked_once_if_no_time_is_given(prior, tmp_path):
+    assert run("follow", "line:3", "-o", tmp_path / "a.npz", "--speed", 1, "--prior", prior) == 0
+    assert mapctl.load(tmp_path / "a.npz").seconds == pytest.approx(3, abs=0.1)
+
+
+def test_same_seed_same_bytes(prior, tmp_path):
+    def written(name: str, seed: int) -> bytes:
+        path = tmp_path / name
+        assert run("follow", "s:2", "-o", path, "--seconds", 1, "--seed", seed, "--prior", prior) == 0
+        return path.read_bytes()
+
+    assert written("a.bvh", 5) == written("b.bvh", 5)
+    assert len({written(f"{seed}.bvh", seed) for seed in range(6)}) > 1
+
+
+def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
+    """The made-up prior's data reach 2 m/s."""
+    words = ("follow", "line:4", "-o", tmp_path / "a.bvh", "--seconds", 1, "--prior", prior)
+    assert run(*words, "--speed", 6) == 0
+    assert run(*words, "--speed", 6, "--strict") == 3
+    assert "cannot all hold" in capsys.readouterr().out
+    assert run(*words, "--strict") == 0
+    assert (tmp_path / "a.bvh").exists()
+
+
+def test_generate_writes_different_clips(prior, tmp_path):
+    assert run("generate", "-o", tmp_path / "new" / "gen", "--seconds", 1.5, "--count", 3, "--prior", prior) == 0
+    clips = sorted((tmp_path / "new" / "gen").iterdir())
+    assert [clip.name for clip in clips] == [f"generated_00{k}.bvh" for k in range(3)]
+    assert {mapctl.load(clip).num_frames for clip in clips} == {45}
+    assert len({clip.read_bytes() for clip in clips}) == 3
+    assert run("generate", "-o", tmp_path / "one", "--seconds", 1.5, "--prior", prior, "--no-refine") == 0
+    assert (tmp_path / "one" / "generated_000.bvh").read_bytes() == clips[0].read_bytes()
+
+
+def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
+    words = ("generate", "--seconds", 1, "--prior", prior, "--temperature", 0)
+    assert run(*words, "-o", tmp_path / "clip", "--start", walk) == 0
+    assert run(*words, "-o", tmp_path / "index", "--start", 2) == 0
+    ends, begins = (
+        mapctl.load(path).joint_positions()[at, 0]
+        for path, at in ((walk, -1), (tmp_path / "clip" / "generated_000.bvh", 0))
+    )
+    assert float((ends - begins).norm()) < 0.2
+
+
+def test_long_motion_comes_in_pieces(prior, tmp_path):
+    """45 s are three pieces; the header was written before the last of them was drawn."""
+    assert run("generate", "-o", tmp_path, "--seconds", 45, "--prior", prior, "--quiet") == 0
+    motion = mapctl.load(tmp_path / "generated_000.bvh")
+    assert motion.num_frames == 1350
+    steps = motion.root_position.diff(dim=0).norm(dim=-1)
+    assert float(steps.max()) < 0.2
+
+
+def test_convert_there_and_back(walk, tmp_path, capsys):
+    assert run("convert", walk, tmp_path / "a.npz") == 0
+    assert run("convert", tmp_path / "a.npz", tmp_path / "b.bvh") == 0
+    assert (tmp_path / "b.bvh").read_text() == walk.read_text()
+    assert "60 frames" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("fps", "frames"), [("60", 119), ("15", 30), ("30000/1001", 59)])
+def test_convert_changes_the_frame_rate(walk, tmp_path, fps, frames):
+    assert run("convert", walk, tmp_path / "a.bvh", "--fps", fps) == 0
+    assert mapctl.load(tmp_path / "a.bvh").num_frames == frames
+
+
+@pytest.mark.parametrize("rig", ["canonical", "clip"])
+def test_convert_changes_the_rig(walk, tmp_path, rig):
+    """From canonical to canonical nothing changes, whichever way the rig is named."""
+    wanted = walk if rig == "clip" else rig
+    assert run("convert", walk, tmp_path / "a.bvh", "--rig", wanted) == 0
+    before, after = mapctl.load(walk), mapctl.load(tmp_path / "a.bvh")
+    assert float((before.joint_positions() - after.joint_positions()).abs().max()) < 1e-5
+
+
+def test_measure_prints_json_and_a_table(walk, prior, capsys):
+    words = ("measure", walk, "--curve", "circle:3", "--speed", 1.2, "--reference", walk, "--prior", prior)
+    assert run(*words, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    report = json.loads(walk.with_suffix(".json").read_text())
+    assert told["measures"]["path_error_mean_cm"] == pytest.approx(report["measures"]["path_error_mean_cm"], abs=0.01)
+    assert told["reference"]["speed_m_s"] == told["measures"]["speed_m_s"]
+    assert told["mocap"]["sway_cm"] == {"mean": 1.9, "p2": 1.2, "p98": 2.6}
+    assert run(*words) == 0
+    table = capsys.readouterr().out
+    assert all(name in table for name in told["measures"])
+    assert "1.9 (1.2 to 2.6)" in table
+
+
+def test_render_and_follow_make_films(walk, prior, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
+    assert run("render", walk, "-o", tmp_path / "a.png", "--size", "96x64", "--curve", "circle:3") == 0
+    words = ("follow", "line:1", "--seconds", 0.2, "--prior", prior, "--size", "64x48")
+    assert run(*words, "-o", tmp_path / "b.bvh", "--video", tmp_path / "b.mp4") == 0
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "b.mp4").read_bytes()[4:8] == b"ftyp"
+    assert str(tmp_path / "b.mp4") in capsys.readouterr().out
+
+
+def test_run_plays_a_scene(prior, tmp_path, monkeypatch):
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'prior = "{prior}"\nsize = [96, 64]\noutputs = ["a.bvh", "a.png", "a.json"]\n'
+        '[[actors]]\nname = "one"\ncurve = "line:2"\nseconds = 0.5\n'
+        '[[actors]]\nname = "two"\ncurve = "circle:2"\nseconds = 0.7\nseed = 4\noffset = [1, 2]\n'
+    )
+    assert run("run", scene, "-o", tmp_path / "out") == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"a-one.bvh", "a-two.bvh", "a.png", "a.json"}
+    report = json.loads((tmp_path / "out" / "a.json").read_text())
+    assert report["actors"].keys() == {"one", "two"}
+    assert report["actors"]["two"]["seed"] == 4
+    assert report["actors"]["two"]["motion"]["frames"] == 21
+
+
+def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
+    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
+    assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 0
+    assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
+
+
+def test_info_names_what_is_here(prior, capsys):
+    assert run("info") == 0
+    told = capsys.readouterr().out
+    for word in (mapctl.__version__, "CC BY-NC 4.0", "rendering", "threads", "torch"):
+        assert word in told
+    assert run("info", prior) == 0
+    assert json.loads(capsys.readouterr().out)["kind"] == "lstm-gmm"
+
+
+def test_train_takes_its_options(tmp_path):
+    words = [
+        "train",
+        "lstm-gmm",
+        "--data",
+        str(tmp_path),
+        "-o",
+        "run",
+        "--width",
+        "64",
+        "--steps",
+        "7",
+        "--seed",
+        "3",
+    ]
+    command = cli.parse([*words, "--match", "walk", "--device", "cpu", "--minutes-between-checkpoints", "0.5"])
+    assert isinstance(command, Train)
+    request = command.request()
+    assert (request.config.width, request.settings.steps, request.settings.seed) == (64, 7, 3)
+    assert (request.match, request.device, request.checkpoint_minutes) == ("walk", "cpu", 0.5)
+    paper = cli.parse([*words, "--paper"])
+    assert isinstance(paper, Train)
+    assert (paper.request().config.retain, paper.request().config.width) == (0.0, 64)
+    assert paper.request().settings.optimiser == "rmsprop"
+
+
+def test_interruption_leaves_nothing_half_done(prior, tmp_path):
+    """Ctrl-C in the middle of hours of motion: status 130, no traceback, no file, no folder."""
+    words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mapctl.cli", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    give_up = time.monotonic() + 100
+    while not list(tmp_path.glob("gen/.*")) and time.monotonic() < give_up:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert (process.returncode, told) == (130, "mapctl: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_closed_pipe_is_no_error():
+    """As in `mapctl measure walk.bvh | head -1`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "mapctl.cli", "--version"],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        timeout=120,
+    )
+    os.close(writer)
+    assert b"Traceback" not in done.stderr
+    assert done.returncode == 1
+
+
+def test_sizes_are_read():
+    assert parse_size("1280x720") == (1280, 720)

@@ -1,0 +1,218 @@
+"""Whatever is wrong: exit status 2, one clear line on standard error, nothing written."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_prior import save_tiny_prior
+
+from mapctl import cli
+
+TURNS = "Zrotation Xrotation Yrotation"
+HEAD = (
+    f"HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition {TURNS}\n"
+    f"JOINT Leg\n{{\nOFFSET 0 -90 0\nCHANNELS 3 {TURNS}\nEnd Site\n{{\nOFFSET 0 -10 0\n}}\n}}\n}}\n"
+    "MOTION\nFrames: 2\nFrame Time: 0.0333333\n"
+)
+ROW = "0 90 0 0 0 0 0 0 0\n"
+DEPTH = 3000
+DEEP = (
+    "HIERARCHY\nROOT j\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+    + "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n" for k in range(DEPTH))
+    + "}\n" * (DEPTH + 1)
+    + "MOTION\nFrames: 1\nFrame Time: 0.04\n"
+    + "0 " * 3 * (DEPTH + 1)
+)
+MOTIONS = {
+    "empty": b"",
+    "binary": bytes(range(256)) * 40,
+    "cut": (HEAD + ROW + "0 90 0").encode(),
+    "nan": (HEAD + ROW + ROW.replace("90", "nan")).encode(),
+    "counts": (HEAD + ROW).encode(),
+    "words": (HEAD + ROW + ROW.replace("90", "high")).encode(),
+    "deep": DEEP.encode(),
+}
+CURVES = {
+    "empty": b"",
+    "binary": bytes(range(256)) * 40,
+    "cut": b"x,z\n0,0\n1,",
+    "nan": b"x,z\n0,0\n1,nan\n",
+    "counts": b"x,z\n0,0\n1,1,1,1\n",
+    "point": b"x,z\n0,0\n",
+    "header": b"x,z\n",
+}
+
+
+@pytest.fixture
+def fails(tmp_path, capsys, monkeypatch):
+    """Runs mapctl in an empty folder and holds it to the rule; returns the line."""
+    monkeypatch.chdir(tmp_path)
+
+    def check(*words: object) -> str:
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+        status = cli.main([str(word) for word in words])
+        told = capsys.readouterr()
+        assert status == 2
+        assert told.out == ""
+        assert told.err.startswith("mapctl: ")
+        assert told.err.count("\n") == 1
+        assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+        return told.err
+
+    return check
+
+
+@pytest.fixture(scope="session")
+def prior(tmp_path_factory) -> str:
+    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+@pytest.mark.parametrize(
+    "words",
+    [("convert", "in.bvh", "out.npz"), ("measure", "in.bvh"), ("render", "in.bvh", "-o", "out.png")],
+    ids=lambda words: words[0],
+)
+def test_broken_motions(fails, words, kind):
+    Path("in.bvh").write_bytes(MOTIONS[kind])
+    assert "in.bvh" in fails(*words)
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+def test_broken_starts_of_generation(fails, prior, kind):
+    Path("in.bvh").write_bytes(MOTIONS[kind])
+    assert "in.bvh" in fails("generate", "-o", "gen", "--seconds", 1, "--start", "in.bvh", "--prior", prior)
+
+
+@pytest.mark.parametrize("kind", CURVES)
+def test_broken_curves(fails, prior, kind):
+    Path("curve.csv").write_bytes(CURVES[kind])
+    assert "curve.csv" in fails("follow", "curve.csv", "-o", "out.bvh", "--prior", prior, "--report", "out.json")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["follow", "circle:0", "-o", "a.bvh"], "radius"),
+        (["follow", "circle:-4", "-o", "a.bvh"], "radius"),
+        (["follow", "circle:nan", "-o", "a.bvh"], "circle"),
+        (["follow", "hexagon:4", "-o", "a.bvh"], "circle"),
+        (["follow", "", "-o", "a.bvh"], "circle"),
+        (["follow", "nowhere.csv", "-o", "a.bvh"], "no such file"),
+        (["follow", "nowhere/curve", "-o", "a.bvh"], "no such file"),
+        (["follow", "line:4", "-o", "a.bvh", "--speed", "-1"], "speed must be positive, got -1 m/s"),
+        (["follow", "line:4", "-o", "a.bvh", "--speed", "0"], "speed must be positive"),
+        (["follow", "line:4", "-o", "a.bvh", "--speed", "nan"], "speed must be positive"),
+        (["follow", "line:4", "-o", "a.bvh", "--speed", "fast"], "'fast'"),
+        (["follow", "line:4", "-o", "a.bvh", "--speed", "0:1,0:2"], "rise"),
+        (["follow", "line:4", "-o", "a.bvh", "--seconds", "-3"], "seconds must be positive, got -3"),
+        (["follow", "line:4", "-o", "a.bvh", "--seconds", "nan"], "seconds must be positive"),
+        (["follow", "line:4", "-o", "a.bvh", "--seconds", "1e9"], "fewer seconds"),
+        (
+            ["follow", "line:4", "-o", "a.bvh", "--seconds", "long"],
+            "--seconds: expected a number, got 'long'",
+        ),
+        (["follow", "line:4", "-o", "a.bvh", "--seed", "1.5"], "--seed: expected a whole number, got '1.5'"),
+        (["follow", "line:4", "-o", "a.bvh", "--seed", "-1"], "seed"),
+        (["follow", "line:4", "-o", "a.bvh", "--seed", str(2**63)], "seed"),
+        (["follow", "line:4", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
+        (["follow", "line:4", "-o", "a.bvh", "--metres-per-unit", "2"], "metres per unit"),
+        (["follow", "line:4", "-o", "a.txt"], ".bvh"),
+        (["follow", "line:4", "-o", "gone/a.bvh"], "does not exist"),
+        (["follow", "line:4", "-o", "."], "cannot write ."),
+        (["follow", "line:4", "-o", "a.bvh", "--report", "gone/a.json"], "gone"),
+        (["follow", "line:4", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
+        (["follow", "line:4", "-o", "a.bvh", "--video", "a.avi"], ".mp4"),
+        (["follow", "line:4", "-o", "a.bvh", "--video", "a.mp4", "--size", "big"], "WIDTHxHEIGHT"),
+        (["follow", "line:4", "-o", "a.bvh", "--video", "a.mp4", "--size", "1x1"], "pixels"),
+        (["follow", "line:4", "-o", "a.bvh", "--camera", "side"], "'side'"),
+        (["follow", "line:4", "-o", "a.bvh", "--strct"], "Perhaps you meant: --strict"),
+        (["follow", "line:4"], "--out"),
+        (["follow"], "mapctl follow --help"),
+        ([], "mapctl --help"),
+        (["fly"], "follow"),
+        (["generate", "-o", "gen", "--seconds", "0"], "seconds must be positive"),
+        (["generate", "-o", "gen", "--seconds", "inf"], "seconds must be at most"),
+        (["generate", "-o", "gen", "--seconds", "1", "--count", "0"], "count"),
+        (["generate", "-o", "gen", "--seconds", "1", "--temperature", "-1"], "temperature"),
+        (["generate", "-o", "gen", "--seconds", "1", "--start", "gone.bvh"], "gone.bvh"),
+        (["convert", "gone.bvh", "a.npz"], "gone.bvh"),
+        (["convert", "gone.fbx", "a.npz"], ".fbx"),
+        (["convert", "gone.bvh", "a.fbx"], ".fbx"),
+        (["convert", "gone.bvh", "a.npz", "--fps", "0"], "frame rate"),
+        (["convert", "gone.bvh", "a.npz", "--fps", "1/0"], "frame rate"),
+        (["measure", "gone.bvh"], "gone.bvh"),
+        (["measure", "gone.bvh", "--speed", "1"], "--curve"),
+        (["measure", "gone.bvh", "--curve", "line:4", "--speed", "-1"], "speed must be positive"),
+        (["render", "gone.bvh", "-o", "a.png"], "gone.bvh"),
+        (["run", "gone.toml"], "gone.toml"),
+        (["run", "nothing"], "ready scenes"),
+        (["train", "lstm-gmm", "--data", "gone", "-o", "run"], "gone"),
+        (["train", "lstm-gmm", "--data", ".", "-o", "run"], ".bvh"),
+        (["train", "lstm-gmm", "--data", ".", "-o", "run", "--steps", "0"], "--steps"),
+        (["train", "gan", "--data", ".", "-o", "run"], "lstm-gmm"),
+        (["info", "nobody"], "no prior 'nobody'"),
+    ],
+    ids=lambda value: " ".join(value)[:60] if isinstance(value, list) else "",
+)
+def test_impossible_requests(fails, words, said):
+    assert said in fails(*words)
+
+
+def test_start_beyond_the_last(fails, prior):
+    assert "0 to 7" in fails("generate", "-o", "a/b", "--seconds", 1, "--start", 8, "--prior", prior)
+
+
+def test_a_file_in_the_folders_place(fails, prior):
+    Path("gen").write_text("here first")
+    assert "not a folder" in fails("generate", "-o", "gen", "--seconds", 1, "--prior", prior)
+    assert "not a folder" in fails("demo", "-o", "gen/deeper", "--prior", prior)
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that not even root can write")
+def test_read_only_places(fails, prior):
+    assert "cannot write" in fails("follow", "line:4", "-o", "/proc/self/a.bvh", "--prior", prior)
+    assert "cannot write" in fails("generate", "-o", "/proc/self/gen", "--seconds", 1, "--prior", prior)
+
+
+def test_known_rigs_need_a_clip(fails):
+    Path("in.bvh").write_text(HEAD + ROW + ROW)
+    assert "rig" in fails("convert", "in.bvh", "out.bvh", "--rig", "canonical")
+
+
+def test_weights_that_are_none(fails):
+    Path("bad.safetensors").write_bytes(b"\0" * 99)
+    assert "bad" in fails("follow", "line:4", "-o", "a.bvh", "--prior", "bad.safetensors")
+
+
+def test_missing_extra_is_named(fails, monkeypatch):
+    monkeypatch.setattr("mapctl.commands.outputs.find_spec", lambda name: None)
+    assert "pip install 'mapctl[render]'" in fails("follow", "line:4", "-o", "a.bvh", "--video", "a.mp4")
+
+
+def test_missing_package_is_named(fails, monkeypatch):
+    def run(self):
+        raise ModuleNotFoundError("No module named 'viser.scene'", name="viser.scene")
+
+    monkeypatch.setattr("mapctl.commands.info.Info.run", run)
+    assert "pip install 'mapctl[live]'" in fails("info")
+
+
+@pytest.mark.skipif(not hasattr(os, "wait4"), reason="needs the memory of a child process")
+@pytest.mark.parametrize("words", [("convert", "deep.bvh", "a.npz"), ("follow", "circle:0", "-o", "a.bvh")])
+def test_as_installed(tmp_path, words):
+    """In a process of its own: no traceback, and far below 10 s and 1 GB."""
+    (tmp_path / "deep.bvh").write_text(DEEP)
+    command = [sys.executable, "-m", "mapctl.cli", *words]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    told = process.stderr.read().decode() if process.stderr else ""
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 2
+    assert told.startswith("mapctl: ")
+    assert told.count("\n") == 1
+    assert usage.ru_utime + usage.ru_stime < 10
+    assert usage.ru_maxrss < (1 << 20) * (1024 if sys.platform == "darwin" else 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["deep.bvh"]

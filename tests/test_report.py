@@ -1,0 +1,120 @@
+"""Reports: complete, and JSON that every parser reads."""
+
+import json
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapctl import curves, report
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.result import Ledger, LedgerEntry, Outcome, Solution, Status, WindowRecord
+
+FRAMES = 90
+
+
+def glide(frames: int = FRAMES, speed: float = 1.0) -> Motion:
+    """A T-pose that slides along +Z."""
+    root = torch.zeros(frames, 3, dtype=torch.float64)
+    root[:, 1], root[:, 2] = 0.9, torch.arange(frames) * speed / 30
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(frames, CANONICAL.num_joints, 4)
+    return Motion(CANONICAL, Fraction(30), root, still.clone())
+
+
+def window(frames: int, seconds: float, evaluations: int) -> WindowRecord:
+    return WindowRecord(frames, seconds, evaluations, start_energy=2.0, energy=1.0, outcome="converged")
+
+
+@pytest.fixture
+def solution() -> Solution:
+    energy, residual = torch.ones(FRAMES), torch.linspace(0, 1, FRAMES)
+    ledger = Ledger((LedgerEntry("path", "m", energy, residual),))
+    status = Status(Outcome.DONE).with_notes(["too fast"], infeasible=True)
+    return Solution(glide(), status, ledger, (window(17, 0.17, 20), window(17, 0.34, 30)))
+
+
+def test_everything_is_in_it(solution):
+    made = report.build(
+        solution, request={"curve": "line:4"}, seed=3, measures={"sway_cm": math.nan}, seconds=1.0,
+        prior={"name": "tiny", "licence": "none", "quality": {"mocap": {"sway_cm": {"mean": 1.9}}}},
+    )  # fmt: skip
+    made = json.loads(report.as_json(made))
+    assert made["request"] == {"curve": "line:4"}
+    assert made["seed"] == 3
+    assert made["prior"] == {"name": "tiny", "licence": "none"}
+    assert made["status"]["notes"] == ["too fast"]
+    assert made["status"]["ok"] is False
+    assert "too fast" in made["status"]["text"]
+    assert made["motion"] == {"frames": FRAMES, "fps": 30.0, "seconds": 3.0}
+    assert made["ledger"]["path"]["energy_nats"] == FRAMES
+    assert made["ledger"]["path"]["residual_max"] == 1
+    assert made["measures"] == {"sway_cm": None}
+    assert made["mocap"] == {"sway_cm": {"mean": 1.9}}
+    assert {"mapctl", "python", "torch", "numpy", "platform"} <= made["versions"].keys()
+
+
+def test_a_card_without_mocap_gives_none(solution):
+    made = report.build(solution, request={}, seed=0, measures={}, seconds=1.0, prior={"name": "tiny"})
+    assert made["mocap"] == {}
+
+
+def test_timing_is_for_each_delivered_frame(solution):
+    timing = report.timing(solution.windows, seconds=2.0)
+    assert timing["frame_ms_p50"] == pytest.approx(15)  # between 10 ms in one window and 20 ms in the other
+    assert timing["frame_ms_p99"] == pytest.approx(20)
+    assert timing["frame_ms_mean"] == pytest.approx(15)
+    assert timing["evaluations_per_frame"] == pytest.approx(50 / 34)
+    assert (timing["seconds"], timing["windows"], timing["threads"]) == (2.0, 2, torch.get_num_threads())
+    assert "late_frames" not in timing
+
+
+def test_long_windows_weigh_more():
+    """Most frames cost 1 ms, whatever the two short windows took."""
+    windows = (window(1, 0.1, 1), window(100, 0.1, 1), window(1, 0.1, 1))
+    assert report.timing(windows, seconds=1)["frame_ms_p50"] == pytest.approx(1)
+
+
+def test_no_windows_are_no_numbers():
+    assert json.loads(report.as_json(report.timing((), seconds=0.0)))["frame_ms_p50"] is None
+
+
+def test_progress_is_against_the_wanted_way():
+    """89 steps of 1/30 m are 2.967 m; twice that was wanted."""
+    measures = report.path_measures(glide(), curves.line(length=10), wanted_m=2 * 89 / 30)
+    assert measures["wanted_m"] == pytest.approx(2 * 89 / 30)
+    assert measures["travelled_m"] == pytest.approx(89 / 30, abs=1e-6)
+    assert measures["progress_ratio"] == pytest.approx(0.5, abs=1e-6)
+    assert measures["path_error_max_cm"] == pytest.approx(0, abs=1e-6)
+
+
+TREES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.tuples(inner, inner),
+    max_leaves=20,
+)
+
+
+@given(TREES)
+def test_any_tree_becomes_plain_json(values):
+    def refuse(word: str):
+        raise AssertionError(f"{word} is no JSON")
+
+    json.loads(report.as_json(values), parse_constant=refuse)
+
+
+def test_numpy_and_torch_numbers_are_python_ones():
+    values = report.as_json({"a": np.float64("nan"), "b": float(torch.tensor(2.0))})
+    assert json.loads(values) == {"a": None, "b": 2.0}
+
+
+def test_written_whole(solution, tmp_path):
+    path = tmp_path / "report.json"
+    report.write(report.status(replace(solution, status=Status(Outcome.DONE))), path)
+    assert json.loads(path.read_text())["text"] == "done"
+    assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
