@@ -64,10 +64,12 @@ def _ghosts(stage: Stage) -> list[int]:
     paths = [player.body.anatomy.hips_world[:, [0, 2]] for player in stage.players]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
     most = max(4, _MOST_GHOSTS // len(paths))
-    count = min(round(max(lengths) / _GHOST_STRIDE) + 1, most)
+    furthest = paths[int(np.argmax(lengths))]
+    # Someone who sways on the spot goes a long way too, but not far.
+    reach = np.linalg.norm(furthest - furthest[0], axis=1).max()
+    count = min(round(min(max(lengths), 2 * reach) / _GHOST_STRIDE) + 1, most)
     if count == 1:
         return [stage.num_frames // 2]
-    furthest = paths[int(np.argmax(lengths))]
     loop = max(lengths) > 3 * _GHOST_STRIDE and np.linalg.norm(furthest[-1] - furthest[0]) < _GHOST_STRIDE
     return _spread(stage.num_frames - 1, count + 1)[1:] if loop else _spread(stage.num_frames - 1, count)
 
