@@ -13,6 +13,7 @@ RendererName = Literal["auto", "egl", "stick"]
 VARIABLE = "MAPCTL_RENDERER"
 """Environment variable with the renderer where none is asked for."""
 
+_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libgles2"
 _log = logging.getLogger("mapctl.scenes")
 
 
@@ -32,7 +33,7 @@ def painter(name: RendererName | None = None) -> Painter:
     except NoGraphicsError as error:
         if wanted == "egl":
             raise
-        _log.warning("%s; drawing stick figures. On Debian: apt-get install libegl1 libgl1-mesa-dri", error)
+        _log.warning("%s; drawing stick figures. On Debian: apt-get install %s", error, _PACKAGES)
         return _sticks()
 
 
