@@ -1,7 +1,7 @@
 """What the core asks of learned models. A model has the roles it can fill; none is given a fake one."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +20,7 @@ class Plan:
     """Left and right toe planted."""
 
 
+@runtime_checkable
 class Density(Protocol[State]):
     """A density over next frames with explicit state: what was seen so far, batch first."""
 
@@ -50,6 +51,7 @@ class Density(Protocol[State]):
         ...
 
 
+@runtime_checkable
 class Inbetweener(Protocol):
     """Proposes the frames between known ones."""
 
@@ -63,6 +65,7 @@ class Inbetweener(Protocol):
         ...
 
 
+@runtime_checkable
 class Refiner(Protocol):
     """Makes a synthesised motion look captured without changing what it does."""
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -40,6 +40,7 @@ class SolvedWindow:
     """Why L-BFGS stopped."""
 
 
+@runtime_checkable
 class Method(Protocol):
     """Solves one window."""
 

@@ -5,13 +5,14 @@ The only place that advances a prior's state during a solve.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.errors import RequestError
 from mapctl.features import Place, root_places
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -35,6 +36,10 @@ class WindowSettings:
     past: int = 40
     """Committed frames that terms may look back on."""
 
+    def __post_init__(self):
+        if not 0 <= self.overlap < self.frames or self.past < 1:
+            raise RequestError(f"windows need frames > overlap >= 0 and past >= 1, got {self}")
+
 
 @dataclass(frozen=True, eq=False)
 class Committed:
@@ -48,12 +53,17 @@ class Committed:
     """Of every committed frame, the first being the start."""
     joints_world: Float[Tensor, "past joints 3"]
     """World joint positions of its last frames, metres."""
-    tail: Float[Tensor, "frames width"]
+    tail: Float[Tensor, "ahead width"]
     """What the last window found for the frames beyond: where the next one starts (see the method's `carry`)."""
     ledger: Ledger = field(default_factory=Ledger)
     """Of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
     """Cost of each window."""
+
+    def finite(self, count: int) -> bool:
+        """Whether the last `count` frames and their energies are numbers."""
+        checked = (self.features[-count:], *(entry.energy[-count:] for entry in self.ledger.entries))
+        return all(bool(torch.isfinite(values).all()) for values in checked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +94,10 @@ class WindowSolver:
             if deadline is not None and time.monotonic() >= deadline:
                 return committed, Outcome.BUDGET
             count = min(self.settings.frames - self.settings.overlap, frames - done)
-            committed = self._next(committed, terms_of(done, self.settings.frames), count, generator)
-            if not torch.isfinite(committed.features[-count:]).all():
-                return replace(committed, features=committed.features[:-count]), Outcome.NOT_FINITE
+            following = self._next(committed, terms_of(done, self.settings.frames), count, generator)
+            if not following.finite(count):
+                return committed, Outcome.NOT_FINITE
+            committed = following
             if progress is not None:
                 progress(min(len(committed.features), frames), frames)
         return committed, Outcome.DONE

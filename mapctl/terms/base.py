@@ -1,6 +1,6 @@
 """What a term is: an energy for every frame of every candidate, and what it measures in physical units."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -8,6 +8,7 @@ from torch import Tensor
 from mapctl.trial import Trial
 
 
+@runtime_checkable
 class Term(Protocol):
     """Sigmas in physical units are a term's only weights; energies are negative log likelihoods (nats)."""
 
