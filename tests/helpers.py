@@ -38,9 +38,7 @@ def quat_xyzw(rotation_vectors: Tensor) -> Tensor:
     return torch.from_numpy(flat).reshape(*rotation_vectors.shape[:-1], 4)
 
 
-def walk(
-    frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, seed: int = 0, fps: int = 30
-) -> Motion:
+def walk(frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, seed: int = 0, fps: int = 30) -> Motion:
     """A procedural walk: legs and arms swing, knees lift, the lower toe is on the floor."""
     time = torch.arange(frames, dtype=torch.float64) / fps
     phase = 2 * math.pi * cadence * time
@@ -82,15 +80,10 @@ def _root(heading: Tensor, *, speed: float, fps: int) -> Tensor:
 
 def walks(count: int = 5, frames: int = 100) -> list[Motion]:
     """Different walks: to the left, straight, to the right; slower and faster."""
-    return [
-        walk(frames, turn_rate=0.3 * (k % 3 - 1), cadence=CADENCE * (0.8 + 0.1 * k), seed=k)
-        for k in range(count)
-    ]
+    return [walk(frames, turn_rate=0.3 * (k % 3 - 1), cadence=CADENCE * (0.8 + 0.1 * k), seed=k) for k in range(count)]
 
 
-def random_motion(
-    skeleton: Skeleton, frames: int = 5, *, seed: int = 0, fps: Fraction = Fraction(30)
-) -> Motion:
+def random_motion(skeleton: Skeleton, frames: int = 5, *, seed: int = 0, fps: Fraction = Fraction(30)) -> Motion:
     """Every joint in any rotation, the root anywhere."""
     local = torch.from_numpy(Rotation.random(frames * skeleton.num_joints, rng=seed).as_quat())
     root = torch.randn(frames, 3, generator=generator(seed), dtype=torch.float64)
@@ -135,17 +128,13 @@ def cmu_skeleton() -> Skeleton:
     parents.append(names.index("lHand"))
     offsets = torch.cat([offsets, offsets.new_tensor([[0.03, -0.01, 0.04]])])
     toe = (0.01, -0.07, 0.09)
-    return Skeleton(
-        tuple(names), tuple(parents), offsets, {"lFoot": toe, "rFoot": toe, "head": (0.0, 0.2, 0.0)}
-    )
+    return Skeleton(tuple(names), tuple(parents), offsets, {"lFoot": toe, "rFoot": toe, "head": (0.0, 0.2, 0.0)})
 
 
 def corpus(count: int = 5, frames: int = 100) -> Corpus:
     """The features of `walks`."""
     clips = [encode(motion)[0].float() for motion in walks(count, frames)]
-    return Corpus(
-        tuple(f"walk-{k}.bvh" for k in range(count)), tuple(len(c) for c in clips), torch.cat(clips)
-    )
+    return Corpus(tuple(f"walk-{k}.bvh" for k in range(count)), tuple(len(c) for c in clips), torch.cat(clips))
 
 
 def write_corpus(folder: Path, count: int = 5, frames: int = 80) -> Path:
@@ -182,13 +171,9 @@ def tiny_density(*, width: int = 8, components: int = 3, seed: int = 0, starts: 
     return density
 
 
-def noise(
-    batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32
-) -> Float[Tensor, "b f c"]:
+def noise(batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Float[Tensor, "b f c"]:
     """Latents of a rollout."""
-    return torch.randn(batch, frames, LAYOUT.continuous, generator=generator(seed), dtype=torch.float64).to(
-        dtype
-    )
+    return torch.randn(batch, frames, LAYOUT.continuous, generator=generator(seed), dtype=torch.float64).to(dtype)
 
 
 def finite_difference(function, at: Tensor, direction: Tensor, *, step: float = 1e-6) -> float:

@@ -27,16 +27,12 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     vectors, start = encode(motion)
     ground, heading = root_places(vectors[:PAST], start)
     scale = disturbed * vectors.std(0)
-    features = (
-        vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
-    )
+    features = vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
     bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
     place = Place(ground[-1].to(dtype), heading[-1].to(dtype))
     before = motion.joint_positions()[PAST - past : PAST].to(dtype)
-    return Trial(
-        features.to(dtype), place, draw[..., 1:].to(dtype), 30 * draw[..., 0].to(dtype), bits, before
-    )
+    return Trial(features.to(dtype), place, draw[..., 1:].to(dtype), 30 * draw[..., 0].to(dtype), bits, before)
 
 
 def rows(whole, picked):
@@ -114,9 +110,7 @@ def test_single_precision_is_enough(name):
 def test_the_gradient_is_that_of_finite_differences(name, past):
     whole, term = trial(2, past=past), TERMS[name]
     parts = [getattr(whole, part) for part in ("features", "noise", "log_density")]
-    directions = [
-        torch.randn(part.shape, generator=generator(k), dtype=torch.float64) for k, part in enumerate(parts)
-    ]
+    directions = [torch.randn(part.shape, generator=generator(k), dtype=torch.float64) for k, part in enumerate(parts)]
     directions[0] = 0.1 * directions[0]
 
     def energy(step):
@@ -152,9 +146,7 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
         rotate_ground(here.start.position_xz, angle) + torch.tensor(shift).double(), here.start.heading + turn
     )
     before = here.before.clone()
-    before[..., ::2] = (
-        rotate_ground(before[..., ::2], angle.expand(before.shape[:-1])) + torch.tensor(shift).double()
-    )
+    before[..., ::2] = rotate_ground(before[..., ::2], angle.expand(before.shape[:-1])) + torch.tensor(shift).double()
     there = replace(here, start=place, before=before)
     if "curve" in {field.name for field in fields(term)}:
         term = replace(term, curve=moved_curve(term.curve, turn, shift))
@@ -171,9 +163,7 @@ def test_world_joints_are_those_of_the_motion():
     toe = CANONICAL.index("leftToes")
     past = walk(PAST, turn_rate=0.2).joint_positions()[-1, toe]
     torch.testing.assert_close(whole.step(toe)[1, 0], whole.joints_world[1, 0, toe] - past)
-    torch.testing.assert_close(
-        replace(whole, before=whole.before[:0]).step(toe)[1, 0], torch.zeros(3).double()
-    )
+    torch.testing.assert_close(replace(whole, before=whole.before[:0]).step(toe)[1, 0], torch.zeros(3).double())
 
 
 def test_likelihood_and_noise_are_their_formulas():
@@ -189,16 +179,14 @@ def test_a_walk_to_the_left_of_a_line_is_off_by_as_much():
     whole = trial(1, disturbed=0.0)
     beside = replace(whole, start=Place(torch.tensor([0.25, 0.0]).double(), torch.tensor(0.0).double()))
     straight = walk(FRAMES + 1)
-    vectors, start = encode(straight)
+    vectors, _ = encode(straight)
     beside = replace(beside, features=vectors[None, 1:], before=whole.before[:0])
     hips = beside.root_xz_world[0]
     term = Path(line(length=3), hips[:, 1].clone())
     torch.testing.assert_close(term.residual(beside)[0], hips[:, 0].abs(), atol=1e-6, rtol=0)
     late = replace(term, arcs=term.arcs + 0.16)
     gained = late(beside) - term(beside)
-    torch.testing.assert_close(
-        gained, torch.full((1, FRAMES), 0.5 * (0.16 / 0.08) ** 2).double(), atol=1e-4, rtol=0
-    )
+    torch.testing.assert_close(gained, torch.full((1, FRAMES), 0.5 * (0.16 / 0.08) ** 2).double(), atol=1e-4, rtol=0)
 
 
 def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():

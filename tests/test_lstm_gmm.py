@@ -1,0 +1,221 @@
+"""The LSTM-GMM against torch.distributions, and its five operations against each other."""
+
+import pytest
+import torch
+from catalogue import densities
+from helpers import corpus, finite_difference, generator, noise, tiny_density
+from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, Normal
+
+from mapctl.features import LAYOUT
+from mapctl.protocols import Plan
+from priors.lstm_gmm import LstmState
+
+SIZE = LAYOUT.continuous
+NETWORKS = densities()
+each_network = pytest.mark.parametrize("kind", NETWORKS)
+
+
+def clip(batch=2, frames=9, first=20):
+    """Frames of the walks, float64."""
+    return torch.stack([c[first : first + frames].double() for c in corpus().clips()[:batch]])
+
+
+def warm(network, batch=2):
+    """A state that has seen some frames."""
+    seen = clip(batch, 12, first=8)
+    return network.advance(network.initial_state(seen[:, 0]), seen[:, 1:])
+
+
+def rolled(network, state, frames=8, seed=0):
+    """Noise, its likeliest plan, and the rollout under it."""
+    draws = noise(state.batch, frames, seed=seed, dtype=torch.float64)
+    plan = network.plan(state, draws)
+    return draws, plan, *network.rollout(state, draws, plan)
+
+
+def mixture_of(network, state, frames):
+    """The mixtures that the network predicts along given frames."""
+    before = torch.cat([state.previous[:, None], frames[:, :-1]], 1)
+    return network(network.normalise(before), (state.hidden, state.cell))[0]
+
+
+@each_network
+def test_the_density_is_a_mixture_of_normals_times_two_bernoullis(kind):
+    network, frames = NETWORKS[kind], clip()
+    state = warm(network)
+    mixture = mixture_of(network, state, frames)
+    normals = Independent(Normal(mixture.mean, mixture.log_sigma.exp()), 1)
+    poses = MixtureSameFamily(Categorical(logits=mixture.log_weight), normals)
+    bits = Independent(Bernoulli(logits=mixture.contact_logit), 1)
+    expected = poses.log_prob(network.normalise(frames)[..., :SIZE]) + bits.log_prob(frames[..., SIZE:])
+    torch.testing.assert_close(network.log_prob(frames, state), expected)
+    torch.testing.assert_close(mixture.log_weight.exp().sum(-1), torch.ones(2, 9).double())
+    assert float(mixture.log_sigma.min()) > network.config.min_log_sigma
+    assert float(mixture.log_sigma.max()) < network.config.max_log_sigma
+
+
+@each_network
+def test_a_rollout_scores_its_component_which_is_part_of_the_mixture(kind):
+    network = NETWORKS[kind]
+    state = warm(network)
+    _, plan, frames, density = rolled(network, state)
+    whole = network.log_prob(frames, state)
+    if network.config.components == 1:
+        torch.testing.assert_close(density, whole)
+    else:
+        assert bool((density < whole + 1e-9).all())
+    mixture = mixture_of(network, state, frames)
+    chosen = mixture.log_weight.argmax(-1)
+    assert torch.equal(plan.component, chosen)
+    assert torch.equal(plan.contacts, mixture.contact_logit > 0)
+    # Of one noise, the components' densities differ by their weights and sigmas alone.
+    draws = noise(2, 8, dtype=torch.float64)
+    plans = [Plan(torch.full_like(plan.component, k), plan.contacts) for k in range(network.config.components)]
+    parts = [network.rollout(state, draws, each) for each in plans]
+    first = torch.stack([density[:, 0] for _, density in parts])
+    expected = mixture.log_weight[:, 0].T
+    torch.testing.assert_close(first.logsumexp(0) - first, expected.logsumexp(0) - expected + spread(mixture)[:, 0].T)
+
+
+def spread(mixture):
+    """How the components' sigmas differ in the densities of one and the same noise, nats."""
+    sums = mixture.log_sigma.sum(-1)
+    own = mixture.log_weight - sums
+    return own.logsumexp(-1, keepdim=True) - own - (mixture.log_weight.logsumexp(-1, keepdim=True) - mixture.log_weight)
+
+
+@each_network
+def test_noise_is_the_standardised_error_of_the_chosen_component(kind):
+    network = NETWORKS[kind]
+    state = warm(network)
+    draws, plan, frames, _ = rolled(network, state)
+    mixture = mixture_of(network, state, frames)
+    picked = plan.component[..., None, None].expand(-1, -1, 1, SIZE)
+    mean, sigma = (part.gather(-2, picked)[..., 0, :] for part in (mixture.mean, mixture.log_sigma.exp()))
+    torch.testing.assert_close((network.normalise(frames)[..., :SIZE] - mean) / sigma, draws, atol=1e-7, rtol=1e-7)
+    assert torch.equal(frames[..., SIZE:] > 0.5, plan.contacts)
+
+
+@each_network
+def test_a_state_advanced_by_frames_continues_their_rollout(kind):
+    network = NETWORKS[kind]
+    state = warm(network)
+    draws, plan, frames, density = rolled(network, state)
+    later = network.advance(state, frames[:, :5])
+    torch.testing.assert_close(network.log_prob(frames[:, 5:], later), network.log_prob(frames, state)[:, 5:])
+    rest, scores = network.rollout(later, draws[:, 5:], Plan(plan.component[:, 5:], plan.contacts[:, 5:]))
+    torch.testing.assert_close((rest, scores), (frames[:, 5:], density[:, 5:]))
+    again = network.plan(later, draws[:, 5:])
+    assert torch.equal(again.component, plan.component[:, 5:])
+
+
+@each_network
+def test_the_pullback_of_a_rollout_is_that_of_finite_differences(kind):
+    network = NETWORKS[kind]
+    state = warm(network)
+    draws, plan, frames, _ = rolled(network, state, frames=5)
+    weight = torch.randn(frames.shape, generator=generator(5), dtype=torch.float64)
+
+    def measure(values):
+        features, density = network.rollout(state, values, plan)
+        return (features * weight).sum() + density.sum()
+
+    leaf = draws.clone().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(measure(leaf), leaf)
+    direction = noise(2, 5, seed=6, dtype=torch.float64)
+    assert float((gradient * direction).sum()) == pytest.approx(finite_difference(measure, draws, direction), rel=1e-5)
+
+
+@each_network
+def test_rows_of_a_batch_know_nothing_of_each_other(kind):
+    network = NETWORKS[kind]
+    state, frames = warm(network, 3), clip(3)
+    together = network.log_prob(frames, state)
+    for row in range(3):
+        alone = state.pick(torch.tensor([row]))
+        torch.testing.assert_close(network.log_prob(frames[row : row + 1], alone)[0], together[row])
+    copies = state.pick(torch.tensor([1])).repeat(4)
+    assert copies.batch == 4
+    torch.testing.assert_close(network.log_prob(frames[1:2].expand(4, -1, -1), copies), together[1].expand(4, -1))
+
+
+def test_noisy_inputs_are_seen_but_not_scored():
+    network = NETWORKS["several"]
+    state, frames = warm(network), clip()
+    seen = frames.clone()
+    seen[:, 4, :SIZE] += 0.05 * network.std[:SIZE]
+    plain, noisy = network.log_prob(frames, state), network.log_prob(frames, state, inputs=seen)
+    torch.testing.assert_close(noisy[:, :5], plain[:, :5])
+    assert float((noisy[:, 5:] - plain[:, 5:]).abs().min()) > 1e-6
+    torch.testing.assert_close(network.log_prob(frames, state, inputs=frames), plain)
+
+
+def test_without_a_say_of_the_network_the_mean_is_the_clamped_share_of_the_last_frame():
+    network = densities()["several"]
+    with torch.no_grad():
+        network.out.weight.zero_()
+        network.out.bias.zero_()
+    previous = network.mean + network.std * torch.linspace(-9, 9, LAYOUT.size).double()
+    plan = Plan(torch.zeros(1, 1, dtype=torch.long), torch.zeros(1, 1, 2, dtype=torch.bool))
+    frames, _ = network.rollout(network.initial_state(previous[None]), torch.zeros(1, 1, SIZE).double(), plan)
+    expected = 0.9 * torch.linspace(-9, 9, LAYOUT.size).double().clamp(-5, 5)
+    torch.testing.assert_close(network.normalise(frames)[0, 0, :SIZE], expected[:SIZE])
+
+
+@each_network
+def test_draws_follow_the_mixture(kind):
+    network = NETWORKS[kind]
+    count = 4000
+    state = warm(network, 1)
+    drawn, _ = network.sample(state.repeat(count), 1, generator(3))
+    mixture = mixture_of(network, state, clip(1, 1))
+    weight = mixture.log_weight[0, 0].exp()[:, None]
+    mean = (weight * mixture.mean[0, 0]).sum(0)
+    second = (weight * (mixture.mean[0, 0] ** 2 + (2 * mixture.log_sigma[0, 0]).exp())).sum(0)
+    error = (second - mean**2).sqrt() / count**0.5
+    values = network.normalise(drawn)[:, 0]
+    assert float(((values[:, :SIZE].mean(0) - mean) / error).abs().max()) < 4.5
+    torch.testing.assert_close((values[:, :SIZE] ** 2).mean(0), second, rtol=0.15, atol=1e-3)
+    bits = drawn[:, 0, SIZE:].double().mean(0)
+    torch.testing.assert_close(bits, torch.sigmoid(mixture.contact_logit[0, 0]), atol=0.04, rtol=0)
+
+
+@each_network
+def test_sampling_returns_the_state_after_its_frames_and_obeys_the_seed(kind):
+    network = NETWORKS[kind]
+    state = warm(network)
+    drawn, after = network.sample(state, 6, generator(1))
+    expected = network.advance(state, drawn)
+    for part in ("previous", "hidden", "cell"):
+        torch.testing.assert_close(getattr(after, part), getattr(expected, part))
+    assert torch.equal(network.sample(state, 6, generator(1))[0], drawn)
+    assert not torch.equal(network.sample(state, 6, generator(2))[0], drawn)
+
+
+def test_at_temperature_zero_only_the_discrete_choices_are_drawn():
+    network = NETWORKS["one"]
+    state = warm(network)
+    drawn, _ = network.sample(state, 6, generator(1), temperature=0.0)
+    plan = Plan(torch.zeros(2, 6, dtype=torch.long), drawn[..., SIZE:] > 0.5)
+    torch.testing.assert_close(network.rollout(state, torch.zeros(2, 6, SIZE).double(), plan)[0], drawn)
+
+
+def test_long_free_runs_stay_finite():
+    network = NETWORKS["several"]
+    drawn, _ = network.sample(warm(network), 300, generator(), temperature=2.0)
+    assert bool(torch.isfinite(drawn).all())
+
+
+def test_a_loaded_density_offers_what_its_network_does():
+    density = tiny_density()
+    state = density.starts.state.pick(torch.tensor([0, 2]))
+    draws = noise(2, 4)
+    plan = density.plan(state, draws)
+    frames, scores = density.rollout(state, draws, plan)
+    torch.testing.assert_close((frames, scores), density.reference.rollout(state, draws, plan))
+    after = density.advance(state, frames)
+    assert isinstance(after, LstmState)
+    torch.testing.assert_close(after.previous, frames[:, -1])
+    assert density.log_prob(frames, state).shape == (2, 4)
+    assert density.abilities.slowest < density.abilities.fastest
+    assert len(density.starts.names) == len(density.starts.speed) == density.starts.state.batch == 4

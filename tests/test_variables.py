@@ -1,0 +1,121 @@
+"""Unknowns to trials, and the objective over them."""
+
+import pytest
+import torch
+from catalogue import excite
+from helpers import corpus, finite_difference, generator, noise, tiny_model, walk
+
+from mapctl.features import LAYOUT, Place
+from mapctl.protocols import Plan
+from mapctl.solver.objective import Objective
+from mapctl.solver.variables import Context, Latents, States
+from mapctl.terms import Footing, Likelihood, Noise, Seam
+
+FRAMES, SIZE = 7, LAYOUT.continuous
+
+
+def network():
+    model = tiny_model(dtype=torch.float64)
+    excite(model, 0)
+    return model
+
+
+def context(model):
+    """After some frames of a walk, facing anywhere."""
+    seen = corpus().clips()[0][None, :30].double()
+    state = model.advance(model.initial_state(seen[:, 0]), seen[:, 1:])
+    place = Place(torch.tensor([1.0, -2.0]).double(), torch.tensor(0.8).double())
+    return Context(model, state, place, walk(10).joint_positions(), FRAMES)
+
+
+MODEL = network()
+CONTEXT = context(MODEL)
+
+
+def states():
+    """The states' unknowns around a stretch of a walk."""
+    features = corpus().clips()[0][None, 30 : 30 + FRAMES].double()
+    bits = LAYOUT.pick(features, "contacts") > 0.5
+    return features, States(CONTEXT, MODEL.std[:SIZE], MODEL.mean[:SIZE], bits)
+
+
+def slope(function, at, direction):
+    leaf = at.clone().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(function(leaf), leaf)
+    return float((gradient * direction).sum())
+
+
+def test_latents_build_the_rollout_of_their_plan():
+    draws = noise(3, FRAMES, dtype=torch.float64)
+    latents = Latents.planned(CONTEXT, draws.flatten(1))
+    trial = latents.build(draws.flatten(1))
+    features, density = MODEL.rollout(CONTEXT.state.repeat(3), draws, latents.plan)
+    torch.testing.assert_close((trial.features, trial.log_density), (features, density))
+    torch.testing.assert_close(trial.noise, draws)
+    assert torch.equal(trial.contacts, LAYOUT.pick(features, "contacts") > 0.5)
+    assert trial.start is CONTEXT.place
+    assert trial.before is CONTEXT.before
+
+
+def test_one_plan_serves_many_candidates():
+    draws = noise(3, FRAMES, dtype=torch.float64)
+    plan = Latents.planned(CONTEXT, draws[:1].flatten(1)).plan
+    together = Latents(CONTEXT, plan).build(draws.flatten(1))
+    assert isinstance(plan, Plan)
+    for row in range(3):
+        alone = Latents(CONTEXT, plan).build(draws[row : row + 1].flatten(1))
+        torch.testing.assert_close(together.features[row], alone.features[0])
+
+
+def test_states_build_their_own_features_and_teacher_forced_density():
+    features, variables = states()
+    trial = variables.build(variables.from_features(features))
+    torch.testing.assert_close(trial.features, features, atol=1e-9, rtol=0)
+    torch.testing.assert_close(trial.log_density, MODEL.log_prob(features, CONTEXT.state))
+    assert float(trial.noise.abs().max()) == 0
+
+
+def test_the_input_noise_of_states_is_in_units_of_the_papers_sigma():
+    features, variables = states()
+    unknowns = variables.from_features(features)
+    half = unknowns.shape[1] // 2
+    unknowns[:, half:] = noise(1, FRAMES, dtype=torch.float64).flatten(1)
+    trial = variables.build(unknowns)
+    seen = features.clone()
+    seen[..., :SIZE] += 0.05 * MODEL.std[:SIZE] * unknowns[:, half:].unflatten(-1, (FRAMES, SIZE))
+    torch.testing.assert_close(trial.features, features, atol=1e-9, rtol=0)
+    torch.testing.assert_close(trial.log_density, MODEL.log_prob(features, CONTEXT.state, inputs=seen))
+
+
+@pytest.mark.parametrize("kind", ["latents", "states"])
+def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences(kind):
+    if kind == "latents":
+        unknowns = 0.5 * noise(2, FRAMES, dtype=torch.float64).flatten(1)
+        objective = Objective(Latents.planned(CONTEXT, unknowns).build, (Noise(), Footing(), Seam()))
+    else:
+        features, variables = states()
+        unknowns = variables.from_features(features)
+        unknowns = unknowns + 0.1 * torch.randn(unknowns.shape, generator=generator(), dtype=torch.float64)
+        objective = Objective(variables.build, (Likelihood(), Noise(), Footing()))
+    energy, gradient = objective.energy_and_gradient(unknowns)
+    direction = torch.randn(unknowns.shape, generator=generator(4), dtype=torch.float64)
+    difference = finite_difference(lambda x: objective.energy(x).sum(), unknowns, direction)
+    assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-5)
+    torch.testing.assert_close(energy, objective.energy(unknowns))
+    assert not energy.requires_grad
+    assert not unknowns.requires_grad
+
+
+def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
+    unknowns = noise(1, FRAMES, dtype=torch.float64).flatten(1)
+    terms = (Noise(), Footing(), Seam())
+    objective = Objective(Latents.planned(CONTEXT, unknowns).build, terms)
+    ledger = objective.ledger_of(objective.build(unknowns))
+    assert [(e.name, e.unit) for e in ledger.entries] == [(t.name, t.unit) for t in terms]
+    total = sum(entry.energy.sum() for entry in ledger.entries)
+    torch.testing.assert_close(total, objective.energy(unknowns)[0])
+    joined = ledger.slice(3).join(ledger)
+    assert all(len(entry.energy) == len(entry.residual) == 3 + FRAMES for entry in joined.entries)
+    row = joined.summary()["noise"]
+    assert row["energy_nats"] == pytest.approx(float(joined.entries[0].energy.sum()))
+    assert row["residual_mean"] <= row["residual_p95"] <= row["residual_max"]

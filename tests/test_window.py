@@ -1,0 +1,194 @@
+"""Windows: each lowers its energy, together they are one motion, and limits hold."""
+
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator, tiny_density, tiny_model
+
+from controllers.starting import choose_start
+from mapctl import curves
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, root_places
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.methods import LatentMethod, StateMethod
+from mapctl.solver.objective import Objective
+from mapctl.solver.proposals import BestOf, SteeringKnots, Swarm
+from mapctl.solver.result import Outcome
+from mapctl.solver.swarm import SwarmSettings
+from mapctl.solver.variables import Context, Latents
+from mapctl.solver.window import WindowSettings, WindowSolver
+from mapctl.terms import Footing, Likelihood, Noise, Path
+
+DENSITY = tiny_density()
+CURVE = curves.circle(radius=2.0)
+SHORT = WindowSettings(frames=10, overlap=4, past=12)
+METHOD = LatentMethod(rounds=2, budget=Budget(evaluations=12))
+ARCS = 0.04 * torch.arange(80, dtype=torch.float64)
+
+
+def terms_of(first, frames):
+    return Noise(), Path(CURVE, ARCS[first : first + frames]), Footing()
+
+
+def start(seed=0):
+    found = choose_start(DENSITY, CURVE, ARCS, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator(seed))
+    return found.committed
+
+
+BEGUN = start()
+
+
+def solver(method=METHOD, density=DENSITY, settings=SHORT):
+    return WindowSolver(density, settings, method=method)
+
+
+def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
+    return solver(method, density).solve(BEGUN, terms_of, frames, generator=generator(seed), **limits)
+
+
+def context(committed):
+    return Context(DENSITY, committed.state, committed.place, committed.joints_world, SHORT.frames)
+
+
+METHODS = {
+    "zero start": METHOD,
+    "best of": replace(METHOD, proposal=BestOf(count=4)),
+    "swarm": replace(METHOD, proposal=Swarm(SwarmSettings(particles=4, iterations=1))),
+    "states": StateMethod(DENSITY.feature_std[: LAYOUT.continuous], DENSITY.feature_mean[: LAYOUT.continuous],
+                          budget=Budget(evaluations=12)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_window_ends_lower_than_it_began_within_its_budget(name):
+    terms = (*terms_of(1, SHORT.frames), Likelihood())
+    begun = BEGUN
+    solved = METHODS[name](context(begun), terms, begun.tail, generator())
+    assert solved.energy < solved.start_energy
+    assert solved.evaluations <= 12
+    assert sum(float(e.energy.sum()) for e in solved.ledger.entries) == pytest.approx(solved.energy, rel=1e-4)
+    assert solved.carry.shape[0] == SHORT.frames
+    assert not solved.trial.features.requires_grad
+
+
+@pytest.mark.parametrize("method", [METHOD, METHODS["states"]], ids=["latents", "states"])
+def test_windows_join_without_a_seam(method):
+    done, outcome = solve(21, method=method)
+    assert outcome is Outcome.DONE
+    assert len(done.features) == 21
+    assert [record.frames for record in done.windows] == [6, 6, 6, 2]
+    begun = BEGUN
+    ground, heading = root_places(done.features[1:], begun.place)
+    torch.testing.assert_close((done.place.position_xz, done.place.heading), (ground[-1], heading[-1]))
+    expected = DENSITY.advance(begun.state, done.features[None, 1:])
+    for part in ("previous", "hidden", "cell"):
+        torch.testing.assert_close(getattr(done.state, part), getattr(expected, part))
+    assert all(len(entry.energy) == 20 for entry in done.ledger.entries)
+    assert done.joints_world.shape == (SHORT.past, 21, 3)
+    torch.testing.assert_close(done.joints_world[-1, 0, ::2], ground[-1], atol=1e-5, rtol=1e-5)
+
+
+def test_the_next_window_starts_from_the_last_ones_tail():
+    done, _ = solve(7)
+    assert done.tail.shape == (4, LAYOUT.continuous)
+    spent = LatentMethod(rounds=1, budget=Budget(evaluations=0))(context(done), terms_of(7, 10), done.tail, generator())
+    torch.testing.assert_close(spent.carry[:4], done.tail)
+    assert float(spent.carry[4:].abs().max()) == 0
+
+
+def test_solving_follows_the_curve_better_than_not_solving():
+    errors = []
+    for budget in (0, 30):
+        done, _ = solve(31, method=LatentMethod(budget=Budget(evaluations=budget)))
+        ground, _ = root_places(done.features[1:], BEGUN.place)
+        errors.append(float((ground - CURVE.point(ARCS[1:31]).float()).norm(dim=-1).mean()))
+    assert errors[1] < 0.8 * errors[0]
+
+
+@pytest.mark.parametrize("name", ["zero start", "swarm"])
+def test_the_same_seed_gives_the_same_bits(name):
+    first, second = (solve(14, method=METHODS[name], seed=3)[0] for _ in range(2))
+    assert torch.equal(first.features, second.features)
+
+
+def test_other_seeds_search_elsewhere():
+    first, second = (solve(14, method=METHODS["best of"], seed=seed)[0] for seed in (1, 2))
+    assert not torch.equal(first.features, second.features)
+
+
+def test_every_window_keeps_its_budget_and_progress_is_told():
+    told = []
+    done, _ = solve(20, progress=lambda now, total: told.append((now, total)))
+    assert all(record.evaluations <= 12 for record in done.windows)
+    assert all(record.energy <= record.start_energy for record in done.windows)
+    assert told == [(7, 20), (13, 20), (19, 20), (20, 20)]
+
+
+def test_a_deadline_stops_with_what_there_is():
+    done, outcome = solve(20, deadline=time.monotonic() - 1)
+    assert outcome is Outcome.BUDGET
+    assert len(done.features) == 1
+    late = time.monotonic() + 0.2
+    done, outcome = solve(80, method=LatentMethod(budget=Budget(evaluations=200)), deadline=late)
+    assert outcome is Outcome.BUDGET
+    assert time.monotonic() - late < 5
+    assert 1 < len(done.features) < 80
+    assert len(done.ledger.entries[0].energy) == len(done.features) - 1
+
+
+def broken(after):
+    """A density that answers NaN from its window number `after` on."""
+    model = tiny_model()
+    rollout, advance, windows = model.rollout, model.advance, [0]
+
+    def counting(state, committed):
+        windows[0] += 1
+        return advance(state, committed)
+
+    def failing(state, noise, plan):
+        features, density = rollout(state, noise, plan)
+        return (features * torch.nan, density * torch.nan) if windows[0] >= after else (features, density)
+
+    model.advance, model.rollout = counting, failing
+    return model
+
+
+@pytest.mark.parametrize("after", [0, 2])
+def test_a_density_that_breaks_down_ends_the_solve_with_the_finite_frames(after):
+    done, outcome = solve(20, density=broken(after))
+    assert outcome is Outcome.NOT_FINITE
+    assert len(done.features) == 1 + 6 * after
+    for values in (done.features, done.state.hidden, done.joints_world, done.place.position_xz):
+        assert bool(torch.isfinite(values).all())
+    assert all(len(entry.energy) == 6 * after for entry in done.ledger.entries)
+
+
+@pytest.mark.parametrize("settings", [{"frames": 10, "overlap": 10}, {"overlap": -1}, {"past": 0}])
+def test_windows_that_never_advance_are_refused(settings):
+    with pytest.raises(RequestError, match="windows need"):
+        WindowSettings(**settings)
+
+
+def test_steering_knots_are_linear_in_time_and_touch_only_their_blocks():
+    space = SteeringKnots(knots=3)
+    values = torch.randn(2, space.size(), generator=generator())
+    dense = space.expand(values, 9)
+    knots = values.unflatten(-1, (3, -1))
+    columns = [*range(*LAYOUT.slices["root_displacement_heading"].indices(99)), LAYOUT.slices["heading_change"].start]
+    torch.testing.assert_close(dense[:, [0, 4, 8]][..., columns], knots)
+    torch.testing.assert_close(dense[:, 2][..., columns], knots[:, :2].mean(1))
+    others = [i for i in range(LAYOUT.continuous) if i not in columns]
+    assert float(dense[..., others].abs().max()) == 0
+
+
+def test_the_warm_start_is_among_the_candidates():
+    begun, terms = BEGUN, terms_of(1, SHORT.frames)
+    zero = torch.zeros(1, SHORT.frames * LAYOUT.continuous)
+    plain = Objective(Latents.planned(context(begun), zero).build, terms).energy(zero)
+    for name in ("best of", "swarm"):
+        method = replace(METHODS[name], rounds=1, budget=Budget(evaluations=100))
+        solved = method(context(begun), terms, begun.tail, generator())
+        assert solved.start_energy <= float(plain) + 1e-3
