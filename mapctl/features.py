@@ -1,7 +1,7 @@
 """State features of the prior: what of a motion is left when place and heading are taken away.
 
-rnn paper, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change, the root
-height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation vectors
+rnn paper, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change, the
+root height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation vectors
 about the canonical T-pose stand in for the paper's Euler angles, whose wraps real rigs sit near.
 """
 

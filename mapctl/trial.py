@@ -65,7 +65,7 @@ class Trial:
         return self.joints_world[..., self.skeleton.index(name), :]
 
     def step(self, joint: int) -> Float[Tensor, "batch frames 3"]:
-        """Displacement of a joint since the frame before, metres; the first frame's is from the past, if there is one."""
+        """Displacement of a joint since the frame before, metres; the first frame's needs a past, or is 0."""
         places = self.joints_world[..., joint, :]
         past = self.before[-1:, joint].to(places.dtype) if len(self.before) else places[:, :1].detach()
         return torch.diff(places, dim=-2, prepend=past.expand(len(places), 1, 3))

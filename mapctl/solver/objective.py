@@ -1,7 +1,7 @@
 """The MAP objective of one window: unknowns to a trial, terms to energies, autograd to the gradient (Eq. 19).
 
-The density offers a rollout (and, on the fast path, its hand-written pullback behind autograd); a term offers an energy on
-the trial's quantities. No piece here knows a network, and no network knows a term.
+The density offers a rollout (and, on the fast path, its hand-written pullback behind autograd); a term offers an energy
+on the trial's quantities. No piece here knows a network, and no network knows a term.
 """
 
 from collections.abc import Callable, Sequence

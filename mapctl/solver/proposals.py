@@ -1,7 +1,8 @@
 """Where L-BFGS starts in a window: the last solution's tail, the best of random draws, or a particle swarm.
 
 A swarm over all the noise of a window (34 x 66 numbers) gains nothing over zero noise (design, section 11.5). Here it
-searches a few numbers that steer: the root's noise (sideways, forward, turn) at a handful of time knots, joined linearly.
+searches a few numbers that steer: the root's noise (sideways, forward, turn) at a handful of time knots, joined
+linearly.
 """
 
 from collections.abc import Callable, Sequence

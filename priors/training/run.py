@@ -1,4 +1,4 @@
-"""`mapctl train lstm-gmm`: from a folder of BVH to a run folder with checkpoints, a training curve and a loadable prior."""
+"""`mapctl train lstm-gmm`: from a folder of BVH to a run folder with checkpoints, a curve and a loadable prior."""
 
 import json
 import math
@@ -94,7 +94,7 @@ def _card(
             "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
             "match": request.match, "split_seed": request.settings.seed, "starts": list(starts),
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
-    training = {"settings": asdict(request.settings), "curve": curve}
+    training = {"command": command(request), "settings": asdict(request.settings), "curve": curve}
     quality = {"test_nats_per_frame": validation_nats(model, parts.test), "mocap": _mocap(parts),
                "data": summary(parts.train.features)}  # fmt: skip
     return checkpoints.Card(
@@ -103,10 +103,19 @@ def _card(
     )  # fmt: skip
 
 
+def command(request: TrainRequest) -> str:
+    """What to type for the same run, for the card; options that are the defaults are left out."""
+    plain, parts = TrainingSettings(), [f"mapctl train lstm-gmm --data DATA -o RUN --match '{request.match}'"]
+    parts += [f"--width {request.config.width}"]
+    wanted, default = asdict(request.settings), asdict(plain)
+    parts += [f"--{name} {wanted[name]}" for name in ("steps", "batch", "window", "seed") if wanted[name] != default[name]]
+    return " ".join(parts) + (" --paper" if request.config.retain == 0 else "")
+
+
 def _mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
     """What the clips kept from training show in every measure: mean, 2nd and 98th percentile (NaN left out)."""
     held = [decode(clip, Place.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
-    table = {name: asdict(spread) for name, spread in reference(held).items()}
+    table = {name: spread._asdict() for name, spread in reference(held).items()}
     return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
 
 
