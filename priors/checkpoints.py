@@ -89,7 +89,7 @@ def bundled() -> list[str]:
 def locate(name: str) -> Path:
     """The safetensors file of a bundled name, of a path, or of a training run's folder."""
     path = Path(name)
-    for candidate in (path, path / "model.safetensors", path.with_suffix(".safetensors")):
+    for candidate in (path, path / "model.safetensors", Path(f"{name}.safetensors")):
         if candidate.is_file() and candidate.suffix == ".safetensors":
             return candidate
     if name in bundled():

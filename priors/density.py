@@ -91,13 +91,14 @@ def load(name: str) -> LstmGmmDensity:
     tensors, card = checkpoints.load(path)
     if card.kind != "lstm-gmm":
         raise CheckpointError(f"{path}: a {card.kind} is no density")
-    starts = Starts(
-        LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
-        tensors.pop("starts.speed"), tuple(card.data["starts"]),
-    )  # fmt: skip
-    model = LstmGmm(LstmGmmConfig(**card.config), mean=tensors["mean"], std=tensors["std"])
     try:
+        starts = Starts(
+            LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
+            tensors.pop("starts.speed"), tuple(card.data["starts"]),
+        )  # fmt: skip
+        Abilities(**card.abilities)
+        model = LstmGmm(LstmGmmConfig(**card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise CheckpointError(f"{path}: its tensors do not fit its card ({error})") from error
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
     return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)

@@ -153,15 +153,16 @@ class LstmGmm(nn.Module):
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """Frames drawn one after the other (section 4.1.4); temperature scales the Gaussians' spread."""
-        drawn = []
+        drawn, device = [], self.mean.device
         with torch.no_grad():
             for _ in range(frames):
                 mixture, state = self._step(state)
-                weights = mixture.log_weight.exp()
-                component = torch.multinomial(weights, 1, generator=generator)[:, 0]
-                noise = temperature * torch.randn(len(weights), self.layout.continuous, generator=generator)
+                # Random numbers come from the CPU's generator wherever the network is.
+                weights = mixture.log_weight.exp().cpu()
+                component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
+                noise = temperature * torch.randn(len(weights), self.layout.continuous, generator=generator).to(device)
                 odds = torch.sigmoid(mixture.contact_logit)
-                bits = torch.rand(odds.shape, generator=generator) < odds
+                bits = torch.rand(odds.shape, generator=generator).to(device) < odds
                 state = LstmState(self._compose(mixture, component, noise, bits)[0], state.hidden, state.cell)
                 drawn.append(state.previous)
         return torch.stack(drawn, dim=1), state

@@ -23,6 +23,8 @@ from mapctl.formats.atomic import atomic_path
 TRAINING_FPS = Fraction(30)
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
+SHORTEST = 75
+"""Frames that the longest clip of each part must have at least: free runs and starts warm up on it, 2.5 s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +62,21 @@ class Split:
 
 
 def split(corpus: Corpus, seed: int) -> Split:
-    """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part."""
+    """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part.
+
+    RequestError for fewer than 3 clips, or where a part has only clips too short to warm up on.
+    """
     count = len(corpus.names)
     if count < 3:
         raise RequestError(f"training needs at least 3 clips, got {count}")
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
     held = max(1, round(0.05 * count))
     parts = order[2 * held :], order[:held], order[held : 2 * held]
+    for part in parts:
+        if (longest := max(corpus.lengths[i] for i in part)) < SHORTEST:
+            raise RequestError(
+                f"training and held-out clips must reach {SHORTEST} frames at 30 fps, got {longest} at most"
+            )
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
 
@@ -78,7 +88,11 @@ def read(
     Clips that cannot be read or fit no known rig raise, naming the file. `skip_first` drops frame 0 (the T-pose of
     CMU takes).
     """
-    files = [f for f in sorted(data.rglob("*.bvh")) if re.search(match, f.relative_to(data).as_posix())]
+    try:
+        pattern = re.compile(match)
+    except re.error as error:
+        raise RequestError(f"match must be a regular expression, got {match!r} ({error})") from error
+    files = [f for f in sorted(data.rglob("*.bvh")) if pattern.search(f.relative_to(data).as_posix())]
     if not files:
         raise RequestError(f"no .bvh below {data} matches {match!r}")
     key = _fingerprint(data, files, skip_first)
@@ -102,8 +116,8 @@ def clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size
     motion = load(file)
     if skip_first and motion.num_frames > 2:
         motion = motion.slice(1, motion.num_frames)
-    canonical, _ = retarget.to_canonical(motion)
     try:
+        canonical, _ = retarget.to_canonical(motion)
         return encode(canonical.resample(TRAINING_FPS))[0].float()
     except MapctlError as error:
         raise MapctlError(f"{file}: {error}") from error

@@ -17,7 +17,7 @@ def free_run(
 ) -> dict[str, float]:
     """Speed, height and pose variation of free runs, each as a ratio to the corpus, and the slowest run's last speed.
 
-    Runs begin in the middle of clips; their first ten seconds are not counted.
+    Runs begin after the first two seconds of clips; their first ten seconds are not counted.
     """
     clips = [clip for clip in corpus.clips() if len(clip) > 60]
     clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]

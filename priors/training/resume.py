@@ -43,7 +43,7 @@ def load(run: Path, trainer: Trainer) -> list[dict[str, float]]:
     try:
         index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
         tensors = load_file(run / index["tensors"])
-    except (OSError, ValueError, KeyError, SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{run}: no readable checkpoint ({error})") from error
     for part, ours in (("settings", trainer.settings), ("config", trainer.model.config)):
         changed = [

@@ -44,7 +44,8 @@ def abilities(corpus: Corpus) -> Abilities:
         speeds.append(pace)
         turns.append(turn.abs()[pace[_SECOND:] > 0.5])
     speeds, turns = torch.cat(speeds), torch.cat(turns)
-    return Abilities(float(speeds.quantile(0.01)), float(speeds.quantile(0.99)), float(turns.quantile(0.995)))
+    turn_rate = float(turns.quantile(0.995)) if len(turns) else 0.0  # nobody may walk in the data
+    return Abilities(float(speeds.quantile(0.01)), float(speeds.quantile(0.99)), turn_rate)
 
 
 def speed(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch"]:

@@ -1,0 +1,152 @@
+"""Weights on disk: they come back, and whatever does not fit is refused in one line."""
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import tiny_density
+
+import priors
+from mapctl.errors import CheckpointError
+from mapctl.features import LAYOUT
+from priors import checkpoints
+from priors.checkpoints import Card
+
+DENSITY = tiny_density()
+
+
+def write(folder: Path, *, card: Card = DENSITY.card, drop: str = "", half: bool = False) -> Path:
+    """The tiny density as a training run leaves it."""
+    state = DENSITY.starts.state
+    tensors = dict(DENSITY.reference.state_dict())
+    tensors |= {"starts.previous": state.previous, "starts.hidden": state.hidden, "starts.cell": state.cell}
+    tensors |= {"starts.speed": DENSITY.starts.speed}
+    tensors.pop(drop, None)
+    checkpoints.save(tensors, card, folder / "model.safetensors", half=half)
+    return folder / "model.safetensors"
+
+
+def refused(path, *, match):
+    with pytest.raises(CheckpointError, match=match) as caught:
+        priors.load(str(path))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_weights_and_card_come_back(tmp_path, half):
+    path = write(tmp_path, half=half)
+    tensors, card = checkpoints.load(path)
+    assert card == DENSITY.card
+    for name, value in DENSITY.reference.state_dict().items():
+        assert tensors[name].dtype is torch.float32
+        exact = not half or name in ("mean", "std")
+        torch.testing.assert_close(tensors[name], value, rtol=0 if exact else 1e-3, atol=0 if exact else 1e-6)
+
+
+@pytest.mark.parametrize("named", ["file", "folder", "stem"])
+def test_a_prior_is_found_by_file_folder_or_stem(tmp_path, named):
+    path = write(tmp_path)
+    asked = {"file": path, "folder": tmp_path, "stem": path.with_suffix("")}[named]
+    loaded = priors.load(str(asked))
+    assert loaded.starts.names == DENSITY.starts.names
+    torch.testing.assert_close(loaded.starts.state.hidden, DENSITY.starts.state.hidden)
+    frames = DENSITY.starts.state.previous[:1].expand(3, -1)[None]
+    state = DENSITY.starts.state.pick(torch.tensor([0]))
+    torch.testing.assert_close(loaded.log_prob(frames, state), DENSITY.log_prob(frames, state))
+    assert loaded.abilities == DENSITY.abilities
+    assert not any(p.requires_grad for p in loaded.reference.parameters())
+
+
+def test_another_layout_is_refused_with_both_printed(tmp_path):
+    other = [["root", 7], ["contacts", 2]]
+    path = write(tmp_path, card=replace(DENSITY.card, layout=other, fingerprint="0123456789ab"))
+    message = refused(path, match="its features are")
+    assert str(other) in message
+    assert str([list(block) for block in LAYOUT.blocks]) in message
+
+
+@pytest.mark.parametrize(("changes", "match"), [
+    ({"kind": "refiner"}, "a refiner is no density"),
+    ({"config": {**DENSITY.card.config, "width": 9}}, "do not fit its card"),
+    ({"config": {**DENSITY.card.config, "depth": 3}}, "do not fit its card"),
+    ({"config": {**DENSITY.card.config, "width": "wide"}}, "do not fit its card"),
+    ({"data": {}}, "do not fit its card"),
+    ({"abilities": {"fastest": 1.0}}, "do not fit its card"),
+])  # fmt: skip
+def test_a_card_that_does_not_fit_is_refused(tmp_path, changes, match):
+    refused(write(tmp_path, card=replace(DENSITY.card, **changes)), match=match)
+
+
+@pytest.mark.parametrize("missing", ["out.bias", "mean", "starts.hidden"])
+def test_missing_tensors_are_refused(tmp_path, missing):
+    refused(write(tmp_path, drop=missing), match="do not fit its card")
+
+
+@pytest.mark.parametrize("content", [b"", b"\x08" + b"\0" * 20, b"not safetensors", "cut"], ids=repr)
+def test_a_broken_file_is_refused(tmp_path, content):
+    path = write(tmp_path)
+    path.write_bytes(path.read_bytes()[:-100] if content == "cut" else content)
+    refused(path, match="no readable safetensors file")
+
+
+@pytest.mark.parametrize("content", ["", "[1]", "{}", "{", '"card"', b"\xff\xfe"], ids=repr)
+def test_a_broken_card_is_refused(tmp_path, content):
+    path = write(tmp_path)
+    path.with_suffix(".json").write_bytes(content if isinstance(content, bytes) else content.encode())
+    refused(path, match="no readable card")
+
+
+def test_a_missing_card_is_refused(tmp_path):
+    path = write(tmp_path)
+    path.with_suffix(".json").unlink()
+    refused(path, match="no readable card")
+
+
+class Trap:
+    """Unpickling it writes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_nothing_is_unpickled(tmp_path):
+    path, sprung = write(tmp_path), tmp_path / "sprung"
+    path.write_bytes(pickle.dumps(Trap(sprung)))
+    refused(path, match="no readable safetensors file")
+    torch.save(Trap(sprung), path)
+    refused(path, match="no readable safetensors file")
+    assert not sprung.exists()
+
+
+@pytest.mark.parametrize("name", ["no-such-prior", "", ".", "..", "/", "a/b.txt"])
+def test_an_unknown_name_is_answered_with_the_bundled_ones(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused(name, match="no prior")
+
+
+def test_a_failed_save_leaves_the_old_weights(tmp_path):
+    path = write(tmp_path)
+    before = path.read_bytes()
+    tied = torch.zeros(4)
+    with pytest.raises(RuntimeError):
+        checkpoints.save({"a": tied, "b": tied}, DENSITY.card, path, half=False)
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.json", "model.safetensors"]
+
+
+def test_the_card_is_plain_json(tmp_path):
+    card = json.loads(write(tmp_path).with_suffix(".json").read_text("utf-8"))
+    assert card["fingerprint"] == LAYOUT.fingerprint()
+    assert card["layout"] == [list(block) for block in LAYOUT.blocks]
+
+
+def test_half_precision_error_is_relative():
+    assert checkpoints.half_precision_error({"a": torch.tensor([1.0, 2.0])}) == 0
+    assert checkpoints.half_precision_error({"a": torch.tensor([1.0 + 2**-12])}) == pytest.approx(2**-12, rel=1e-2)
