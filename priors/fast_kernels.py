@@ -99,6 +99,30 @@ def affine(weight, bias, x, out):
 
 
 @_inner
+def affine_pullback(weight, transposed, nothing, gradient, out):
+    """out = gradient weight over the first columns of out, from `weight` or its transposed copy.
+
+    One particle reads the weights that its rollout has just left in cache, 8 rows at a time; for several, arithmetic
+    counts, and products with the copy have more of it in registers. `nothing` is a zero bias.
+    """
+    rows, columns = weight.shape
+    if len(gradient) > 1:
+        affine(transposed, nothing, gradient, out)
+        return
+    d, total = gradient[0], out[0, :columns]
+    for k in range(columns):
+        total[k] = _ZERO
+    for r in range(0, rows, 8):
+        w0, w1, w2, w3 = weight[r], weight[r + 1], weight[r + 2], weight[r + 3]
+        w4, w5, w6, w7 = weight[r + 4], weight[r + 5], weight[r + 6], weight[r + 7]
+        d0, d1, d2, d3, d4, d5, d6, d7 = d[r], d[r + 1], d[r + 2], d[r + 3], d[r + 4], d[r + 5], d[r + 6], d[r + 7]
+        for k in range(columns):
+            low = (d0 * w0[k] + d1 * w1[k]) + (d2 * w2[k] + d3 * w3[k])
+            high = (d4 * w4[k] + d5 * w5[k]) + (d6 * w6[k] + d7 * w7[k])
+            total[k] += low + high
+
+
+@_inner
 def copy(source, target, at):
     """target[:, at:] = source. Written out: numba takes seconds to compile it as slices."""
     for b in range(len(source)):
@@ -324,7 +348,7 @@ def compose_pullback(settings, tape, noise, t, d_feature, d_density, d_frame, d_
 
 @_entry
 def backward(
-    transposed, nothing, settings, tape, noise, component, d_feature, d_density,
+    weights, transposed, nothing, settings, tape, noise, component, d_feature, d_density,
     d_noise, d_frame, d_input, d_cell,
 ):  # fmt: skip
     """Pullback of `forward` by back-propagation through time: fills d_noise.
@@ -339,20 +363,21 @@ def backward(
     for t in range(noise.shape[1] - 1, -1, -1):
         compose_pullback(settings, tape, noise, t, d_feature, d_density, d_frame, d_noise, d_head)
         for b in range(batch):
-            affine(transposed.head[component[b, t]], nothing, d_head[b : b + 1], d_third[b : b + 1])
+            k, row = component[b, t], slice(b, b + 1)
+            affine_pullback(weights.head[k], transposed.head[k], nothing, d_head[row], d_third[row])
         relu_pullback(d_third, tape.third[t], width)
-        affine(transposed.fc3, nothing, d_third, d_above)
+        affine_pullback(weights.fc3, transposed.fc3, nothing, d_third, d_above)
         for layer in (1, 0):
             above = d_above if layer == 1 else d_input[1]
             lstm_cell_pullback(
                 above, d_input[layer], d_cell[layer], tape.gates[t, layer], tape.cell[t, layer],
                 tape.tanh_cell[t, layer], d_gates,
             )  # fmt: skip
-            affine(transposed.lstm[layer], nothing, d_gates, d_input[layer])
+            affine_pullback(weights.lstm[layer], transposed.lstm[layer], nothing, d_gates, d_input[layer])
         relu_pullback(d_input[0], tape.lstm_input[t, 0], width)
-        affine(transposed.fc2, nothing, d_input[0], d_third)
+        affine_pullback(weights.fc2, transposed.fc2, nothing, d_input[0], d_third)
         relu_pullback(d_third, tape.first[t], width)
-        affine(transposed.fc1, nothing, d_third, d_before)
+        affine_pullback(weights.fc1, transposed.fc1, nothing, d_third, d_before)
         for b in range(batch):
             for j in range(d_frame.shape[1]):
                 d_frame[b, j] += d_before[b, j]

@@ -147,7 +147,7 @@ def pack(model: LstmGmm) -> tuple[Layers, Layers]:
 
 
 def transpose(weights: Layers) -> Layers:
-    """Copies with the last two axes exchanged: a pullback's products then read memory as a rollout's do."""
+    """Copies with the last two axes exchanged, for pullbacks of several particles at once."""
     return Layers(*(np.ascontiguousarray(weight.swapaxes(-1, -2)) for weight in weights))
 
 

@@ -137,7 +137,7 @@ class FastRollout:
         d_noise, d_frame = np.empty_like(run.noise), np.zeros_like(run.tape.frame[0])
         d_input, d_cell = np.zeros_like(run.tape.lstm_input[0]), np.zeros_like(run.tape.cell[0])
         self._kernels.backward(
-            self._transposed, self._no_bias, self._settings, run.tape, run.noise, run.choices.component,
+            self._weights, self._transposed, self._no_bias, self._settings, run.tape, run.noise, run.choices.component,
             _rows(_array(d_features), rows), _rows(_array(d_density), rows),
             d_noise, d_frame, d_input, d_cell,
         )  # fmt: skip

@@ -18,9 +18,7 @@ CASES = [(7, 1, 5), (64, 3, 5), (64, 8, 1), (33, 5, 4), (256, 1, 5)]  # width, b
 FRAMES = 12
 
 
-def make(
-    width: int, batch: int, components: int = 5, *, frames: int = FRAMES, kind: torch.dtype = torch.float32
-):
+def make(width: int, batch: int, components: int = 5, *, frames: int = FRAMES, kind: torch.dtype = torch.float32):
     """A random network, livelier than a fresh one so that components, bits, clamps vary; state and noise."""
     generator = torch.Generator().manual_seed(width + batch)
     size = LstmGmm(LstmGmmConfig(width=1), mean=torch.zeros(68), std=torch.ones(68)).layout.size
@@ -64,9 +62,7 @@ def test_rollout_and_pullback_agree_with_the_reference(width, batch, components)
 def test_long_window_of_any_plan_agrees_in_energy_and_gradient():
     model, state, noise = make(40, 2, frames=100)
     generator = torch.Generator().manual_seed(1)
-    plan = Plan(
-        torch.randint(5, (2, 100), generator=generator), torch.rand(2, 100, 2, generator=generator) < 0.5
-    )
+    plan = Plan(torch.randint(5, (2, 100), generator=generator), torch.rand(2, 100, 2, generator=generator) < 0.5)
     assert plan.component.unique().numel() == 5
     for ours, theirs in zip(
         gradients(FastRollout(model), state, noise, plan), gradients(model, state, noise, plan), strict=True
@@ -90,9 +86,7 @@ def _functional(model: LstmGmm, state: LstmState, noise: torch.Tensor, plan: Pla
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         parts = model.rollout(state, noise, plan)
-        return float(
-            sum((part * torch.randn(part.shape, generator=generator).to(part)).sum() for part in parts)
-        )
+        return float(sum((part * torch.randn(part.shape, generator=generator).to(part)).sum() for part in parts))
 
 
 @pytest.mark.parametrize(("width", "batch", "components"), CASES)
