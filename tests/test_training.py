@@ -1,0 +1,217 @@
+"""The training command on five synthetic clips: it learns, resumes to the bit, and leaves a loadable prior."""
+
+from dataclasses import asdict, replace
+from functools import partial
+
+import pytest
+import torch
+from helpers import corpus, generator, walk, write_corpus
+
+import priors
+from mapctl.errors import CheckpointError, MapctlError, RequestError
+from mapctl.features import LAYOUT, encode, mirror_features
+from priors.lstm_gmm import LstmGmmConfig
+from priors.training import corpus as corpora
+from priors.training import health, run, starts
+from priors.training.lstm_gmm import PAPER, Trainer, TrainingSettings, statistics
+from priors.training.run import TrainRequest, train
+
+TINY = LstmGmmConfig(width=8, components=2)
+SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_corpus(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(autouse=True)
+def short_free_runs(monkeypatch):
+    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+
+
+def request_in(out, data, **changes):
+    """Checkpoints at every step, so that a kill can come anywhere."""
+    settings = replace(SETTINGS, **changes.pop("settings", {}))
+    return TrainRequest(data, out, config=TINY, settings=settings, device="cpu", checkpoint_minutes=0.0,
+                        report_steps=1, validate_steps=2, starts=4, **changes)  # fmt: skip
+
+
+class Killed(Exception):
+    pass
+
+
+def killer(step):
+    """Progress that ends the run when a step is reported."""
+
+    def progress(line):
+        if line.startswith(f"step {step}:"):
+            raise Killed
+
+    return progress
+
+
+def without_cost(card):
+    """A card without what depends on the folder it was trained in."""
+    return {key: value for key, value in vars(card).items() if key != "training"} | {"curve": card.training["curve"]}
+
+
+def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, data):
+    whole = train(request_in(tmp_path / "whole", data))
+    for step in (3, 5):
+        with pytest.raises(Killed):
+            train(request_in(tmp_path / "parts", data, resume=step > 3), killer(step))
+    parts = train(request_in(tmp_path / "parts", data, resume=True))
+    assert parts.read_bytes() == whole.read_bytes()
+    for file in (tmp_path / "whole").glob("step-6-*"):
+        assert (tmp_path / "parts" / file.name).read_bytes() == file.read_bytes()
+    loaded = [priors.load(str(path)) for path in (parts, whole)]
+    assert without_cost(loaded[0].card) == without_cost(loaded[1].card)
+    assert [row["step"] for row in loaded[0].card.training["curve"]] == [2, 4, 6]
+
+
+@pytest.mark.parametrize("recipe", ["ours", "paper"])
+def test_steps_lower_the_loss(recipe):
+    config, settings = (TINY, SETTINGS) if recipe == "ours" else PAPER
+    config, settings = replace(config, width=8), replace(settings, steps=400, batch=8, window=20, learning_rate=5e-3)
+    trainer = Trainer(config, settings, corpus())
+    losses = [trainer.train_step() for _ in range(60)]
+    assert sum(losses[-5:]) < sum(losses[:5]) - 10
+
+
+def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, data):
+    out, news = tmp_path / "run", []
+    path = train(request_in(out, data, licence="CC0", match="walk"), news.append)
+    prior = priors.load(str(out))
+    card = prior.card
+    assert card.licence == "CC0"
+    assert (card.kind, card.config) == ("lstm-gmm", asdict(TINY))
+    assert (card.data["clips"], card.data["frames"]) == (5, 5 * 80)
+    assert card.training["settings"] == asdict(SETTINGS)
+    assert "mapctl train lstm-gmm" in card.training["command"]
+    held = card.data["held_out"]["validation"] + card.data["held_out"]["test"]
+    assert len(held) == 2
+    assert not set(held) & set(card.data["starts"])
+    assert {"validation_nats", "free_run_speed_ratio", "free_run_finite"} <= set(card.training["curve"][-1])
+    assert card.quality["test_nats_per_frame"]
+    assert 0 < prior.abilities.slowest < prior.abilities.fastest < 3
+    assert any("step 6: " in line for line in news)
+    files = {file.name for file in out.iterdir()}
+    assert files == {"cache", "checkpoint.json", "step-6-checkpoint.safetensors", "model.json", path.name}
+
+
+def test_resuming_is_asked_for_and_needs_the_same_recipe(tmp_path, data):
+    out = tmp_path / "run"
+    with pytest.raises(CheckpointError, match="no checkpoint to resume"):
+        train(request_in(out, data, resume=True))
+    train(request_in(out, data))
+    with pytest.raises(RequestError, match="already holds a run; pass --resume"):
+        train(request_in(out, data))
+    with pytest.raises(CheckpointError, match=r"learning_rate: 0\.001 then, 0\.1 now"):
+        train(request_in(out, data, resume=True, settings={"learning_rate": 0.1}))
+    with pytest.raises(CheckpointError, match="width: 8 then, 9 now"):
+        train(replace(request_in(out, data, resume=True), config=replace(TINY, width=9)))
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"tensors": "gone"}'])
+def test_a_broken_checkpoint_is_refused(tmp_path, data, content):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "checkpoint.json").write_text(content)
+    with pytest.raises(CheckpointError, match="no readable checkpoint"):
+        train(request_in(out, data, resume=True))
+
+
+def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
+    with pytest.raises(RequestError, match="not a folder"):
+        train(request_in(tmp_path / "run", tmp_path / "nowhere"))
+    with pytest.raises(RequestError, match=r"no .bvh below .* matches 'dance'"):
+        train(request_in(tmp_path / "run", data, match="dance"))
+    with pytest.raises(RequestError, match="regular expression"):
+        train(request_in(tmp_path / "run", data, match="walk("))
+    with pytest.raises(RequestError, match="at least 3 clips, got 2"):
+        train(request_in(tmp_path / "run", data, match="walk-[01]"))
+    with pytest.raises(RequestError, match="must reach 75 frames"):
+        train(request_in(tmp_path / "run", write_corpus(tmp_path / "short", frames=60)))
+    with pytest.raises(RequestError, match="auto, cpu or cuda"):
+        train(replace(request_in(tmp_path / "run", data), device="abacus"))
+    assert not (tmp_path / "run" / "checkpoint.json").exists()
+
+
+def test_a_clip_that_cannot_be_used_is_named(tmp_path, data):
+    text = (data / "walk-0.bvh").read_text().replace("Spine", "Trunk")
+    (tmp_path / "odd.bvh").write_text(text)
+    with pytest.raises(MapctlError, match=r"odd\.bvh: no known rig"):
+        corpora.read(tmp_path, match="", cache=tmp_path / "cache")
+
+
+def test_the_corpus_is_the_features_of_the_clips_and_is_read_once(tmp_path, data, monkeypatch):
+    read = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    assert read.names == ("walk-0.bvh", "walk-1.bvh", "walk-2.bvh")
+    expected = corpus(3, frames=80)
+    torch.testing.assert_close(read.features, expected.features, atol=1e-5, rtol=1e-5)
+    monkeypatch.setattr(corpora, "clip_features", None)
+    again = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    assert torch.equal(again.features, read.features)
+    assert (again.names, again.lengths) == (read.names, read.lengths)
+    (data / "walk-0.bvh").touch()
+    with pytest.raises(TypeError):  # a changed file is read anew
+        corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+
+
+def test_the_split_is_by_clip_seeded_and_complete():
+    many = corpora.Corpus(tuple(map(str, range(60))), (80,) * 60, torch.zeros(4800, LAYOUT.size))
+    first, again, other = (corpora.split(many, seed) for seed in (1, 1, 2))
+    parts = [set(part.names) for part in (first.train, first.validation, first.test)]
+    assert [len(part) for part in parts] == [54, 3, 3]
+    assert set.union(*parts) == set(many.names)
+    assert first.test.names == again.test.names
+    assert first.test.names != other.test.names
+
+
+def test_windows_stay_within_their_clips():
+    found = corpora.window_starts((5, 2, 4), 3).tolist()
+    assert found == [0, 1, 2, 7, 8]
+    with pytest.raises(RequestError, match="no clip is as long as the window of 9 frames"):
+        corpora.window_starts((5, 2, 4), 9)
+
+
+def test_statistics_are_symmetric_and_floored():
+    mean, std = statistics(corpus().features, LAYOUT.continuous)
+    torch.testing.assert_close(mirror_features(mean[None])[0], mean, atol=1e-5, rtol=0)
+    assert float(std.min()) >= 0.001
+    assert bool((mean[LAYOUT.continuous :] == 0.5).all())
+    assert bool((std[LAYOUT.continuous :] == 0.5).all())
+
+
+def test_starts_are_the_states_after_stretches_of_clips():
+    data = corpus()
+    trainer = Trainer(TINY, SETTINGS, data)
+    found = starts.choose(trainer.model, data, count=3, generator=generator())
+    assert len(set(found.names)) == 3
+    clips = dict(zip(data.names, data.clips(), strict=True))
+    for row, name in enumerate(found.names):
+        clip = clips[name]
+        end = 1 + int((clip == found.state.previous[row]).all(-1).nonzero()[0])
+        expected = trainer.model.advance(trainer.model.initial_state(clip[:1]), clip[None, 1:end])
+        torch.testing.assert_close(found.state.hidden[:, row], expected.hidden[:, 0])
+        assert float(found.speed[row]) == pytest.approx(float(starts.speed(clip[end - 30 : end]).mean()), rel=1e-5)
+
+
+def test_abilities_are_the_speeds_and_turns_of_the_data():
+    found = starts.abilities(corpus())
+    speeds = [float(starts.speed(clip).mean()) for clip in corpus().clips()]
+    assert min(speeds) * 0.9 < found.slowest < found.fastest < max(speeds) * 1.05
+    assert found.turn_rate == pytest.approx(0.3, abs=0.05)
+    still = corpora.Corpus(("still",), (80,), torch.zeros(80, LAYOUT.size))
+    assert starts.abilities(still).turn_rate == 0
+
+
+def test_free_runs_are_compared_with_the_data():
+    data = corpus()
+    found = health.free_run(Trainer(TINY, SETTINGS, data).model, data, runs=4, frames=40)
+    assert found["free_run_finite"] == 1
+    assert found["free_run_speed_ratio"] == pytest.approx(1, abs=0.3)
+    assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)
+    summary = health.summary(encode(walk(60))[0].float())
+    assert summary["speed"] == pytest.approx(1.24, abs=0.02)
