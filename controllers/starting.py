@@ -44,15 +44,16 @@ def choose_start(
     the curve. The generator picks among the best few, so that seeds give different walks.
     """
     wanted = float(arcs[1] - arcs[0]) * fps
+    ahead = min(_LOOK_AHEAD, len(arcs) - 1)
     near = (prior.starts.speed - wanted).abs().argsort()[:_CANDIDATES]
     state = prior.starts.state.pick(near)
-    noise = torch.zeros(len(near), _LOOK_AHEAD, LAYOUT.continuous)
+    noise = torch.zeros(len(near), ahead, LAYOUT.continuous)
     features, _ = prior.rollout(state, noise, prior.plan(state, noise))
     places = Place(_first_point(curve).expand(len(near), 2), _aligned_heading(features, curve, arcs))
-    context = Context(prior, state, places, torch.zeros(0, skeleton.num_joints, 3), _LOOK_AHEAD, skeleton, fps)
+    context = Context(prior, state, places, torch.zeros(0, skeleton.num_joints, 3), ahead, skeleton, fps)
     flat = noise.flatten(1)
     with torch.no_grad():
-        energy = Objective(Latents.planned(context, flat).build, terms_of(1, _LOOK_AHEAD)).energy(flat)
+        energy = Objective(Latents.planned(context, flat).build, terms_of(1, ahead)).energy(flat)
     best = energy.argsort()[:_AMONG_BEST]
     pick = int(best[torch.randint(len(best), (1,), generator=generator)])
     place = Place(places.position_xz[pick], places.heading[pick])
@@ -74,7 +75,7 @@ def _first_point(curve: Curve) -> Float[Tensor, "2"]:
 
 def _aligned_heading(features: Tensor, curve: Curve, arcs: Tensor) -> Float[Tensor, " starts"]:
     """Heading of each start's frame that makes the rollout's way over the first half second parallel to the curve's."""
-    half = _LOOK_AHEAD // 2
+    half = features.shape[1] // 2
     ground, _ = root_places(features, Place.origin())
     way = curve.point(arcs[half]) - curve.point(0.0)
     wanted = torch.atan2(way[0], way[-1]).float()

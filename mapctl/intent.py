@@ -1,5 +1,6 @@
 """What a person asks for, before it becomes terms."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +25,8 @@ class SpeedProfile:
     def __post_init__(self):
         if len(self.arcs) != len(self.speeds) or not self.arcs:
             raise RequestError("a speed profile needs one speed for each arc")
-        if any(b <= a for a, b in zip(self.arcs, self.arcs[1:], strict=False)):
+        rises = all(a < b for a, b in zip(self.arcs, self.arcs[1:], strict=False))
+        if not rises or not all(math.isfinite(arc) for arc in self.arcs):
             raise RequestError(f"the arcs of a speed profile must rise, got {self.arcs}")
         for speed in self.speeds:
             if not 0 < speed < float("inf"):
@@ -75,12 +77,14 @@ class Follow:
     def frames(self, fps: float, *, most: int = 3_600_000) -> int:
         """How many frames it takes, at least two; RequestError beyond `most`."""
         if self.seconds is not None:
-            count = round(self.seconds * fps)
+            count = self.seconds * fps
         else:
-            count = 1 + _steps_until(self.profile, self.curve.length, fps)
+            count = 1 + _steps_until(self.profile, self.curve.length, fps, most=most)
         if count > most:
-            raise RequestError(f"{count} frames are more than the {most} allowed; ask for fewer seconds")
-        return max(2, count)
+            raise RequestError(
+                f"{count:.3g} frames are more than the {most} allowed; ask for fewer seconds or more speed"
+            )
+        return max(2, round(count))
 
     def fitted(self, fps: float, *, slowest_share: float = 0.6) -> tuple["Follow", str | None]:
         """The request with speeds lowered so that an open curve lasts for the whole duration, and a sentence if so.
@@ -112,10 +116,13 @@ def _advance(profile: SpeedProfile, arc: float, seconds: float) -> float:
     return arc
 
 
-def _steps_until(profile: SpeedProfile, length: float, fps: float) -> int:
+def _steps_until(profile: SpeedProfile, length: float, fps: float, *, most: int) -> float:
+    """Frames until the arc is the curve's length; counts to `most` at most where speeds differ."""
     if len(profile.speeds) == 1:
-        return max(1, round(length / profile.speeds[0] * fps))
+        return max(1, length / profile.speeds[0] * fps)
+    if length / max(profile.speeds) * fps > most:
+        return math.inf
     arc, steps = 0.0, 0
-    while arc < length:
+    while arc < length and steps <= most:
         arc, steps = _advance(profile, arc, 1 / fps), steps + 1
     return steps

@@ -1,0 +1,198 @@
+"""Following a curve with an untrained density: the contract of the job, not the quality of the walk."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator, tiny_density
+
+import controllers
+from controllers.feasibility import after_the_fact, in_advance
+from controllers.follow import FollowSettings, follow_terms
+from controllers.starting import choose_start
+from mapctl import curves
+from mapctl.errors import RequestError
+from mapctl.features import encode
+from mapctl.intent import Follow, SpeedProfile
+from mapctl.kinematics import heading
+from mapctl.protocols import Abilities
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.methods import LatentMethod
+from mapctl.solver.result import Outcome
+from mapctl.solver.window import WindowSettings
+from mapctl.terms import Likelihood
+
+DENSITY = tiny_density()
+QUICK = FollowSettings(window=WindowSettings(frames=10, overlap=4, past=12),
+                       method=LatentMethod(rounds=1, budget=Budget(evaluations=5)))  # fmt: skip
+ABLE = Abilities(slowest=0.5, fastest=2.0, turn_rate=1.5)
+HILL = torch.stack(
+    [torch.zeros(50), 0.9 + 0.02 * torch.linspace(0, 6, 50).sin(), torch.linspace(0, 3, 50)], -1
+).double()
+
+
+def follow(curve, *, seed=0, **wishes):
+    return controllers.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **wishes})
+
+
+@pytest.mark.parametrize(
+    "curve", [curves.circle(radius=2), curves.s(length=3), curves.from_points(HILL)], ids=["circle", "s", "hill"]
+)
+def test_a_walk_starts_on_the_curves_first_point_going_along_it(curve):
+    solution = follow(curve, seconds=1.0, speed=1.2)
+    motion = solution.motion
+    assert (motion.num_frames, motion.fps, motion.skeleton) == (30, 30, CANONICAL)
+    start = curve.point(0.0)[[0, -1]]
+    torch.testing.assert_close(motion.root_position[0, ::2], start, atol=1e-5, rtol=0)
+    way = motion.root_position[15, ::2] - start
+    along = curve.point(0.6)[[0, -1]] - start
+    assert float(way @ along / way.norm() / along.norm()) > math.cos(0.3)
+    facing = float(heading(motion.local_quat_xyzw[0, 0]))
+    assert abs(math.remainder(facing - curve.start_heading, 2 * math.pi)) < 0.6
+    assert all(len(entry.energy) == 29 for entry in solution.ledger.entries)
+    assert {entry.name for entry in solution.ledger.entries} == {"noise", "path", "footing"}
+    assert solution.features.shape[0] == 30
+    torch.testing.assert_close(encode(motion)[0][1:, :66], solution.features[1:, :66].double(), atol=1e-5, rtol=0)
+
+
+def test_a_curve_is_walked_once_unless_seconds_say_otherwise():
+    line = curves.line(length=1.2)
+    assert follow(line, speed=1.2).motion.num_frames == 31
+    assert follow(line, speed=1.2, seconds=0.5).motion.num_frames == 15
+
+
+def test_the_same_seed_gives_the_same_bytes_and_other_seeds_other_walks(tmp_path):
+    curve = curves.circle(radius=2)
+    for name, seed in (("a", 1), ("b", 1), ("c", 2), ("d", 3), ("e", 4)):
+        follow(curve, seconds=0.5, seed=seed).motion.save(tmp_path / f"{name}.bvh")
+    written = {name: (tmp_path / f"{name}.bvh").read_bytes() for name in "abcde"}
+    assert written["a"] == written["b"]
+    assert len(set(written.values())) > 1
+
+
+def test_a_further_term_enters_the_ledger():
+    solution = follow(curves.circle(radius=2), seconds=0.4, settings=replace(QUICK, extra=(Likelihood(),)))
+    assert {entry.name for entry in solution.ledger.entries} == {"noise", "path", "footing", "likelihood"}
+
+
+def test_a_deadline_returns_what_there_is_and_says_so():
+    solution = follow(curves.circle(radius=2), seconds=20, deadline_seconds=0.0)
+    assert solution.status.outcome is Outcome.BUDGET
+    assert solution.motion.num_frames == 1
+    assert "budget" in solution.status.text
+
+
+def test_progress_ends_with_all_frames():
+    told = []
+    follow(curves.line(length=3), seconds=0.5, progress=lambda done, total: told.append((done, total)))
+    assert told == sorted(told)
+    assert told[-1] == (15, 15)
+
+
+@pytest.mark.parametrize(("wishes", "message"), [
+    ({"speed": -1.0}, "speed must be positive, got -1 m/s"),
+    ({"speed": 0.0}, "speed must be positive, got 0 m/s"),
+    ({"speed": math.nan}, "speed must be positive, got nan m/s"),
+    ({"speed": math.inf}, "speed must be positive, got inf m/s"),
+    ({"seconds": 0.0}, "seconds must be positive, got 0"),
+    ({"seconds": -2.0}, "seconds must be positive, got -2"),
+    ({"seconds": math.nan}, "seconds must be positive, got nan"),
+    ({"seconds": 1e9}, "frames are more than the 3600000 allowed"),
+    ({"speed": 1e-7}, "frames are more than the 3600000 allowed"),
+    ({"speed": 1e-320}, "more than the 3600000 allowed"),
+    ({"speed": SpeedProfile((0.0, 1.0), (1e-9, 1e-9))}, "more than the 3600000 allowed"),
+])  # fmt: skip
+def test_wishes_that_make_no_sense_are_refused(wishes, message):
+    with pytest.raises(RequestError, match=message):
+        follow(curves.circle(radius=2), **wishes)
+
+
+def test_a_speed_beyond_the_data_is_named_with_both_numbers():
+    solution = follow(curves.line(length=9), seconds=0.4, speed=9.0)
+    fastest = DENSITY.abilities.fastest
+    assert f"9.00 m/s is faster than the prior's data, which reach {fastest:.2f} m/s" in solution.status.text
+    assert solution.status.outcome is Outcome.INFEASIBLE
+    assert not solution.status.ok
+
+
+def notes(curve, speed, seconds, profile=None):
+    request = Follow(curve, profile or SpeedProfile.constant(speed), seconds)
+    return in_advance(request, request.arcs(request.frames(30), 30), ABLE)
+
+
+def test_possible_wishes_draw_no_notes():
+    assert notes(curves.circle(radius=2), 1.2, 5.0) == []
+    assert notes(curves.line(length=6), 1.0, 5.0) == []
+
+
+def test_a_slow_wish_is_named():
+    assert notes(curves.line(length=6), 0.2, 2.0) == [
+        "0.20 m/s is slower than the prior's data, which begin at 0.50 m/s"
+    ]
+
+
+def test_a_corner_is_named_with_its_place_and_angles():
+    bend = curves.from_points(torch.tensor([[0.0, 0], [0, 2], [2, 2]]).double())
+    (note,) = notes(bend, 1.0, 4.0)
+    assert "the curve turns 90 degrees within a second at 1." in note
+    assert "the prior's data turn at most 86" in note
+    assert notes(curves.circle(radius=0.5), 1.2, 3.0)[0].startswith("the curve turns 13")
+
+
+def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
+    request, note = Follow(curves.line(length=3), SpeedProfile.constant(1.0), 4.0).fitted(30)
+    assert float(request.arcs(120, 30)[-1]) == pytest.approx(3.0, abs=0.05)
+    assert "the curve is 3.0 m long" in note
+    assert "76 %" in note
+    far, _ = Follow(curves.line(length=1), SpeedProfile.constant(1.0), 4.0).fitted(30)
+    assert far.profile.speeds == (0.6,)
+    assert "go straight on beyond its end" in notes(curves.line(length=1), 1.0, 4.0)[-1]
+    closed = Follow(curves.circle(radius=0.1), SpeedProfile.constant(1.0), 4.0)
+    assert closed.fitted(30) == (closed, None)
+
+
+def test_leaving_the_curve_is_told_with_the_distance_and_the_time():
+    motion = follow(curves.line(length=3), seconds=1.0).motion
+    beside = motion.root_position.clone()
+    arcs = beside[:, 2].clone().clamp(min=0)
+    beside[:, 0] = 0.14
+    assert after_the_fact(replace(motion, root_position=beside), curves.line(length=3), arcs, 30.0) == []
+    beside[12:19, 0] = 0.4
+    told = after_the_fact(replace(motion, root_position=beside), curves.line(length=3), arcs, 30.0)
+    assert told == ["the curve is left by up to 40 cm between 0.4 and 0.6 s"]
+
+
+def test_the_start_is_one_of_the_best_by_the_wishes_speed():
+    arcs = 0.04 * torch.arange(60, dtype=torch.float64)
+    curve = curves.circle(radius=2)
+    terms_of = follow_terms(curve, arcs, QUICK)
+    found = choose_start(DENSITY, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator())
+    assert any(torch.equal(found.committed.state.previous[0], row) for row in DENSITY.starts.state.previous)
+    stood = found.before_first.moved(found.committed.features[0, :2], found.committed.features[0, 2])
+    torch.testing.assert_close(stood.position_xz, found.committed.place.position_xz, atol=1e-6, rtol=0)
+    torch.testing.assert_close(stood.heading, found.committed.place.heading)
+
+
+@pytest.mark.parametrize(("text", "at", "speed"), [
+    ("1.2", 7.0, 1.2), ("0:1.0,4:2.0", 2.0, 1.5), ("0:1.0,4:2.0", 9.0, 2.0), ("1:3,2:1", 0.0, 3.0),
+])  # fmt: skip
+def test_speed_profiles_are_linear_between_their_arcs(text, at, speed):
+    assert SpeedProfile.parse(text).at(at) == pytest.approx(speed)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "fast", "0:1,0:2", "2:1,1:1", "0:1,2", "0:-1", "0:1:2", "nan", "nan:1", "0:1,inf:2"]
+)
+def test_profiles_that_are_none_are_refused(text):
+    with pytest.raises(RequestError):
+        SpeedProfile.parse(text)
+
+
+def test_arcs_are_the_integral_of_speed():
+    profile = SpeedProfile((0.0, 10.0), (1.0, 2.0))  # ds/dt = 1 + s / 10
+    arcs = Follow(curves.line(length=20), profile, 5.0).arcs(151, 30)
+    assert float(arcs[-1]) == pytest.approx(10 * (math.exp(0.5) - 1), rel=2e-3)
+    frames = Follow(curves.line(length=5), profile).frames(30)
+    assert float(Follow(curves.line(length=5), profile).arcs(frames, 30)[-1]) == pytest.approx(5.0, abs=0.06)

@@ -1,0 +1,114 @@
+"""Random generation with an untrained density: lengths, seeds, starts, and pieces that join."""
+
+import math
+import sys
+
+import pytest
+import torch
+from helpers import bandai_skeleton, generator, tiny_density, turn_between, walk
+
+from controllers.generate import GenerateSettings, generate, stream
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.features import decode, encode
+from mapctl.kinematics import heading
+from mapctl.skeleton import CANONICAL
+
+DENSITY = tiny_density()
+
+
+def made(seconds=1.0, *, seed=0, **wishes):
+    return generate(DENSITY, seconds=seconds, generator=generator(seed), **wishes)
+
+
+@pytest.mark.parametrize(("seconds", "frames"), [(1.0, 30), (0.5, 15), (0.001, 2), (1.51, 45)])
+def test_it_is_as_long_as_asked(seconds, frames):
+    motion = made(seconds)
+    assert (motion.num_frames, motion.fps) == (frames, 30)
+    assert motion.skeleton is CANONICAL
+    assert bool(torch.isfinite(motion.joint_positions()).all())
+
+
+def test_it_begins_at_the_origin_facing_ahead():
+    motion = made()
+    assert float(motion.root_position[0, ::2].norm()) < 0.15
+    assert abs(float(heading(motion.local_quat_xyzw[0, 0]))) < 0.2
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        made(seed=seed).save(tmp_path / f"{name}.bvh")
+    a, b, c = ((tmp_path / f"{name}.bvh").read_bytes() for name in "abc")
+    assert a == b != c
+
+
+def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
+    whole = made(2.0, seed=5)
+    monkeypatch.setattr(sys.modules["controllers.generate"], "_CHUNK", 13)
+    pieces = list(stream(DENSITY, seconds=2.0, generator=generator(5)))
+    assert [piece.num_frames for piece in pieces] == [13, 13, 13, 13, 8]
+    joined = made(2.0, seed=5)
+    torch.testing.assert_close(joined.joint_positions(), whole.joint_positions(), atol=1e-6, rtol=0)
+    assert turn_between(joined.local_quat_xyzw, whole.local_quat_xyzw) < 1e-6
+    dots = (joined.local_quat_xyzw[1:] * joined.local_quat_xyzw[:-1]).sum(-1)
+    assert float(dots.min()) > 0
+
+
+def test_it_is_what_the_prior_samples_from_the_chosen_start():
+    motion = made(0.5, seed=3, settings=GenerateSettings(start=2, temperature=0.5))
+    draws = generator(3)
+    torch.randint(4, (1,), generator=draws)
+    state = DENSITY.starts.state.pick(torch.tensor([2]))
+    features, _ = DENSITY.sample(state, 15, draws, temperature=0.5)
+    torch.testing.assert_close(encode(motion)[0][1:, 2:66], features[0, 1:, 2:66].double(), atol=1e-5, rtol=0)
+
+
+def test_temperature_spreads_the_draws():
+    one = tiny_density(components=1)
+    calm, wild = (
+        generate(one, seconds=2.0, generator=generator(), settings=GenerateSettings(temperature=t, start=0))
+        for t in (0.0, 2.0)
+    )
+    jerks = [encode(m)[0][:, 6:66].diff(n=3, dim=0).square().mean().sqrt() for m in (calm, wild)]
+    assert float(jerks[1]) > 2 * float(jerks[0])
+
+
+@pytest.mark.parametrize("rig", ["canonical", "bandai", "60 fps"])
+def test_it_continues_where_a_clip_ends(rig):
+    clip = walk(40, turn_rate=0.8, fps=60 if rig == "60 fps" else 30)
+    if rig == "bandai":
+        clip = retarget.from_canonical(clip, retarget.map_rig(bandai_skeleton()))
+    end = retarget.to_canonical(clip)[0]
+    motion = made(start_clip=clip)
+    step = motion.root_position[0] - end.root_position[-1]
+    assert 0.005 < float(step[::2].norm()) < 0.1
+    turned = float(heading(motion.local_quat_xyzw[0, 0])) - float(heading(end.local_quat_xyzw[-1, 0]))
+    assert abs(math.remainder(turned, 2 * math.pi)) < 0.2
+
+
+def test_a_clip_warms_up_the_memory():
+    clip = walk(40)
+    motion = made(0.2, start_clip=clip, settings=GenerateSettings(temperature=0.0))
+    features, place = encode(clip)
+    state = DENSITY.advance(DENSITY.initial_state(features[:1].float()), features[None, 1:].float())
+    drawn, _ = DENSITY.sample(state, 6, generator(0), temperature=0.0)
+    expected = decode(torch.cat([features, drawn[0].double()]), place)
+    torch.testing.assert_close(motion.joint_positions(), expected.joint_positions()[40:], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, math.inf])
+def test_impossible_lengths_are_refused(seconds):
+    with pytest.raises(RequestError, match="seconds must be positive"):
+        made(seconds)
+
+
+@pytest.mark.parametrize("temperature", [-0.1, 2.5, math.nan])
+def test_impossible_temperatures_are_refused(temperature):
+    with pytest.raises(RequestError, match="temperature must lie between 0 and 2"):
+        GenerateSettings(temperature=temperature)
+
+
+@pytest.mark.parametrize("start", [-1, 4])
+def test_starts_that_are_not_there_are_refused(start):
+    with pytest.raises(RequestError, match=f"the prior has starts 0 to 3, got {start}"):
+        made(settings=GenerateSettings(start=start))
