@@ -1,4 +1,4 @@
-"""Wishes that cannot hold, named with numbers: before the solve from what the data show, after it from what was missed."""
+"""Wishes that cannot hold, named with numbers: before the solve from the data, after it from what was missed."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,6 @@ from mapctl.curves import Curve
 from mapctl.intent import Follow
 from mapctl.motion import Motion
 from mapctl.protocols import Abilities
-from mapctl.roles import find_hips
 
 _TOLERATED_CM = 15.0
 _CORNER_SECONDS = 1.0
@@ -31,12 +30,11 @@ def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abili
     return notes
 
 
-def after_the_fact(motion: Motion, curve: Curve, arcs: Float[Tensor, " frames"], fps: float) -> list[str]:
+def after_the_fact(motion: Motion, curve: Curve, joint: str, fps: float) -> list[str]:
     """The worst stretch that leaves the curve by more than 15 cm, if there is one."""
-    hips = motion.joint_positions()[:, find_hips(motion.skeleton)]
-    places = hips[:, ::2] if curve.dims == 2 else hips
-    wanted = arcs[: len(places)]
-    error = (places - curve.point(curve.nearest(places, around=wanted, reach=1.0))).norm(dim=-1)
+    walked = motion.joint_positions()[:, motion.skeleton.index(joint)]
+    places = walked[:, ::2] if curve.dims == 2 else walked
+    error = (places - curve.point(curve.track(walked, start=0.0))).norm(dim=-1)
     if float(error.max()) * 100 <= _TOLERATED_CM:
         return []
     off = (error * 100 > _TOLERATED_CM).nonzero()[:, 0]

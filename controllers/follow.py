@@ -16,7 +16,7 @@ from mapctl.features import decode
 from mapctl.intent import Follow, SpeedProfile
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.methods import LatentMethod, Method
-from mapctl.solver.result import Outcome, Solution, Status
+from mapctl.solver.result import Solution, Status
 from mapctl.solver.window import Committed, TermsOf, WindowSettings, WindowSolver
 from mapctl.terms import Footing, Noise, Path, Term
 
@@ -52,8 +52,8 @@ def follow(
 ) -> Solution:  # fmt: skip
     """A character walks the curve from its first point, facing along it.
 
-    `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the arc;
-    without `seconds` the curve is walked once. The first frame is the start pose. RequestError for wishes that
+    `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the
+    arc; without `seconds` the curve is walked once. The first frame is the start pose. RequestError for wishes that
     make no sense; wishes that cannot hold are named with numbers in the solution's status.
     """
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
@@ -70,7 +70,7 @@ def follow(
     done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
                                  deadline=deadline)  # fmt: skip
     known = (*start.notes, *([lowered] if lowered else ()), *in_advance(request, arcs[:frames], prior.abilities))
-    return _solution(done, Status(outcome), start, known, curve, arcs, skeleton, fps)
+    return _solution(done, Status(outcome), start, known, curve, settings.joint, skeleton, fps)
 
 
 def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
@@ -85,9 +85,9 @@ def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowS
 
 
 def _solution(
-    done: Committed, status: Status, start: Start, known: Sequence[str], curve: Curve, arcs: Tensor,
+    done: Committed, status: Status, start: Start, known: Sequence[str], curve: Curve, joint: str,
     skeleton: Skeleton, fps: float,
 ) -> Solution:  # fmt: skip
     motion = decode(done.features, start.before_first, skeleton=skeleton, fps=round(fps))
-    notes = (*known, *after_the_fact(motion, curve, arcs, fps))
+    notes = (*known, *after_the_fact(motion, curve, joint, fps))
     return Solution(motion, status.with_notes(notes, infeasible=bool(notes)), done.ledger, done.windows, done.features)

@@ -59,11 +59,11 @@ class LatentMethod:
     the one before it is thrown away, since the plan itself is not part of the energy.
     """
 
-    rounds: int = 3
-    """Rounds at most."""
-    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=10))
+    rounds: int = 1
+    """Rounds at most. More than one forget L-BFGS's curvature in between, which costs more than new plans win."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=60))
     """Of one round."""
-    budget: Budget = field(default_factory=lambda: Budget(evaluations=32))
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=40))
     """Of one window."""
     proposal: Proposal = zero_start
     """Where the first round starts."""

@@ -63,6 +63,7 @@ def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path
     """
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
+    _check_run(request)
     corpus = corpora.read(request.data, match=request.match, cache=request.out / "cache",
                           skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
     parts = corpora.split(corpus, request.settings.seed)
@@ -108,7 +109,9 @@ def command(request: TrainRequest) -> str:
     plain, parts = TrainingSettings(), [f"mapctl train lstm-gmm --data DATA -o RUN --match '{request.match}'"]
     parts += [f"--width {request.config.width}"]
     wanted, default = asdict(request.settings), asdict(plain)
-    parts += [f"--{name} {wanted[name]}" for name in ("steps", "batch", "window", "seed") if wanted[name] != default[name]]
+    parts += [
+        f"--{name} {wanted[name]}" for name in ("steps", "batch", "window", "seed") if wanted[name] != default[name]
+    ]
     return " ".join(parts) + (" --paper" if request.config.retain == 0 else "")
 
 
@@ -146,13 +149,17 @@ def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float]:
     return row
 
 
-def _resume(request: TrainRequest, trainer: Trainer, progress: Progress) -> list[dict[str, float]]:
+def _check_run(request: TrainRequest) -> None:
+    """Before anything is read: the folder holds a run if and only if it is to be resumed."""
     present = resume.exists(request.out)
     if request.resume and not present:
         raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
     if present and not request.resume:
         raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
-    if not present:
+
+
+def _resume(request: TrainRequest, trainer: Trainer, progress: Progress) -> list[dict[str, float]]:
+    if not request.resume:
         request.out.mkdir(parents=True, exist_ok=True)
         return []
     curve = resume.load(request.out, trainer)
