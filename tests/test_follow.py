@@ -156,11 +156,11 @@ def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
 def test_leaving_the_curve_is_told_with_the_distance_and_the_time():
     motion = follow(curves.line(length=3), seconds=1.0).motion
     beside = motion.root_position.clone()
-    arcs = beside[:, 2].clone().clamp(min=0)
     beside[:, 0] = 0.14
-    assert after_the_fact(replace(motion, root_position=beside), curves.line(length=3), arcs, 30.0) == []
+    line = curves.line(length=3)
+    assert after_the_fact(replace(motion, root_position=beside), line, "hips", 30.0) == []
     beside[12:19, 0] = 0.4
-    told = after_the_fact(replace(motion, root_position=beside), curves.line(length=3), arcs, 30.0)
+    told = after_the_fact(replace(motion, root_position=beside), line, "hips", 30.0)
     assert told == ["the curve is left by up to 40 cm between 0.4 and 0.6 s"]
 
 
