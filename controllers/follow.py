@@ -25,9 +25,9 @@ from mapctl.terms import Footing, Noise, Path, Term
 class FollowSettings:
     """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
 
-    path_sigma_slow: float = 0.02
+    path_sigma_slow: float = 0.015
     """Sideways offset after its slow part is taken, metres."""
-    path_sigma_raw: float = 0.2
+    path_sigma_raw: float = 0.08
     """Sideways offset itself, metres."""
     path_sigma_progress: float = 0.08
     """Arc missing or too much, metres."""
@@ -69,7 +69,7 @@ def follow(
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
                                  deadline=deadline)  # fmt: skip
-    known = (*start.notes, *([lowered] if lowered else ()), *in_advance(request, arcs[:frames], prior.abilities))
+    known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], prior.abilities))
     return _solution(done, Status(outcome), start, known, curve, settings.joint, skeleton, fps)
 
 

@@ -16,10 +16,14 @@ from mapctl.solver.objective import Objective
 from mapctl.solver.variables import Context, Latents
 from mapctl.solver.window import Committed
 from mapctl.terms import Term
+from mapctl.terms.path import gaussian_weights
 
 _CANDIDATES = 24
-_AMONG_BEST = 6
+_AMONG_BEST = 4
 _LOOK_AHEAD = 34
+_STROLL = 120  # frames of plain rollout that show how a candidate walks when nobody asks for anything
+_SPEED_SIGMA = 0.1  # m/s between a candidate's own speed and the wanted one that count as one standard deviation
+_SWAY_SECONDS = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,43 +34,64 @@ class Start:
     """The first frame, as the window solver wants it."""
     before_first: Place
     """The place from which `features.decode` leads to the first frame."""
-    notes: tuple[str, ...] = ()
-    """What the user should know."""
 
 
 def choose_start(
     prior: Any, curve: Curve, arcs: Float[Tensor, " frames"], terms_of: Callable[[int, int], Sequence[Term]], *,
     skeleton: Skeleton, fps: float, generator: torch.Generator,
 ) -> Start:  # fmt: skip
-    """Of the prior's starts near the wanted speed, one of those whose plain rollout fits the wishes best.
+    """Of the prior's starts near the wanted speed, one of those that fit the wishes best with nobody steering.
 
-    Each candidate stands on the curve's first point and is turned so that the rollout's first half second goes along
-    the curve. The generator picks among the best few, so that seeds give different walks.
+    Each candidate stands on the curve's first point and is turned so that the first half second of its plain rollout
+    goes along the curve. It is scored by the energy of the first window, by how far the speed it falls into is from
+    the wanted one, and by how unusual its sway is among the candidates. The generator picks among the best few, so that
+    seeds give different walks.
     """
     wanted = float(arcs[1] - arcs[0]) * fps
     ahead = min(_LOOK_AHEAD, len(arcs) - 1)
     near = (prior.starts.speed - wanted).abs().argsort()[:_CANDIDATES]
     state = prior.starts.state.pick(near)
-    noise = torch.zeros(len(near), ahead, LAYOUT.continuous)
-    features, _ = prior.rollout(state, noise, prior.plan(state, noise))
-    places = Place(_first_point(curve).expand(len(near), 2), _aligned_heading(features, curve, arcs))
-    context = Context(prior, state, places, torch.zeros(0, skeleton.num_joints, 3), ahead, skeleton, fps)
-    flat = noise.flatten(1)
+    noise = torch.zeros(len(near), _STROLL, LAYOUT.continuous)
     with torch.no_grad():
-        energy = Objective(Latents.planned(context, flat).build, terms_of(1, ahead)).energy(flat)
-    best = energy.argsort()[:_AMONG_BEST]
+        features, _ = prior.rollout(state, noise, prior.plan(state, noise))
+    places = Place(_first_point(curve).expand(len(near), 2), _aligned_heading(features[:, :ahead], curve, arcs))
+    context = Context(prior, state, places, torch.zeros(0, skeleton.num_joints, 3), ahead, skeleton, fps)
+    flat = noise[:, :ahead].flatten(1)
+    with torch.no_grad():
+        energy = Objective(Latents.planned(context, flat).build, terms_of(1, ahead)).energy(flat) / ahead
+    # The plain rollout soon leaves the curve, and its energy then says little: it counts for a tenth.
+    best = (0.1 * energy + _oddness(features, wanted, fps)).argsort()[:_AMONG_BEST]
     pick = int(best[torch.randint(len(best), (1,), generator=generator)])
     place = Place(places.position_xz[pick], places.heading[pick])
-    return _standing(state.pick(torch.tensor([pick])), place, skeleton, ())
+    return _standing(state.pick(torch.tensor([pick])), place, skeleton)
 
 
-def _standing(state: Any, place: Place, skeleton: Skeleton, notes: tuple[str, ...]) -> Start:
+def _oddness(features: Float[Tensor, "starts frames size"], wanted: float, fps: float) -> Float[Tensor, " starts"]:
+    """Nats: the squared distance of each candidate's own speed from the wanted one, and of its sway from the median."""
+    speed = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean(-1) * fps
+    sway = _sway(features, fps)
+    spread = (sway.quantile(0.75) - sway.quantile(0.25)).clamp_min(1e-4) / 2
+    return 0.5 * ((speed - wanted) / _SPEED_SIGMA).square() + 0.5 * ((sway - sway.median()) / spread).square()
+
+
+def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:
+    """rms of the root's sideways departure from its own smoothed way, metres (DESIGN's sway, without a curve)."""
+    ground, _ = root_places(features, Place.origin())
+    smooth = gaussian_weights(ground.shape[1], _SWAY_SECONDS * fps, ground.dtype) @ ground
+    way = torch.nn.functional.normalize(torch.gradient(smooth, dim=1)[0], dim=-1)
+    apart = ground - smooth
+    sideways = apart[..., 0] * way[..., 1] - apart[..., 1] * way[..., 0]
+    edge = min(round(2 * _SWAY_SECONDS * fps), ground.shape[1] // 4)
+    return sideways[:, edge:-edge].square().mean(-1).sqrt()
+
+
+def _standing(state: Any, place: Place, skeleton: Skeleton) -> Start:
     first = state.previous
     before = place.before(
         LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
     )
     joints = decode(first, before, skeleton=skeleton).joint_positions().to(first.dtype)
-    return Start(Committed(state, place, first, joints, first.new_zeros(0, LAYOUT.continuous)), before, notes)
+    return Start(Committed(state, place, first, joints, first.new_zeros(0, LAYOUT.continuous)), before)
 
 
 def _first_point(curve: Curve) -> Float[Tensor, "2"]:

@@ -24,9 +24,9 @@ class Path:
     """Wanted arc of each frame of the window, metres."""
     joint: str = "hips"
     """Which joint follows."""
-    sigma_slow: float = 0.02
+    sigma_slow: float = 0.015
     """Of the sideways offset after a Gaussian of `slow_seconds`, metres."""
-    sigma_raw: float = 0.2
+    sigma_raw: float = 0.08
     """Of the sideways offset itself, metres."""
     sigma_progress: float = 0.08
     """Of the arc that is missing or too much, metres."""
