@@ -27,7 +27,7 @@ class FollowSettings:
 
     path_sigma_slow: float = 0.015
     """Sideways offset after its slow part is taken, metres."""
-    path_sigma_raw: float = 0.08
+    path_sigma_raw: float = 0.12
     """Sideways offset itself, metres."""
     path_sigma_progress: float = 0.08
     """Arc missing or too much, metres."""

@@ -5,13 +5,17 @@ slow part of the sideways offset is held tightly and the raw offset loosely.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.curve_axes import CurveAxes, axes_near
 from mapctl.curves import Curve
 from mapctl.trial import Trial
+
+_REACH = 0.6  # metres around the wanted arc where the nearest place is sought: a crossing's other branch is farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,7 @@ class Path:
     """Which joint follows."""
     sigma_slow: float = 0.015
     """Of the sideways offset after a Gaussian of `slow_seconds`, metres."""
-    sigma_raw: float = 0.08
+    sigma_raw: float = 0.12
     """Of the sideways offset itself, metres."""
     sigma_progress: float = 0.08
     """Of the arc that is missing or too much, metres."""
@@ -40,58 +44,54 @@ class Path:
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Nats of sideways offset, its slow part, progress, and height in space."""
         places = self._places(trial)
-        arcs = self._nearest(places)
-        sideways = self.curve.signed_offset(places, arcs)
-        energy = 0.5 * (sideways / self.sigma_raw).square()
-        energy = energy + 0.5 * (self._slow(trial, sideways) / self.sigma_slow).square()
-        energy = energy + 0.5 * (self._missing(places, arcs) / self.sigma_progress).square()
-        if self.curve.dims == 3:
-            energy = energy + 0.5 * (self._height(places, arcs) / self.sigma_height).square()
-        return energy
+        near = self._near(places)
+        # The axes are held in the gradient: where the nearest place moves along the curve, so does the wish.
+        offsets = ((places - near.place).unsqueeze(-2) * near.axes).sum(-1)
+        slow = self._slow(trial, offsets[..., 0]) / self.sigma_slow
+        return 0.5 * (((offsets + self._passed(near)) / self._sigmas(places.dtype)).square().sum(-1) + slow.square())
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Distance to the curve, metres."""
         places = self._places(trial)
-        at = self.curve.point(self._nearest(places))
-        return (self._flat(places) - at).norm(dim=-1)
+        return (places - self._near(places).place).norm(dim=-1)
 
-    def _places(self, trial: Trial) -> Float[Tensor, "batch frames 3"]:
+    def _places(self, trial: Trial) -> Float[Tensor, "batch frames dims"]:
         if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics
-            ground = trial.root_xz_world
-            return torch.stack([ground[..., 0], torch.zeros_like(ground[..., 0]), ground[..., 1]], dim=-1)
-        return trial.joint_world(self.joint)
+            return trial.root_xz_world
+        return self._of_curve(trial.joint_world(self.joint))
 
-    def _nearest(self, places: Tensor) -> Tensor:
-        with torch.no_grad():
-            around = self.arcs.to(places.dtype).expand(places.shape[:-1])
-            return self.curve.nearest(places, around=around, reach=0.6)
-
-    def _missing(self, places: Tensor, arcs: Tensor) -> Tensor:
-        along = ((self._flat(places) - self.curve.point(arcs)) * self.curve.tangent(arcs)).sum(-1)
-        return arcs - self.arcs.to(places.dtype) + along
-
-    def _height(self, places: Tensor, arcs: Tensor) -> Tensor:
-        """Over the curve in space; the arc is held in the gradient, so what lies along a slope is taken off here."""
-        apart, tangent = places - self.curve.point(arcs), self.curve.tangent(arcs)
-        return apart[..., 1] - (apart * tangent).sum(-1) * tangent[..., 1]
-
-    def _flat(self, places: Tensor) -> Tensor:
+    def _of_curve(self, places: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch dims"]:
         return places[..., ::2] if self.curve.dims == 2 else places
+
+    def _near(self, places: Tensor) -> CurveAxes:
+        return axes_near(self.curve, places, self.arcs, reach=_REACH)
+
+    def _passed(self, near: CurveAxes) -> Float[Tensor, "batch frames dims"]:
+        """By how much the nearest place itself lies beyond the wanted one, as an offset along the axes."""
+        return torch.nn.functional.pad(near.ahead.unsqueeze(-1), (1, self.curve.dims - 2))
+
+    def _sigmas(self, dtype: torch.dtype) -> Float[Tensor, " dims"]:
+        """Of the offsets along the axes."""
+        return torch.tensor((self.sigma_raw, self.sigma_progress, self.sigma_height)[: self.curve.dims], dtype=dtype)
 
     def _slow(self, trial: Trial, sideways: Tensor) -> Tensor:
         """The offset smoothed over time; the frames before the window count, missing ones do not."""
-        past = trial.before[:, trial.skeleton.index(self.joint)].to(sideways.dtype)
-        frames, reach = sideways.shape[-1], round(3 * self.slow_seconds * trial.fps)
-        past = past[-reach:]
-        if len(past):
-            step = (self.arcs[1] - self.arcs[0]) if frames > 1 else 0.0
-            around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
-            before = self.curve.signed_offset(past, self.curve.nearest(past, around=around, reach=0.6))
-            sideways = torch.cat([before.expand(*sideways.shape[:-1], -1), sideways], dim=-1)
-        weights = gaussian_weights(sideways.shape[-1], self.slow_seconds * trial.fps, sideways.dtype)
-        return sideways @ weights[-frames:].T
+        frames, sigma = sideways.shape[-1], self.slow_seconds * trial.fps
+        past = trial.before[-round(3 * sigma) :, trial.skeleton.index(self.joint)].to(sideways.dtype)
+        weights = gaussian_weights(len(past) + frames, sigma, sideways.dtype)[len(past) :]
+        slow = sideways @ weights[:, len(past) :].T
+        return slow + self._sideways_before(past) @ weights[:, : len(past)].T if len(past) else slow
+
+    def _sideways_before(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
+        """Sideways offsets of the frames before the window, metres; arcs go on backwards at the first frame's pace."""
+        step = self.arcs[1] - self.arcs[0] if len(self.arcs) > 1 else 0.0
+        around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
+        places = self._of_curve(past)
+        near = axes_near(self.curve, places[None], around, reach=_REACH)
+        return ((places - near.place[0]) * near.axes[0, :, 0]).sum(-1)
 
 
+@lru_cache(maxsize=16)
 def gaussian_weights(count: int, sigma_frames: float, dtype: torch.dtype) -> Float[Tensor, "count count"]:
     """Row t averages the frames around t with a Gaussian, normalised over the frames there are."""
     at = torch.arange(count, dtype=dtype)
