@@ -1,6 +1,6 @@
 """One candidate motion as the terms see it: built once per evaluation, world poses computed at most once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -32,6 +32,8 @@ class Trial:
     """Whose bones forward kinematics uses."""
     fps: float = 30.0
     """Frames per second."""
+    contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
+    """Left and right toe planted in the frame before the window; unbatched or with the batch's shape."""
 
     @cached_property
     def _root(self) -> tuple[Tensor, Tensor]:

@@ -32,7 +32,9 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
     place = Place(ground[-1].to(dtype), heading[-1].to(dtype))
     before = motion.joint_positions()[PAST - past : PAST].to(dtype)
-    return Trial(features.to(dtype), place, draw[..., 1:].to(dtype), 30 * draw[..., 0].to(dtype), bits, before)
+    planted = torch.tensor([True, False])
+    return Trial(features.to(dtype), place, draw[..., 1:].to(dtype), 30 * draw[..., 0].to(dtype), bits, before,
+                 contacts_before=planted)  # fmt: skip
 
 
 def rows(whole, picked):
@@ -192,7 +194,7 @@ def test_a_walk_to_the_left_of_a_line_is_off_by_as_much():
 def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():
     whole = trial(1, disturbed=0.0)
     planted = torch.ones_like(whole.contacts)
-    resting = replace(whole, contacts=planted)
+    resting = replace(whole, contacts=planted, contacts_before=planted[0, 0])
     toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
     places = torch.cat([whole.before[-1:, toes], whole.joints_world[0][:, toes]])
     speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
@@ -203,6 +205,17 @@ def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():
     free = replace(whole, contacts=~planted)
     assert float(Footing().residual(free).abs().max()) == 0
     assert float(Footing()(free).max()) < float(Footing()(resting).min()) + 1e-6
+
+
+def test_a_toe_that_lands_as_the_window_begins_is_not_held_by_its_swing():
+    whole = trial(2, disturbed=0.0)
+    both, left = torch.ones_like(whole.contacts), torch.tensor([[True, False], [False, False]])
+    landing = replace(whole, contacts=both, contacts_before=torch.zeros(2, dtype=torch.bool))
+    assert float(Footing().residual(landing)[:, 0].max()) == 0
+    standing = Footing().residual(replace(landing, contacts_before=left))
+    assert float(standing[0, 0]) > 0
+    assert float(standing[1, 0]) == 0
+    torch.testing.assert_close(standing[:, 1:], Footing().residual(landing)[:, 1:])
 
 
 def test_the_seam_sees_a_jump_at_its_start_and_nothing_beyond():

@@ -39,7 +39,8 @@ class Context:
 
     def trial(self, features: Tensor, noise: Tensor, density: Tensor, contacts: Tensor) -> Trial:
         """A trial in this context."""
-        return Trial(features, self.place, noise, density, contacts, self.before, self.skeleton, self.fps)
+        planted = LAYOUT.pick(self.state.previous, "contacts") > 0.5
+        return Trial(features, self.place, noise, density, contacts, self.before, self.skeleton, self.fps, planted)
 
 
 @dataclass(frozen=True, eq=False)

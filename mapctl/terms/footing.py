@@ -50,7 +50,8 @@ class Footing:
         return trial.joints_world[..., self._toes(trial), 1]
 
     def _planted(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        """A toe is held between two frames only if it is planted in both."""
+        """A toe is held between two frames only if it is planted in both, the one before the window among them."""
         bits = trial.contacts
-        before = torch.cat([bits[:, :1], bits[:, :-1]], dim=1)
+        past = trial.contacts_before.to(bits.device).expand(len(bits), 2).unsqueeze(1)
+        before = torch.cat([past, bits[:, :-1]], dim=1)
         return (bits & before).to(trial.features.dtype)
