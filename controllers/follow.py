@@ -10,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.feasibility import after_the_fact, in_advance
-from controllers.starting import Start, choose_start
+from controllers.starting import choose_start
 from mapctl.curves import Curve
-from mapctl.features import decode
+from mapctl.features import PRIOR_FPS, decode
 from mapctl.intent import Follow, SpeedProfile
+from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.methods import LatentMethod, Method
 from mapctl.solver.result import Solution, Status
@@ -27,8 +28,10 @@ class FollowSettings:
 
     path_sigma_slow: float = 0.015
     """Sideways offset after its slow part is taken, metres."""
-    path_sigma_raw: float = 0.12
-    """Sideways offset itself, metres."""
+    path_free_sway: float = 0.03
+    """Sideways offset that is left to the walker, metres."""
+    path_sigma_raw: float = 0.03
+    """Sideways offset beyond it, metres."""
     path_sigma_progress: float = 0.08
     """Arc missing or too much, metres."""
     footing: Footing = field(default_factory=Footing)
@@ -48,35 +51,38 @@ class FollowSettings:
 def follow(
     prior: Any, curve: Curve, *, seconds: float | None = None, speed: float | SpeedProfile = 1.2,
     generator: torch.Generator | None = None, settings: FollowSettings | None = None, skeleton: Skeleton = CANONICAL,
-    fps: float = 30.0, progress: Callable[[int, int], None] | None = None, deadline_seconds: float | None = None,
+    progress: Callable[[int, int], None] | None = None, deadline_seconds: float | None = None,
 ) -> Solution:  # fmt: skip
     """A character walks the curve from its first point, facing along it.
 
     `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the
-    arc; without `seconds` the curve is walked once. The first frame is the start pose. RequestError for wishes that
-    make no sense; wishes that cannot hold are named with numbers in the solution's status.
+    arc; without `seconds` the curve is walked once. The first frame is the start pose. The motion is at PRIOR_FPS;
+    `Motion.resample` gives other rates. After `deadline_seconds` of wall clock, and at Ctrl-C, what is solved by then
+    comes back and the status says so. RequestError for wishes that make no sense; wishes that cannot hold are named
+    with numbers in the status.
     """
+    deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
-    request, lowered = Follow(curve, profile, seconds).fitted(fps)
+    request, lowered = Follow(curve, profile, seconds).fitted(PRIOR_FPS)
     settings = settings or FollowSettings()
     generator = generator or torch.Generator().manual_seed(0)
-    frames = request.frames(fps)
+    frames = request.frames(PRIOR_FPS)
     # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
-    arcs = request.arcs(frames + settings.window.frames, fps)
+    arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
     terms_of = follow_terms(curve, arcs, settings)
-    start = choose_start(prior, curve, arcs, terms_of, skeleton=skeleton, fps=fps, generator=generator)
-    solver = WindowSolver(prior, settings.window, skeleton, fps, settings.method)
-    deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
+    start = choose_start(prior, curve, arcs, terms_of, skeleton=skeleton, fps=PRIOR_FPS, generator=generator)
+    solver = WindowSolver(prior, settings.window, skeleton, method=settings.method)
     done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
                                  deadline=deadline)  # fmt: skip
     known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], prior.abilities))
-    return _solution(done, Status(outcome), start, known, curve, settings.joint, skeleton, fps)
+    motion = decode(done.features, start.before_first, skeleton=skeleton)
+    return _solution(motion, done, Status(outcome), known, curve, settings.joint)
 
 
 def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
     """The terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
     path = Path(curve, arcs, joint=settings.joint, sigma_slow=settings.path_sigma_slow,
-                sigma_raw=settings.path_sigma_raw, sigma_progress=settings.path_sigma_progress)  # fmt: skip
+                free_sway=settings.path_free_sway, sigma_raw=settings.path_sigma_raw, sigma_progress=settings.path_sigma_progress)  # fmt: skip
 
     def terms(first: int, frames: int) -> Sequence[Term]:
         return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *settings.extra
@@ -85,9 +91,7 @@ def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowS
 
 
 def _solution(
-    done: Committed, status: Status, start: Start, known: Sequence[str], curve: Curve, joint: str,
-    skeleton: Skeleton, fps: float,
-) -> Solution:  # fmt: skip
-    motion = decode(done.features, start.before_first, skeleton=skeleton, fps=round(fps))
-    notes = (*known, *after_the_fact(motion, curve, joint, fps))
+    motion: Motion, done: Committed, status: Status, known: Sequence[str], curve: Curve, joint: str
+) -> Solution:
+    notes = (*known, *after_the_fact(motion, curve, joint))
     return Solution(motion, status.with_notes(notes, infeasible=bool(notes)), done.ledger, done.windows, done.features)
