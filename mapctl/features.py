@@ -1,8 +1,8 @@
 """State features of the prior: what of a motion is left when place and heading are taken away.
 
 rnn paper, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change, the
-root height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation vectors
-about the canonical T-pose stand in for the paper's Euler angles, whose wraps real rigs sit near.
+root height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation
+vectors about the canonical T-pose stand in for the paper's Euler angles, whose wraps real rigs sit near.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,10 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.errors import MapctlError
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+
+PRIOR_FPS = 30
+"""Frames per second of every prior: steps and turns a frame mean nothing at another rate, so results are resampled."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +109,8 @@ def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], Place]:
     turn = rotations.wrap_angle(torch.diff(heading))
     step = rotations.rotate_ground(torch.diff(ground, dim=0), -heading[:-1])
     step, turn = torch.cat([step[:1], step]), torch.cat([turn[:1], turn])
-    tilt_vector = rotations.to_rotation_vector(_upper_half(tilt))
-    joints = rotations.to_rotation_vector(_upper_half(motion.local_quat_xyzw[:, 1:])).flatten(1)
+    tilt_vector = rotations.to_rotation_vector(tilt)
+    joints = rotations.to_rotation_vector(motion.local_quat_xyzw[:, 1:]).flatten(1)
     toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
     planted = torch.as_tensor(contacts.planted(motion.joint_positions()[:, toes], float(motion.fps))).to(step.dtype)
     height = motion.root_position[:, 1:2]
@@ -137,22 +140,18 @@ def local_rotations(
     return torch.cat([hips.unsqueeze(-2), quats[..., 1:, :]], dim=-2)
 
 
-def decode(
-    features: Float[Tensor, "frames size"], start: Place, *, skeleton: Skeleton = CANONICAL, fps: int | Fraction = 30
-) -> Motion:
-    """The canonical motion that the features describe from `start`; inverse of `encode`."""
+def decode(features: Float[Tensor, "frames size"], start: Place, *, skeleton: Skeleton = CANONICAL) -> Motion:
+    """The canonical motion at PRIOR_FPS that the features describe from `start`; inverse of `encode` at that rate."""
     features = features.detach().double()
     ground, heading = root_places(features, Place(start.position_xz.double(), start.heading.double()))
     height = LAYOUT.pick(features, "root_height")
     root = torch.cat([ground[:, :1], height, ground[:, 1:]], dim=-1)
     quats = rotations.sign_continuous(local_rotations(features, heading))
-    return Motion(skeleton, Fraction(fps), root, quats)
+    return Motion(skeleton, Fraction(PRIOR_FPS), root, quats)
 
 
 def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
     """Features of the motion mirrored left to right."""
-    from mapctl.skeleton import mirrored_name
-
     swap = [CANONICAL.index(mirrored_name(name)) - 1 for name in CANONICAL.names[1:]]
     vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))[..., swap, :]
     flip = features.new_tensor
@@ -164,8 +163,3 @@ def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*b
         (vectors * flip([1.0, -1.0, -1.0])).flatten(-2),
         LAYOUT.pick(features, "contacts").flip(-1),
     ], dim=-1)  # fmt: skip
-
-
-def _upper_half(quat_xyzw: Tensor) -> Tensor:
-    """The sign with w >= 0, so that the rotation vector is the short one."""
-    return torch.where(quat_xyzw[..., 3:] < 0, -quat_xyzw, quat_xyzw)

@@ -99,7 +99,7 @@ def test_a_clip_warms_up_the_memory():
 @pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, math.inf])
 def test_impossible_lengths_are_refused(seconds):
     with pytest.raises(RequestError, match="seconds must be positive"):
-        made(seconds)
+        stream(DENSITY, seconds=seconds, generator=generator())  # at once, not when the first piece is taken
 
 
 @pytest.mark.parametrize("temperature", [-0.1, 2.5, math.nan])

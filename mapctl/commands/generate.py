@@ -54,7 +54,7 @@ class Generate:
         from controllers.generate import stream
 
         prior = priors.load(self.prior)
-        draw = partial(stream, prior, seconds=self.seconds, settings=settings, start_clip=clip, fps=options.MOTION_FPS)
+        draw = partial(stream, prior, seconds=self.seconds, settings=settings, start_clip=clip)
         with outputs.made_folder(self.out) as folder:
             for number, seed in enumerate(self._seeds()):
                 pieces = draw(generator=torch.Generator().manual_seed(seed))
@@ -84,6 +84,7 @@ class Generate:
         return torch.randint(2**62, (self.count,), generator=draws).tolist()
 
     def _write(self, pieces: Iterable["Motion"], path: Path, frames: int) -> None:
+        from mapctl.features import PRIOR_FPS
         from mapctl.formats.bvh_stream import bvh_stream
 
         began = time.perf_counter()
@@ -94,5 +95,4 @@ class Generate:
                     progress(file.written, frames)
         if not self.quiet:
             rate = frames / (time.perf_counter() - began)
-            seconds = frames / options.MOTION_FPS
-            print(f"{path}: {frames} frames, {seconds:.1f} s, drawn at {rate:.0f} frames a second")
+            print(f"{path}: {frames} frames, {frames / PRIOR_FPS:.1f} s, drawn at {rate:.0f} frames a second")

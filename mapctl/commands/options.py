@@ -28,10 +28,8 @@ MaybeName = Annotated[str | None, arg(metavar="NAME")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
-MOTION_FPS = 30
-"""Frames per second that priors run at."""
 MOST_FRAMES = 3_600_000
-"""Longest motion asked for in one go: 33 hours at 30 fps."""
+"""Longest motion asked for in one go: 33 hours at the priors' rate."""
 
 
 def check_seed(seed: int) -> None:
@@ -42,11 +40,13 @@ def check_seed(seed: int) -> None:
 
 def frames_of(seconds: float) -> int:
     """Frames of a motion of so many seconds at the priors' rate; RequestError for none or too many."""
+    from mapctl.features import PRIOR_FPS
+
     if not seconds > 0:
         raise RequestError(f"seconds must be positive, got {seconds:g}")
-    if seconds * MOTION_FPS > MOST_FRAMES:
-        raise RequestError(f"seconds must be at most {MOST_FRAMES // MOTION_FPS}, got {seconds:g}")
-    return max(2, round(seconds * MOTION_FPS))
+    if seconds * PRIOR_FPS > MOST_FRAMES:
+        raise RequestError(f"seconds must be at most {MOST_FRAMES // PRIOR_FPS}, got {seconds:g}")
+    return max(2, round(seconds * PRIOR_FPS))
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, Place
+from mapctl.features import LAYOUT, PRIOR_FPS, Place
 from mapctl.protocols import Density, Plan
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.trial import Trial
@@ -34,7 +34,7 @@ class Context:
     """Of the window."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
-    fps: float = 30.0
+    fps: float = PRIOR_FPS
     """Frames per second."""
 
     def trial(self, features: Tensor, noise: Tensor, density: Tensor, contacts: Tensor) -> Trial:

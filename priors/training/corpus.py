@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from fractions import Fraction
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,11 +15,10 @@ from torch import Tensor
 
 from mapctl import retarget
 from mapctl.errors import MapctlError, RequestError
-from mapctl.features import LAYOUT, encode
+from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.formats import load
 from mapctl.formats.atomic import atomic_path
 
-TRAINING_FPS = Fraction(30)
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
 SHORTEST = 75
@@ -75,7 +73,7 @@ def split(corpus: Corpus, seed: int) -> Split:
     for part in parts:
         if (longest := max(corpus.lengths[i] for i in part)) < SHORTEST:
             raise RequestError(
-                f"training and held-out clips must reach {SHORTEST} frames at 30 fps, got {longest} at most"
+                f"training and held-out clips must reach {SHORTEST} frames at {PRIOR_FPS} fps, got {longest} at most"
             )
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
@@ -118,7 +116,7 @@ def clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size
         motion = motion.slice(1, motion.num_frames)
     try:
         canonical, _ = retarget.to_canonical(motion)
-        return encode(canonical.resample(TRAINING_FPS))[0].float()
+        return encode(canonical.resample(PRIOR_FPS))[0].float()
     except MapctlError as error:
         raise MapctlError(f"{file}: {error}") from error
 

@@ -4,17 +4,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, Place, root_places
+from mapctl.features import LAYOUT, PRIOR_FPS, Place, root_places
 from mapctl.protocols import Abilities, Starts
 from priors.lstm_gmm import LstmGmm, LstmState
 from priors.training.corpus import Corpus
 
-_SECOND = 30
+_SECOND = PRIOR_FPS  # frames
 _WARM_UP = 40  # frames of a clip seen before a start; the memory has settled by then
 
 
 def choose(model: LstmGmm, corpus: Corpus, *, count: int, generator: torch.Generator) -> Starts:
-    """`count` moments, spread evenly over the speeds of the corpus, no two from one clip while clips last."""
+    """`count` moments spread evenly over the speeds of the corpus, or as many as there are clips; one a clip."""
     clips = [i for i, length in enumerate(corpus.lengths) if length > _WARM_UP + _SECOND]
     features = corpus.clips()
     shuffled = [clips[i] for i in torch.randperm(len(clips), generator=generator).tolist()]
@@ -37,7 +37,7 @@ def abilities(corpus: Corpus) -> Abilities:
         if len(clip) <= 2 * _SECOND:
             continue
         ground, _ = root_places(clip.double(), Place.origin(torch.float64))
-        velocity = (ground[_SECOND:] - ground[:-_SECOND]) * 1.0  # metres in one second
+        velocity = ground[_SECOND:] - ground[:-_SECOND]  # metres in one second
         pace = velocity.norm(dim=-1)
         direction = torch.atan2(velocity[:, 0], velocity[:, 1])
         turn = torch.remainder(direction[_SECOND:] - direction[:-_SECOND] + torch.pi, 2 * torch.pi) - torch.pi
