@@ -61,13 +61,9 @@ class LbfgsSettings:
 
     def __post_init__(self):
         if self.memory < 1 or self.max_iterations < 0 or self.max_trials < 1:
-            raise RequestError(
-                "L-BFGS needs memory and max_trials of 1 or more, and max_iterations of 0 or more"
-            )
+            raise RequestError("L-BFGS needs memory and max_trials of 1 or more, and max_iterations of 0 or more")
         if not 0 < self.armijo < self.curvature < 1:
-            raise RequestError(
-                f"L-BFGS needs 0 < armijo < curvature < 1, got {self.armijo} and {self.curvature}"
-            )
+            raise RequestError(f"L-BFGS needs 0 < armijo < curvature < 1, got {self.armijo} and {self.curvature}")
         if not self.max_step > 0 or (self.initial_step is not None and not self.initial_step > 0):
             raise RequestError(f"L-BFGS steps must be positive, got {self.initial_step} and {self.max_step}")
 
@@ -103,9 +99,7 @@ def minimise(
     Raises RequestError where `x` is not a float32 or float64 matrix, or the function answers in other shapes.
     """
     if x.ndim != 2 or x.dtype not in (torch.float32, torch.float64):
-        raise RequestError(
-            f"L-BFGS starts from (batch, n) float32 or float64, got {tuple(x.shape)} {x.dtype}"
-        )
+        raise RequestError(f"L-BFGS starts from (batch, n) float32 or float64, got {tuple(x.shape)} {x.dtype}")
     meter = Meter() if meter is None else meter
     problems = [_Problem(row, settings) for row in x.detach().cpu().numpy().copy()]
     calls = 0
@@ -119,9 +113,7 @@ def minimise(
     return _result(problems, x)
 
 
-def _evaluate(
-    function: EnergyAndGradient, points: NDArray, like: Tensor
-) -> tuple[list[float], NDArray[np.float64]]:
+def _evaluate(function: EnergyAndGradient, points: NDArray, like: Tensor) -> tuple[list[float], NDArray[np.float64]]:
     energy, gradient = function(torch.from_numpy(points).to(like.device))
     if energy.shape != like.shape[:1] or gradient.shape != like.shape:
         raise RequestError(
@@ -188,9 +180,7 @@ class _Problem:
         if energy < self.best.energy and point.finite:
             self.best = point
         try:
-            with np.errstate(
-                over="ignore", invalid="ignore"
-            ):  # what overflows is seen to be not finite, and refused
+            with np.errstate(over="ignore", invalid="ignore"):  # what overflows is seen to be not finite, and refused
                 self.ask = self._search.send((energy, gradient))
         except StopIteration as stop:
             self.running, self.status, self.ask = False, stop.value, self.best.x

@@ -51,9 +51,7 @@ class SwarmSettings:
                 f"particles and iterations must be 1 or more, got {self.particles} and {self.iterations}"
             )
         if self.neighbours is not None and self.neighbours < 2:
-            raise RequestError(
-                f"a particle's neighbours must be 2 or more (or None for all), got {self.neighbours}"
-            )
+            raise RequestError(f"a particle's neighbours must be 2 or more (or None for all), got {self.neighbours}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +147,7 @@ class _Track:
 class _Flight:
     """pyswarms' swarm and topology."""
 
-    def __init__(
-        self, points: np.ndarray, settings: SwarmSettings, bounds: Any, random: np.random.RandomState
-    ):
+    def __init__(self, points: np.ndarray, settings: SwarmSettings, bounds: Any, random: np.random.RandomState):
         self._random, self._bounds = random, bounds
         with _quiet_import():
             from pyswarms.backend.handlers import BoundaryHandler, VelocityHandler
@@ -160,9 +156,7 @@ class _Flight:
 
             self._nearest, self._unclamped = BoundaryHandler("nearest"), VelocityHandler("unmodified")
             self._topology = Star() if settings.neighbours is None else Ring(static=False)
-        self._knows = (
-            {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
-        )
+        self._knows = {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
         weights = {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
         self._swarm: Any = Swarm(points, np.zeros_like(points), options=weights)  # pyright: ignore[reportCallIssue]
         self._swarm.pbest_cost = np.full(len(points), np.inf)
@@ -184,9 +178,7 @@ class _Flight:
     def move(self):
         """New velocities and positions."""
         with _numpy_draws_from(self._random):
-            self._swarm.velocity = self._topology.compute_velocity(
-                self._swarm, None, self._unclamped, self._bounds
-            )
+            self._swarm.velocity = self._topology.compute_velocity(self._swarm, None, self._unclamped, self._bounds)
         self._swarm.position = self._topology.compute_position(self._swarm, self._bounds, self._nearest)
 
 
@@ -195,12 +187,8 @@ def _draws(
 ) -> Float[Tensor, "count n"]:
     """The start and normal draws around it, inside the bounds."""
     if start.ndim != 1 or not start.is_floating_point():
-        raise RequestError(
-            f"a swarm starts from a vector of real numbers, got {tuple(start.shape)} {start.dtype}"
-        )
-    noise = torch.randn(
-        int(count), len(start), dtype=start.dtype, device=generator.device, generator=generator
-    )
+        raise RequestError(f"a swarm starts from a vector of real numbers, got {tuple(start.shape)} {start.dtype}")
+    noise = torch.randn(int(count), len(start), dtype=start.dtype, device=generator.device, generator=generator)
     points = start + noise.to(start.device) * spread
     points[:1] = start
     if bounds is None:
