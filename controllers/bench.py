@@ -13,14 +13,14 @@ from controllers.generate import GenerateSettings, begin
 from controllers.starting import choose_start
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.features import LAYOUT
+from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.metrics import measure
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.methods import LatentMethod, Method, StateMethod
 from mapctl.solver.objective import Objective
 from mapctl.solver.proposals import BestOf, Swarm
-from mapctl.solver.result import Solution
+from mapctl.solver.result import Outcome, Solution
 from mapctl.solver.variables import Context, Latents
 from mapctl.terms import Likelihood, Noise
 
@@ -59,8 +59,8 @@ def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) 
     for run in range(runs):
         features = _free_run(prior, frames, seed + run)
         everything.append(features)
-        pace = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * 30
-        seconds = pace[: len(pace) // 30 * 30].unflatten(0, (-1, 30)).mean(-1)
+        pace = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * PRIOR_FPS
+        seconds = pace[: len(pace) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
         rows.append({"run": str(run), **_free_run_values(features), "slowest_second_m_s": float(seconds.min()),
                      "fastest_second_m_s": float(seconds.max()),
                      "largest_feature_sigma": float(_in_sigmas(prior, features).abs().max())})  # fmt: skip
@@ -75,7 +75,7 @@ def _free_run(prior: Any, frames: int, seed: int) -> Tensor:
 
 
 def _free_run_values(features: Tensor) -> Row:
-    return {"speed": float(LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean() * 30),
+    return {"speed": float(LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean() * PRIOR_FPS),
             "height": float(LAYOUT.pick(features, "root_height").mean()),
             "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean())}  # fmt: skip
 
@@ -119,8 +119,7 @@ def _ablated(prior: Any, curve: Curve, method: Method, label: str, settings: Ben
     ):  # its noise is the network's input noise, in units of sigma, and states need a density
         wishes = replace(wishes, noise=Noise(sigma=1.0), extra=(Likelihood(),))
     began = time.process_time()
-    solution = follow(prior, curve, seconds=settings.seconds, settings=wishes,
-                      generator=torch.Generator().manual_seed(settings.seed))  # fmt: skip
+    solution = _followed(prior, curve, settings.seconds, settings.seed, wishes)
     spent = time.process_time() - began
     found = measure(solution.motion, curve)
     return {"method": label, "energy_nats": _wish_energy(solution), "path_error_mean_cm": found["path_error_mean_cm"],
@@ -142,10 +141,10 @@ def _evaluation(prior: Any, reference: Any, count: int, settings: BenchSettings)
 def _timed_evaluation(prior: Any, count: int, settings: BenchSettings) -> float:
     curve, wishes = curves.circle(radius=4.0), FollowSettings()
     frames = wishes.window.frames
-    arcs = torch.arange(2 * frames, dtype=torch.float64) * 1.2 / 30
+    arcs = torch.arange(2 * frames, dtype=torch.float64) * 1.2 / PRIOR_FPS
     terms_of = follow_terms(curve, arcs, wishes)
     generator = torch.Generator().manual_seed(settings.seed)
-    start = choose_start(prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator).committed
+    start = choose_start(prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator).committed
     context = Context(prior, start.state, start.place, start.joints_world, frames)
     unknowns = 0.1 * torch.randn(count, frames * LAYOUT.continuous, generator=generator)
     objective = Objective(Latents.planned(context, unknowns).build, terms_of(1, frames))
@@ -154,12 +153,20 @@ def _timed_evaluation(prior: Any, count: int, settings: BenchSettings) -> float:
 
 def _solve(prior: Any, seconds: float, settings: BenchSettings) -> Row:
     began = time.process_time()
-    solution = follow(prior, curves.circle(radius=4.0), seconds=seconds,
-                      generator=torch.Generator().manual_seed(settings.seed))  # fmt: skip
+    solution = _followed(prior, curves.circle(radius=4.0), seconds, settings.seed, FollowSettings())
     frames = solution.motion.num_frames
     windows = solution.windows
     return {"what": f"follow a circle for {seconds:g} s", "ms_per_frame": 1000 * (time.process_time() - began) / frames,
             "evaluations_per_window": sum(w.evaluations for w in windows) / len(windows)}  # fmt: skip
+
+
+def _followed(prior: Any, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:
+    """A walk to its end: half a one has no place in a table, so Ctrl-C ends the bench."""
+    generator = torch.Generator().manual_seed(seed)
+    solution = follow(prior, curve, seconds=seconds, settings=wishes, generator=generator)
+    if solution.status.outcome is Outcome.INTERRUPTED:
+        raise KeyboardInterrupt
+    return solution
 
 
 def _fastest(run: Callable[[], object], repeats: int) -> float:

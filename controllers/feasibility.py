@@ -1,10 +1,11 @@
 """Wishes that cannot hold, named with numbers: before the solve from the data, after it from what was missed."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.curves import Curve
+from mapctl.features import PRIOR_FPS
 from mapctl.intent import Follow
 from mapctl.motion import Motion
 from mapctl.protocols import Abilities
@@ -16,7 +17,8 @@ _CORNER_SECONDS = 1.0
 def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
     """Sentences about speeds and corners beyond the prior's data, and about a curve that ends too soon."""
     notes = []
-    fastest, slowest = max(request.profile.speeds), min(request.profile.speeds)
+    speeds = torch.diff(arcs) * PRIOR_FPS
+    fastest, slowest = round(float(speeds.max()), 3), round(float(speeds.min()), 3)
     if fastest > abilities.fastest:
         notes.append(f"{fastest:.2f} m/s is faster than the prior's data, which reach {abilities.fastest:.2f} m/s")
     if slowest < abilities.slowest:
@@ -25,30 +27,32 @@ def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abili
     if not request.curve.closed and float(arcs[-1]) > request.curve.length + 0.05:
         over = float(arcs[-1]) - request.curve.length
         notes.append(
-            f"the curve is {request.curve.length:.1f} m long; the last {over:.1f} m go straight on beyond its end"
+            f"the last {over:.1f} m go straight on beyond the end of the curve of {request.curve.length:.1f} m"
         )
     return notes
 
 
-def after_the_fact(motion: Motion, curve: Curve, joint: str, fps: float) -> list[str]:
-    """The worst stretch that leaves the curve by more than 15 cm, if there is one."""
+def after_the_fact(motion: Motion, curve: Curve, joint: str) -> list[str]:
+    """The stretch around the worst frame that leaves the curve by more than 15 cm, if there is one."""
     walked = motion.joint_positions()[:, motion.skeleton.index(joint)]
     places = walked[:, ::2] if curve.dims == 2 else walked
     error = (places - curve.point(curve.track(walked, start=0.0))).norm(dim=-1)
     if float(error.max()) * 100 <= _TOLERATED_CM:
         return []
-    off = (error * 100 > _TOLERATED_CM).nonzero()[:, 0]
-    first, last = int(off[0]), int(off[-1])
-    return [
-        f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first / fps:.1f} and {last / fps:.1f} s"
-    ]
+    first, last = (float(frame / motion.fps) for frame in _stretch(error * 100 > _TOLERATED_CM, int(error.argmax())))
+    return [f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first:.1f} and {last:.1f} s"]
+
+
+def _stretch(off: Bool[Tensor, " frames"], worst: int) -> tuple[int, int]:
+    """First and last frame of the unbroken stretch around the worst one."""
+    inside = (~off).nonzero()[:, 0]
+    before, after = inside[inside < worst], inside[inside > worst]
+    return int(before[-1]) + 1 if len(before) else 0, int(after[0]) - 1 if len(after) else len(off) - 1
 
 
 def _corners(request: Follow, arcs: Tensor, abilities: Abilities) -> list[str]:
-    """The sharpest turn over one second of the walk, if it is beyond the data."""
-    step = max(1, int((arcs <= arcs[0] + request.profile.speeds[0] * _CORNER_SECONDS).sum()))
-    if len(arcs) <= step:
-        return []
+    """The sharpest turn over one second of the walk (or all of a shorter one), if it is beyond the data."""
+    step = min(round(_CORNER_SECONDS * PRIOR_FPS), len(arcs) - 1)
     samples = request.curve.curvature(arcs) * torch.gradient(arcs)[0]
     turned = torch.nn.functional.pad(samples.cumsum(0), (1, 0))
     turned = (turned[step:] - turned[:-step]).abs()
@@ -56,5 +60,5 @@ def _corners(request: Follow, arcs: Tensor, abilities: Abilities) -> list[str]:
     if float(turned[worst]) <= abilities.turn_rate:
         return []
     degrees, able = (torch.rad2deg(torch.tensor(v)).item() for v in (float(turned[worst]), abilities.turn_rate))
-    return [f"the curve turns {degrees:.0f} degrees within a second at {float(arcs[worst]):.1f} m; "
-            f"the prior's data turn at most {able:.0f}"]  # fmt: skip
+    return [f"the curve turns {degrees:.0f} degrees within a second at {float(arcs[worst]):.1f} m, "
+            f"where the prior's data turn at most {able:.0f}"]  # fmt: skip

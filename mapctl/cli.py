@@ -2,7 +2,7 @@
 
 Exit status: 0 done; 1 nobody read the output; 2 the input or the command is wrong, with one line on standard
 error and nothing written; 3 done, but not all that was asked holds (--strict);
-130 interrupted, 143 terminated.
+130 interrupted (what was solved until then is written), 143 terminated.
 """
 
 import io
@@ -21,9 +21,10 @@ import tyro
 
 from mapctl import __version__
 from mapctl.commands import COMMANDS, Command
+from mapctl.commands.walks import INTERRUPTED
 from mapctl.errors import MapctlError, RequestError
 
-_WRONG, _UNREAD, _INTERRUPTED, _TERMINATED = 2, 1, 130, 143
+_WRONG, _UNREAD, _TERMINATED = 2, 1, 143
 _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
     "live": {"viser"},
@@ -54,10 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         status = _version() if words == ["--version"] else parse(words).run()
         sys.stdout.flush()
+        if status == INTERRUPTED:
+            _say("interrupted; what was solved until then is written", status)
     except MapctlError as error:
         status = _say(str(error), _WRONG)
     except KeyboardInterrupt:
-        status = _say("interrupted", _INTERRUPTED)
+        status = _say("interrupted", INTERRUPTED)
     except ModuleNotFoundError as error:
         status = _say(_missing(error.name or str(error)), _WRONG)
     except BrokenPipeError:

@@ -279,6 +279,66 @@ def test_interruption_leaves_nothing_half_done(prior, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def presses_ctrl_c(monkeypatch, *, after):
+    """Every walk from here on is interrupted once so many frames are solved."""
+    from mapctl.solver.window import WindowSolver
+
+    solve = WindowSolver.solve
+
+    def pressed(*words, progress, **options):
+        def press(done, total):
+            if done >= after:
+                raise KeyboardInterrupt
+
+        return solve(*words, progress=press, **options)
+
+    monkeypatch.setattr(WindowSolver, "solve", pressed)
+
+
+def test_an_interrupted_walk_is_written_as_far_as_it_was_solved(prior, tmp_path, monkeypatch, capsys):
+    presses_ctrl_c(monkeypatch, after=20)
+    files = {name: tmp_path / f"walk.{name}" for name in ("bvh", "json", "mp4")}
+    words = ("-o", files["bvh"], "--report", files["json"], "--video", files["mp4"], "--prior", prior)
+    assert run("follow", "circle:3", "--seconds", 4, *words) == 130
+    told = capsys.readouterr()
+    assert "status    interrupted; what was solved until then is kept" in told.out
+    assert "walk.mp4" not in told.out
+    assert told.err == "mapctl: interrupted; what was solved until then is written\n"
+    assert {file.name for file in tmp_path.iterdir()} == {"walk.bvh", "walk.json"}
+    assert mapctl.load(files["bvh"]).num_frames == 35
+    report = json.loads(files["json"].read_text())
+    assert (report["status"]["outcome"], report["motion"]["frames"]) == (
+        "interrupted; what was solved until then is kept",
+        35,
+    )
+
+
+def test_an_interrupted_demo_and_scene_are_written_without_films(prior, tmp_path, monkeypatch):
+    presses_ctrl_c(monkeypatch, after=1)
+    assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 130
+    assert {file.name for file in (tmp_path / "demo").iterdir()} == {"figure8.bvh", "figure8.json"}
+    actors = "".join(f"[[actors]]\nname = '{name}'\ncurve = 'circle:2'\nseconds = 2\n" for name in ("ann", "bob"))
+    outputs = "outputs = ['scene.mp4', 'scene.bvh', 'scene.json']\n"
+    (tmp_path / "scene.toml").write_text(f"prior = '{prior}'\n{outputs}{actors}")
+    assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "scene", "--quiet") == 130
+    assert {file.name for file in (tmp_path / "scene").iterdir()} == {"scene-ann.bvh", "scene.json"}
+
+
+def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_path):
+    words = ("follow", "circle:4", "-o", tmp_path / "walk.bvh", "--seconds", 3000, "--prior", prior)
+    process = subprocess.Popen([sys.executable, "-m", "mapctl.cli", *map(str, words)], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True)  # fmt: skip
+    time.sleep(8)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in told
+    assert told.startswith("mapctl: interrupted")
+    written = (tmp_path / "walk.bvh").exists()
+    assert written == ("what was solved until then is written" in told)
+    assert not written or 2 < mapctl.load(tmp_path / "walk.bvh").num_frames < 90_000
+
+
 def test_a_closed_pipe_is_no_error():
     """As in `mapctl measure walk.bvh | head -1`."""
     reader, writer = os.pipe()

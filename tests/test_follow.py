@@ -1,7 +1,10 @@
 """Following a curve with an untrained density: the contract of the job, not the quality of the walk."""
 
 import math
+import sys
+import time
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -77,6 +80,45 @@ def test_a_further_term_enters_the_ledger():
     assert {entry.name for entry in solution.ledger.entries} == {"noise", "path", "footing", "likelihood"}
 
 
+def test_a_lowered_speed_is_a_wish_that_could_not_hold():
+    solution = follow(curves.line(length=0.9), speed=1.2, seconds=1.0)
+    assert solution.status.outcome is Outcome.INFEASIBLE
+    assert "the wanted speed would go 1.2 m in 1.0 s but the curve is 0.9 m long" in solution.status.text
+    assert "so the speed was lowered to 78 % of it" in solution.status.text
+
+
+def interrupt_at(frames):
+    """Progress that presses Ctrl-C once so many frames are done."""
+
+    def progress(done, total):
+        if done >= frames:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_an_interrupted_walk_keeps_what_was_solved():
+    whole = follow(curves.circle(radius=2), seconds=1.0)
+    solution = follow(curves.circle(radius=2), seconds=1.0, progress=interrupt_at(10))
+    assert solution.status.outcome is Outcome.INTERRUPTED
+    assert solution.status.text.startswith("interrupted; what was solved until then is kept")
+    assert solution.motion.num_frames == 13
+    torch.testing.assert_close(solution.motion.root_position, whole.motion.root_position[:13])
+    assert all(len(entry.energy) == 12 for entry in solution.ledger.entries)
+
+
+def test_the_deadlines_clock_starts_with_the_call(monkeypatch):
+    module = sys.modules["controllers.follow"]
+    slow = partial(after_a_while, module.choose_start)
+    monkeypatch.setattr(module, "choose_start", slow)
+    assert follow(curves.circle(radius=2), seconds=5, deadline_seconds=0.05).motion.num_frames == 1
+
+
+def after_a_while(work, *words, **options):
+    time.sleep(0.1)
+    return work(*words, **options)
+
+
 def test_a_deadline_returns_what_there_is_and_says_so():
     solution = follow(curves.circle(radius=2), seconds=20, deadline_seconds=0.0)
     assert solution.status.outcome is Outcome.BUDGET
@@ -141,6 +183,22 @@ def test_a_corner_is_named_with_its_place_and_angles():
     assert notes(curves.circle(radius=0.5), 1.2, 3.0)[0].startswith("the curve turns 13")
 
 
+def test_a_corner_is_judged_by_the_time_it_takes_not_by_the_speed_at_the_start():
+    arc = torch.linspace(0, math.pi / 2, 200).double()
+    bend = torch.stack([4 - 4 * arc.cos(), 8 + 4 * arc.sin()], -1)  # a quarter of a circle of 4 m after 8 m of line
+    curve = curves.from_points(torch.cat([torch.tensor([[0.0, 0.0]]).double(), bend]))
+    late = SpeedProfile((7.0, 8.0), (0.5, 1.9))
+    assert notes(curve, None, 18.0, late) == []
+    fast = SpeedProfile((0.0, 8.0), (1.9, 0.5))
+    assert notes(curve, None, 10.0, fast) == []
+    sharp = curves.circle(radius=1.0)
+    assert notes(sharp, None, 4.0, SpeedProfile((0.0, 3.0), (0.5, 1.9)))[0].startswith("the curve turns 10")
+
+
+def test_speeds_that_the_walk_never_reaches_draw_no_notes():
+    assert notes(curves.line(length=6), None, 4.0, SpeedProfile((0.0, 50.0), (1.0, 9.0))) == []
+
+
 def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
     request, note = Follow(curves.line(length=3), SpeedProfile.constant(1.0), 4.0).fitted(30)
     assert float(request.arcs(120, 30)[-1]) == pytest.approx(3.0, abs=0.05)
@@ -148,7 +206,7 @@ def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
     assert "76 %" in note
     far, _ = Follow(curves.line(length=1), SpeedProfile.constant(1.0), 4.0).fitted(30)
     assert far.profile.speeds == (0.6,)
-    assert "go straight on beyond its end" in notes(curves.line(length=1), 1.0, 4.0)[-1]
+    assert "go straight on beyond the end of the curve of 1.0 m" in notes(curves.line(length=1), 1.0, 4.0)[-1]
     closed = Follow(curves.circle(radius=0.1), SpeedProfile.constant(1.0), 4.0)
     assert closed.fitted(30) == (closed, None)
 
@@ -158,10 +216,12 @@ def test_leaving_the_curve_is_told_with_the_distance_and_the_time():
     beside = motion.root_position.clone()
     beside[:, 0] = 0.14
     line = curves.line(length=3)
-    assert after_the_fact(replace(motion, root_position=beside), line, "hips", 30.0) == []
+    assert after_the_fact(replace(motion, root_position=beside), line, "hips") == []
     beside[12:19, 0] = 0.4
-    told = after_the_fact(replace(motion, root_position=beside), line, "hips", 30.0)
+    told = after_the_fact(replace(motion, root_position=beside), line, "hips")
     assert told == ["the curve is left by up to 40 cm between 0.4 and 0.6 s"]
+    beside[25:, 0] = 0.3  # another stretch, not so bad
+    assert after_the_fact(replace(motion, root_position=beside), line, "hips") == told
 
 
 def test_the_start_is_one_of_the_best_by_the_wishes_speed():

@@ -13,6 +13,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, root_places
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.methods import LatentMethod, StateMethod
 from mapctl.solver.objective import Objective
 from mapctl.solver.proposals import BestOf, SteeringKnots, Swarm
@@ -137,6 +138,39 @@ def test_a_deadline_stops_with_what_there_is():
     assert time.monotonic() - late < 5
     assert 1 < len(done.features) < 80
     assert len(done.ledger.entries[0].energy) == len(done.features) - 1
+
+
+def test_a_deadline_reaches_into_a_window():
+    endless = LatentMethod(lbfgs=LbfgsSettings(max_iterations=10**6, gradient_tolerance=0.0,
+                                               relative_energy_tolerance=-1.0, max_trials=10**6),
+                           budget=Budget())  # fmt: skip
+    began = time.monotonic()
+    done, outcome = solve(80, method=endless, deadline=began + 0.5)
+    assert outcome is Outcome.BUDGET
+    assert time.monotonic() - began < 2
+    assert done.windows[-1].evaluations > 0
+
+
+def test_an_interrupt_keeps_whole_windows_and_goes_on_where_there_is_none():
+    def press(done, total):
+        raise KeyboardInterrupt
+
+    done, outcome = solve(20, progress=press)
+    assert outcome is Outcome.INTERRUPTED
+    assert len(done.features) == 7
+    with pytest.raises(KeyboardInterrupt):
+        solver(density=interrupted()).solve(BEGUN, terms_of, 20, generator=generator())
+
+
+def interrupted():
+    """A density in whose first rollout Ctrl-C is pressed."""
+    model = tiny_model()
+
+    def press(state, noise, plan):
+        raise KeyboardInterrupt
+
+    model.rollout = press
+    return model
 
 
 def broken(after):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mapctl.commands import options, outputs
 from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import Walk, as_follow, walk
+from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
 from mapctl.progress import bar
 
 CURVE, SPEED = "figure8:2", "1.2"
@@ -26,7 +26,10 @@ class Demo:
     """No summary and no progress bar."""
 
     def run(self) -> int:
-        """Walk, write, film, tell. Without OpenGL the film shows stick figures and says what is missing."""
+        """Walk, write, film, tell. Without OpenGL the film shows stick figures and says what is missing.
+
+        Ctrl-C ends the walk; what there is of it is written, without a film.
+        """
         compute_on_one()
         options.check_seed(self.seed)
         outputs.check_folder(self.out)
@@ -38,11 +41,12 @@ class Demo:
         with bar("walking", quiet=self.quiet) as progress:
             done = walk(prior, request, seed=self.seed, progress=progress)
         with outputs.made_folder(self.out) as folder:
-            files = {ending: folder / f"figure8.{ending}" for ending in ("bvh", "json", "mp4", "png")}
+            endings = ("bvh", "json") if done.interrupted else ("bvh", "json", "mp4", "png")
+            files = {ending: folder / f"figure8.{ending}" for ending in endings}
             self._write(done, files)
         if not self.quiet:
             print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
-        return 0
+        return INTERRUPTED if done.interrupted else 0
 
     def _write(self, done: Walk, files: dict[str, Path]) -> None:
         from mapctl import report
@@ -52,6 +56,9 @@ class Demo:
         done.solution.motion.save(files["bvh"])
         request = options.as_request("demo", self) | {"curve": CURVE, "speed": SPEED}
         report.write(done.report(request), files["json"])
+        films = [files[ending] for ending in ("mp4", "png") if ending in files]
+        if not films:
+            return
         with bar("filming", quiet=self.quiet) as progress:
-            actors, films = [(done.solution.motion, done.request.curve)], [files["mp4"], files["png"]]
+            actors = [(done.solution.motion, done.request.curve)]
             film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)

@@ -1,13 +1,14 @@
 """`mapctl follow`: a character walks a drawn curve."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from mapctl.commands import options, outputs
 from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import Walk, as_follow, walk
+from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
 from mapctl.progress import bar
 
 _NOT_ALL_HOLDS = 3
@@ -45,7 +46,7 @@ class FollowCurve:
     """No summary and no progress bar."""
 
     def run(self) -> int:
-        """Check everything, solve, write, tell."""
+        """Check everything, solve, write, tell. Ctrl-C ends the solve; what it has is written, without a film."""
         compute_on_one()
         self._check()
         request = as_follow(options.read_curve(self.curve, self.metres_per_unit), self.speed, self.seconds)
@@ -54,10 +55,13 @@ class FollowCurve:
         prior = priors.load(self.prior)
         with bar("walking", quiet=self.quiet) as progress:
             done = walk(prior, request, seed=self.seed, progress=progress)
-        self._write(done)
+        video = None if done.interrupted else self.video
+        self._write(done, video)
         if not self.quiet:
-            files = ", ".join(map(str, options.given(self.out, self.video, self.report)))
+            files = ", ".join(map(str, options.given(self.out, video, self.report)))
             print("\n".join([*done.summary(), f"wrote     {files}"]))
+        if done.interrupted:
+            return INTERRUPTED
         return _NOT_ALL_HOLDS if self.strict and not done.solution.status.ok else 0
 
     def _check(self) -> None:
@@ -69,17 +73,17 @@ class FollowCurve:
         if self.video is not None:
             outputs.check_film(self.video, options.parse_size(self.size))
 
-    def _write(self, done: Walk) -> None:
+    def _write(self, done: Walk, video: Path | None) -> None:
         from mapctl import report
 
         done.solution.motion.save(self.out)
         if self.report is not None:
             report.write(done.report(options.as_request("follow", self)), self.report)
-        if self.video is not None:
+        if video is not None:
             from scenes.cameras import CameraSettings
             from scenes.film import film
 
             actors, camera = [(done.solution.motion, done.request.curve)], CameraSettings(self.camera)
             with bar("filming", quiet=self.quiet) as progress:
                 size = options.parse_size(self.size)
-                film(actors, self.video, camera=camera, size=size, progress=progress)
+                film(actors, video, camera=camera, size=size, progress=progress)

@@ -10,10 +10,12 @@ from tyro.conf import Positional, arg
 
 from mapctl.commands import options, outputs
 from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import Walk, as_follow, walk
+from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
 from mapctl.progress import bar
 
 if TYPE_CHECKING:
+    from mapctl.intent import Follow
+    from priors.density import LstmGmmDensity
     from scenes.description import SceneDescription
 
 
@@ -29,7 +31,10 @@ class RunScene:
     """No summary and no progress bar."""
 
     def run(self) -> int:
-        """Check everything, let every actor walk, write the outputs."""
+        """Check everything, let every actor walk, write the outputs.
+
+        Ctrl-C ends the walks; those that have begun are written, without a film.
+        """
         compute_on_one()
         import priors
         import scenes
@@ -42,26 +47,40 @@ class RunScene:
         outputs.check_folder(self.out)
         for path in scene.films(self.out):
             outputs.require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
-        prior = priors.load(scene.prior)
-        walks = []
+        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior))
+        with outputs.made_folder(self.out):
+            self._write(scene, walks, films=() if interrupted else scene.films(self.out))
+        return INTERRUPTED if interrupted else 0
+
+    def _walk(
+        self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity"
+    ) -> tuple[list[Walk], bool]:
+        """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
+        walks: list[Walk] = []
         for actor, request in zip(scene.actors, requests, strict=True):
-            with bar(actor.name, quiet=self.quiet) as progress:
-                walks.append(walk(prior, request, seed=actor.seed, progress=progress))
+            try:
+                with bar(actor.name, quiet=self.quiet) as progress:
+                    walks.append(walk(prior, request, seed=actor.seed, progress=progress))
+            except KeyboardInterrupt:
+                if not walks:
+                    raise
+                return walks, True
             if not self.quiet:
                 print("\n".join([f"{actor.name}:", *(f"  {line}" for line in walks[-1].summary())]))
-        with outputs.made_folder(self.out):
-            self._write(scene, walks)
-        return 0
+            if walks[-1].interrupted:
+                return walks, True
+        return walks, False
 
-    def _write(self, scene: "SceneDescription", walks: Sequence[Walk]) -> None:
+    def _write(self, scene: "SceneDescription", walks: Sequence[Walk], films: Sequence[Path]) -> None:
         from mapctl import report
 
-        motions, films, reports = scene.motions(self.out), scene.films(self.out), scene.reports(self.out)
-        written = [*chain.from_iterable(motions.values()), *films, *reports]
+        motions, reports = scene.motions(self.out), scene.reports(self.out)
+        begun = scene.actors[: len(walks)]
+        written = [*chain.from_iterable(motions[actor.name] for actor in begun), *films, *reports]
         for path in {path.parent for path in written}:
             path.mkdir(parents=True, exist_ok=True)
         outputs.check_files(written)
-        for actor, done in zip(scene.actors, walks, strict=True):
+        for actor, done in zip(begun, walks, strict=True):
             for path in motions[actor.name]:
                 done.solution.motion.save(path)
         for path in reports:
@@ -81,8 +100,8 @@ class RunScene:
             film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, progress=progress)
 
     def _report(self, scene: "SceneDescription", walks: Sequence[Walk]) -> dict[str, Any]:
-        """By actor, the report of each walk."""
+        """By actor, the report of each walk that has begun."""
         request = options.as_request("run", self) | {"title": scene.title}
         actors = {actor.name: done.report(options.as_request("follow", actor))
-                  for actor, done in zip(scene.actors, walks, strict=True)}  # fmt: skip
+                  for actor, done in zip(scene.actors, walks, strict=False)}  # fmt: skip
         return {"request": request, "actors": actors}

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from mapctl.commands.options import MOTION_FPS
 from mapctl.progress import Progress
 
 if TYPE_CHECKING:
@@ -14,6 +13,10 @@ if TYPE_CHECKING:
     from mapctl.intent import Follow
     from mapctl.solver.result import Solution
     from priors.density import LstmGmmDensity
+
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C; what was solved until then is written, films are not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,13 @@ class Walk:
     """What came out."""
     seconds: float
     """Wall clock of the solve."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the solve, so that this is the first part of the walk."""
+        from mapctl.solver.result import Outcome
+
+        return self.solution.status.outcome is Outcome.INTERRUPTED
 
     @cached_property
     def measures(self) -> Mapping[str, float]:
@@ -82,16 +92,17 @@ def walk(prior: "LstmGmmDensity", request: "Follow", *, seed: int, progress: Pro
     began = time.perf_counter()
     solution = follow(
         prior, request.curve, seconds=request.seconds, speed=request.profile,
-        generator=torch.Generator().manual_seed(seed), fps=float(MOTION_FPS), progress=progress,
+        generator=torch.Generator().manual_seed(seed), progress=progress,
     )  # fmt: skip
     return Walk(request, prior, seed, solution, time.perf_counter() - began)
 
 
 def as_follow(curve: "Curve", speed: str | float | None, seconds: float | None) -> "Follow":
     """The wish, checked: RequestError for speeds and durations that make no sense or take too long."""
+    from mapctl.features import PRIOR_FPS
     from mapctl.intent import Follow, SpeedProfile
 
     profile = SpeedProfile.parse(str(1.2 if speed is None else speed))
     request = Follow(curve, profile, seconds)
-    request.frames(MOTION_FPS)
+    request.frames(PRIOR_FPS)
     return request

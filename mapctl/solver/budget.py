@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mapctl.errors import RequestError
 
@@ -21,6 +21,10 @@ class Budget:
         for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds)):
             if limit is not None and (math.isnan(limit) or limit < 0):
                 raise RequestError(f"a budget's {name} must be 0 or more (or None for no limit), got {limit}")
+
+    def within(self, seconds: float) -> "Budget":
+        """This budget, ending after so many seconds at the latest; infinity leaves it as it is."""
+        return replace(self, seconds=seconds if self.seconds is None else min(self.seconds, seconds))
 
 
 class Meter:

@@ -1,5 +1,6 @@
 """How one window is solved: over the latents of a rollout (the default), or over the states themselves."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -45,9 +46,10 @@ class Method(Protocol):
     """Solves one window."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Float[Tensor, "frames width"], generator: torch.Generator
-    ) -> SolvedWindow:
-        """`tail` is the end of the last window's `carry`, empty at the start."""
+        self, context: Context, terms: Sequence[Term], tail: Float[Tensor, "frames width"],
+        generator: torch.Generator, *, seconds: float = math.inf,
+    ) -> SolvedWindow:  # fmt: skip
+        """`tail` is the end of the last window's `carry`, empty at the start; `seconds` are left."""
         ...
 
 
@@ -69,10 +71,11 @@ class LatentMethod:
     """Where the first round starts."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator
-    ) -> SolvedWindow:
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:  # fmt: skip
         """See Method; the carry is the noise."""
-        meter = Meter(self.budget)
+        meter = Meter(self.budget.within(seconds))
         unknowns = self.proposal(context, terms, _extended(tail, context.frames), meter, generator)
         best = self._round(context, terms, unknowns, meter)
         start_energy = float(best[1].start_energy[0])
@@ -111,12 +114,14 @@ class StateMethod:
     """Of one window."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator
-    ) -> SolvedWindow:
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:  # fmt: skip
         """See Method; the carry is the features."""
+        meter = Meter(self.budget.within(seconds))
         features, plan = _continued(context, tail)
         states = States(context, self.scale, self.centre, plan.contacts)
-        objective, meter = Objective(states.build, terms), Meter(self.budget)
+        objective = Objective(states.build, terms)
         result = minimise(
             objective.energy_and_gradient, states.from_features(features), settings=self.lbfgs, meter=meter
         )

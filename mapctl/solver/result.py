@@ -16,6 +16,7 @@ class Outcome(Enum):
 
     DONE = "done"
     BUDGET = "stopped at its budget"
+    INTERRUPTED = "interrupted; what was solved until then is kept"
     INFEASIBLE = "the wishes cannot all hold"
     NOT_FINITE = "stopped where the energy was not finite; the best finite motion is returned"
 

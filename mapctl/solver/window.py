@@ -3,6 +3,7 @@
 The only place that advances a prior's state during a solve.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import Place, root_places
+from mapctl.features import PRIOR_FPS, Place, root_places
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.methods import LatentMethod, Method
@@ -76,7 +77,7 @@ class WindowSolver:
     """Lengths and budgets."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
-    fps: float = 30.0
+    fps: float = PRIOR_FPS
     """Frames per second."""
     method: Method = field(default_factory=LatentMethod)
     """How one window is solved."""
@@ -85,28 +86,39 @@ class WindowSolver:
         self, committed: Committed, terms_of: TermsOf, frames: int, *, generator: torch.Generator,
         progress: Callable[[int, int], None] | None = None, deadline: float | None = None,
     ) -> tuple[Committed, Outcome]:  # fmt: skip
-        """Extend `committed` to `frames` frames; stops early, with all that is committed, at the deadline.
+        """Extend `committed` to `frames` frames; stops early, with all that is committed, at the deadline or Ctrl-C.
 
-        `deadline` is a time.monotonic() value in seconds. Windows always look their full length ahead, so the last
-        frames are solved with a future too.
+        `deadline` is a time.monotonic() value in seconds; the window it falls into is committed as far as it was
+        improved by then. Windows always look their full length ahead, so the last frames are solved with a future too.
+        KeyboardInterrupt goes on where nothing has been solved yet.
         """
-        while (done := len(committed.features)) < frames:
-            if deadline is not None and time.monotonic() >= deadline:
-                return committed, Outcome.BUDGET
-            count = min(self.settings.frames - self.settings.overlap, frames - done)
-            following = self._next(committed, terms_of(done, self.settings.frames), count, generator)
-            if not following.finite(count):
-                return committed, Outcome.NOT_FINITE
-            committed = following
-            if progress is not None:
-                progress(min(len(committed.features), frames), frames)
+        begun = len(committed.features)
+        try:
+            while (done := len(committed.features)) < frames:
+                if (left := _seconds_until(deadline)) <= 0:
+                    return committed, Outcome.BUDGET
+                count = min(self.settings.frames - self.settings.overlap, frames - done)
+                following = self._next(committed, terms_of(done, self.settings.frames), count, generator, left)
+                if not following.windows[-1].evaluations and _seconds_until(deadline) <= 0:
+                    return committed, Outcome.BUDGET
+                if not following.finite(count):
+                    return committed, Outcome.NOT_FINITE
+                committed = following
+                if progress is not None:
+                    progress(min(len(committed.features), frames), frames)
+        except KeyboardInterrupt:
+            if len(committed.features) == begun:
+                raise
+            return committed, Outcome.INTERRUPTED
         return committed, Outcome.DONE
 
-    def _next(self, done: Committed, terms: Sequence[Term], count: int, generator: torch.Generator) -> Committed:
+    def _next(
+        self, done: Committed, terms: Sequence[Term], count: int, generator: torch.Generator, seconds: float
+    ) -> Committed:
         began = time.perf_counter()
         context = Context(self.density, done.state, done.place, done.joints_world, self.settings.frames,
                           self.skeleton, self.fps)  # fmt: skip
-        window = self.method(context, terms, done.tail, generator)
+        window = self.method(context, terms, done.tail, generator, seconds=seconds)
         features = window.trial.features[0, :count]
         ground, heading = root_places(features, done.place)
         joints = torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :]
@@ -118,3 +130,7 @@ class WindowSolver:
             joints_world=joints, tail=window.carry[count:], ledger=done.ledger.join(window.ledger.slice(count)),
             windows=(*done.windows, record),
         )  # fmt: skip
+
+
+def _seconds_until(deadline: float | None) -> float:
+    return math.inf if deadline is None else deadline - time.monotonic()
