@@ -26,7 +26,7 @@ from mapctl.terms import Footing, Noise, Path, Term
 class FollowSettings:
     """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
 
-    path_sigma_slow: float = 0.015
+    path_sigma_slow: float = 0.022
     """Sideways offset after its slow part is taken, metres."""
     path_free_sway: float = 0.03
     """Sideways offset that is left to the walker, metres."""
@@ -81,9 +81,15 @@ def follow(
 
 def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
     """The terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
-    path = Path(curve, arcs, joint=settings.joint, free_sway=settings.path_free_sway,
-                sigma_slow=settings.path_sigma_slow, sigma_raw=settings.path_sigma_raw,
-                sigma_progress=settings.path_sigma_progress)  # fmt: skip
+    path = Path(
+        curve,
+        arcs,
+        joint=settings.joint,
+        sigma_slow=settings.path_sigma_slow,
+        free_sway=settings.path_free_sway,
+        sigma_raw=settings.path_sigma_raw,
+        sigma_progress=settings.path_sigma_progress,
+    )
 
     def terms(first: int, frames: int) -> Sequence[Term]:
         return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *settings.extra
