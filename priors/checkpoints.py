@@ -10,7 +10,6 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -50,13 +49,25 @@ class Card:
 
 
 def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = True) -> None:
-    """Write `path` (.safetensors) and its card (.json beside it); float16 unless `half` is false."""
+    """Write `path` (.safetensors) and its card (.json beside it); float16 unless `half` is false.
+
+    CheckpointError, and nothing written, for a card that holds NaN or infinity, which JSON does not know.
+    """
+    text = as_json(vars(card), path, indent=1)
     kept = {name: (t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t).contiguous()
             for name, t in tensors.items()}  # fmt: skip
     with atomic_path(path) as scratch:
         save_file(kept, scratch)
     with atomic_path(path.with_suffix(".json")) as scratch:
-        scratch.write_text(json.dumps(vars(card), indent=1) + "\n", encoding="utf-8")
+        scratch.write_text(text, encoding="utf-8")
+
+
+def as_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:
+    """JSON that every parser reads; CheckpointError, naming the file it was for, where a number is not finite."""
+    try:
+        return json.dumps(values, indent=indent, allow_nan=False) + "\n"
+    except ValueError as error:
+        raise CheckpointError(f"cannot write {path}: it would hold a number that is not finite ({error})") from error
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], Card]:
@@ -98,9 +109,3 @@ def locate(name: str) -> Path:
     raise CheckpointError(
         f"no prior {name!r}: neither a file nor one of {', '.join(bundled()) or 'the bundled (none)'}"
     )
-
-
-def half_precision_error(tensors: dict[str, Tensor]) -> float:
-    """Largest relative change that float16 storage makes to any tensor (a gate before weights ship)."""
-    return max(float((t - t.half().float()).norm() / t.norm().clamp_min(1e-12)) for t in tensors.values()
-               if t.dtype is torch.float32)  # fmt: skip

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.errors import CheckpointError
+from mapctl.errors import CheckpointError, RequestError
 from mapctl.protocols import Abilities, Plan, Starts
 from priors import checkpoints
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig, LstmState
@@ -99,6 +99,6 @@ def load(name: str) -> LstmGmmDensity:
         Abilities(**card.abilities)
         model = LstmGmm(LstmGmmConfig(**card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, RuntimeError, RequestError) as error:
         raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
     return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)

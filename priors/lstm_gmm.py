@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, FeatureLayout
 from mapctl.protocols import Plan
 
@@ -32,6 +33,11 @@ class LstmGmmConfig:
     """Floor of the predicted log standard deviations (normalised units)."""
     max_log_sigma: float = 1.0
     """Their ceiling."""
+
+    def __post_init__(self):
+        for name in ("width", "components"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,7 +149,7 @@ def write_corpus(folder: Path, count: int = 5, frames: int = 80) -> Path:
 def tiny_model(*, width: int = 8, components: int = 3, seed: int = 0, retain: float = 0.9,
                dtype: torch.dtype = torch.float32) -> LstmGmm:  # fmt: skip
     """An untrained network with the statistics of the walks: it walks on at their mean pose and speed."""
-    mean, std = statistics(corpus().features, LAYOUT.continuous)
+    mean, std = statistics(corpus().features)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         model = LstmGmm(LstmGmmConfig(width=width, components=components, retain=retain), mean=mean, std=std)

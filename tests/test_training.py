@@ -1,11 +1,15 @@
 """The training command on five synthetic clips: it learns, resumes to the bit, and leaves a loadable prior."""
 
+import json
+import math
+import shutil
 from dataclasses import asdict, replace
 from functools import partial
 
 import pytest
 import torch
 from helpers import corpus, generator, walk, write_corpus
+from safetensors.torch import load_file, save_file
 
 import priors
 from mapctl.errors import CheckpointError, MapctlError, RequestError
@@ -113,13 +117,149 @@ def test_resuming_is_asked_for_and_needs_the_same_recipe(tmp_path, data):
         train(replace(request_in(out, data, resume=True), config=replace(TINY, width=9)))
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[]", '{"tensors": "gone"}'])
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory, data):
+    """The folder of a run that was killed at its third step."""
+    out = tmp_path_factory.mktemp("begun") / "run"
+    with pytest.raises(Killed):
+        train(request_in(out, data), killer(4))
+    return out
+
+
+def test_a_run_goes_on_with_its_own_data_only(tmp_path, data, begun):
+    for name, walks in (("more", 6), ("less", 4)):
+        folder = write_corpus(tmp_path / name, count=walks)
+        with pytest.raises(CheckpointError, match=f"begun with other data .*clips: 5 then, {walks} now"):
+            train(request_in(copied(begun, tmp_path / f"{name}-run"), folder, resume=True))
+    swapped = shutil.copytree(data, tmp_path / "swapped")
+    (swapped / "walk-1.bvh").write_bytes((data / "walk-2.bvh").read_bytes())
+    with pytest.raises(CheckpointError, match=r"other data \(features: \w+ then, \w+ now\)"):
+        train(request_in(copied(begun, tmp_path / "swapped-run"), swapped, resume=True))
+    (tmp_path / "moved" / "walks").mkdir(parents=True)
+    moved = shutil.copytree(data, tmp_path / "moved" / "walks", dirs_exist_ok=True)
+    with pytest.raises(CheckpointError, match=r"other data \(clip names: \w+ then, \w+ now\)"):
+        train(request_in(copied(begun, tmp_path / "moved-run"), moved.parent, resume=True))
+    with pytest.raises(CheckpointError, match=r"other data \(match:  then, walk now\)"):
+        train(request_in(copied(begun, tmp_path / "matched-run"), data, match="walk", resume=True))
+
+
+def copied(run_folder, place):
+    return shutil.copytree(run_folder, place)
+
+
+def test_copied_data_are_the_same_data(tmp_path, data, begun):
+    elsewhere = shutil.copytree(data, tmp_path / "elsewhere")
+    assert train(request_in(copied(begun, tmp_path / "run"), elsewhere, resume=True)).exists()
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", "null", "[" * 100_000, '{"tensors": "gone"}', '{"curve": 3}',
+                                     '{"curve": [3]}', '{"curve": [], "settings": 3}'])  # fmt: skip
 def test_a_broken_checkpoint_is_refused(tmp_path, data, content):
     out = tmp_path / "run"
     out.mkdir()
     (out / "checkpoint.json").write_text(content)
     with pytest.raises(CheckpointError, match="no readable checkpoint"):
         train(request_in(out, data, resume=True))
+
+
+@pytest.mark.parametrize(("key", "value"), [
+    ("tensors", None), ("tensors", "checkpoint.json"), ("step", None), ("step", "three"), ("step", []), ("curve", None),
+    ("settings", []), ("network", None), ("data", "all"),
+])  # fmt: skip
+def test_a_malformed_index_is_refused(tmp_path, data, begun, key, value):
+    out = copied(begun, tmp_path / "run")
+    index = json.loads((out / "checkpoint.json").read_text())
+    for broken in (index | {key: value}, {name: index[name] for name in index if name != key}):
+        (out / "checkpoint.json").write_text(json.dumps(broken))
+        with pytest.raises(CheckpointError, match="no readable checkpoint"):
+            train(request_in(out, data, resume=True))
+
+
+@pytest.mark.parametrize("drop", ["generator", "model.fc1.weight", "optimiser.0.exp_avg"])
+def test_a_checkpoint_without_a_tensor_is_refused(tmp_path, data, begun, drop):
+    out = copied(begun, tmp_path / "run")
+    (file,) = out.glob("step-*")
+    tensors = load_file(file)
+    del tensors[drop]
+    save_file(tensors, file)
+    with pytest.raises(CheckpointError, match="no readable checkpoint"):
+        train(request_in(out, data, resume=True))
+
+
+@pytest.mark.parametrize("how", ["loss", "weights"])
+def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, data, monkeypatch, how):
+    out, step = tmp_path / "run", Trainer.train_step
+
+    def diverging(trainer):
+        if trainer.step == 3 and how == "weights":
+            trainer.model.fc1.weight.data[0, 0] = torch.nan
+            trainer.step += 1
+            return 1.0
+        if trainer.step == 3:
+            trainer.features = trainer.features * torch.nan
+        return step(trainer)
+
+    monkeypatch.setattr(Trainer, "train_step", diverging)
+    with pytest.raises(MapctlError, match=r"training diverged at step 4: .*; the last checkpoint, .* is kept"):
+        train(request_in(out, data))
+    assert json.loads((out / "checkpoint.json").read_text())["step"] == 3
+    assert not (out / "model.safetensors").exists()
+    monkeypatch.undo()
+    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+    assert train(request_in(out, data, resume=True)).exists()
+
+
+def test_what_is_not_finite_is_null_in_the_curve(tmp_path, data, monkeypatch):
+    monkeypatch.setattr(run, "free_run", lambda model, corpus: {"free_run_speed_ratio": math.inf})
+    card = priors.load(str(train(request_in(tmp_path / "run", data)))).card
+    assert card.training["curve"][-1]["free_run_speed_ratio"] is None
+    for file in (tmp_path / "run").glob("*.json"):
+        json.loads(file.read_text(), parse_constant=pytest.fail)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"settings": {"steps": 0}}, "steps must be at least 1, got 0"),
+    ({"settings": {"batch": -1}}, "batch must be at least 1, got -1"),
+    ({"settings": {"window": 0}}, "window must be at least 1, got 0"),
+    ({"settings": {"optimiser": "sgd"}}, "optimiser must be adam or rmsprop, got 'sgd'"),
+    ({"settings": {"schedule": "none"}}, "schedule must be cosine or epochs, got 'none'"),
+    ({"starts": 0}, "starts must be at least 1, got 0"),
+])  # fmt: skip
+def test_impossible_recipes_are_refused(tmp_path, data, change, message):
+    with pytest.raises(RequestError, match=message):
+        replace(request_in(tmp_path, data, settings=change.pop("settings", {})), **change)
+    with pytest.raises(RequestError, match="width must be at least 1, got 0"):
+        LstmGmmConfig(width=0)
+
+
+def test_the_device_and_the_folder_are_checked_before_anything_is_read(tmp_path, data, monkeypatch):
+    monkeypatch.setattr(corpora, "read", None)
+    with pytest.raises(RequestError, match="auto, cpu or cuda"):
+        train(replace(request_in(tmp_path / "run", data), device="abacus"))
+    (tmp_path / "file").touch()
+    with pytest.raises(RequestError, match="is not a folder"):
+        train(request_in(tmp_path / "file", data))
+    assert {place.name for place in tmp_path.iterdir()} == {"file"}
+
+
+def test_a_trainer_leaves_the_callers_random_numbers_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    first = Trainer(TINY, SETTINGS, corpus())
+    assert torch.equal(torch.rand(3), expected)
+    second = Trainer(TINY, SETTINGS, corpus())
+    assert torch.equal(first.model.fc1.weight, second.model.fc1.weight)
+
+
+def test_each_window_is_mirrored_with_even_odds():
+    trainer = Trainer(TINY, replace(SETTINGS, batch=1), corpus())
+    trainer.starts = trainer.starts[:1]
+    plain = trainer.features[: SETTINGS.window + 1]
+    drawn = [trainer._windows()[0] for _ in range(200)]
+    mirrored = sum(torch.equal(window, mirror_features(plain)) for window in drawn)
+    assert mirrored + sum(torch.equal(window, plain) for window in drawn) == 200
+    assert 70 < mirrored < 130
 
 
 def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
@@ -159,6 +299,30 @@ def test_the_corpus_is_the_features_of_the_clips_and_is_read_once(tmp_path, data
         corpora.read(data, match="walk-[0-2]", cache=tmp_path)
 
 
+@pytest.mark.parametrize("content", [b"", b"not a corpus", None])
+def test_a_damaged_cache_is_read_anew(tmp_path, data, content):
+    whole = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    (stored,) = tmp_path.iterdir()
+    stored.write_bytes(stored.read_bytes()[:-100] if content is None else content)
+    again = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    assert torch.equal(again.features, whole.features)
+    assert corpora.read(data, match="walk-[0-2]", cache=tmp_path).names == whole.names
+
+
+def test_a_cache_of_other_rig_tables_or_contact_thresholds_is_not_taken(tmp_path, data, monkeypatch):
+    corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    table, contacts = corpora.rigs.known(), corpora.ContactSettings
+    for what, other in (
+        ("rigs.known", lambda: (*table[:-1], replace(table[-1], straighten=("leftHand",)))),
+        ("ContactSettings", partial(contacts, slow=0.4)),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"priors.training.corpus.{what}", other)
+            patch.setattr(corpora, "clip_features", None)
+            with pytest.raises(TypeError):
+                corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+
+
 def test_the_split_is_by_clip_seeded_and_complete():
     many = corpora.Corpus(tuple(map(str, range(60))), (80,) * 60, torch.zeros(4800, LAYOUT.size))
     first, again, other = (corpora.split(many, seed) for seed in (1, 1, 2))
@@ -177,7 +341,7 @@ def test_windows_stay_within_their_clips():
 
 
 def test_statistics_are_symmetric_and_floored():
-    mean, std = statistics(corpus().features, LAYOUT.continuous)
+    mean, std = statistics(corpus().features)
     torch.testing.assert_close(mirror_features(mean[None])[0], mean, atol=1e-5, rtol=0)
     assert float(std.min()) >= 0.001
     assert bool((mean[LAYOUT.continuous :] == 0.5).all())

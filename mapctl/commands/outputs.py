@@ -41,12 +41,7 @@ def check_folder(folder: str | PathLike[str]) -> None:
     """RequestError unless the folder is there and can be written in, or can be made; leaves no trace."""
     from mapctl.formats import atomic
 
-    place = Path(os.path.realpath(folder))
-    while not place.exists():
-        place = place.parent
-    if not place.is_dir():
-        raise RequestError(f"cannot write to {folder}: {place} is not a folder")
-    atomic.check_writable(place / ".mapctl")
+    atomic.check_folder(folder)
 
 
 @contextmanager

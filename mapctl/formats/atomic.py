@@ -55,6 +55,16 @@ def check_writable(path: str | PathLike[str]) -> None:
         raise RequestError(f"cannot write {path}: {error.strerror or error}") from error
 
 
+def check_folder(folder: str | PathLike[str]) -> None:
+    """RequestError unless the folder is there and can be written in, or can be made; leaves no trace."""
+    place = Path(os.path.realpath(folder))
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise RequestError(f"cannot write to {folder}: {place} is not a folder")
+    check_writable(place / ".mapctl")
+
+
 def _check_place(path: str | PathLike[str], target: Path) -> None:
     """Renaming onto a folder or a device (/dev/null) would fail late or replace it, so refuse both early."""
     if not os.fspath(path):

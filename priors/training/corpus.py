@@ -9,11 +9,12 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from mapctl import retarget
+from mapctl import retarget, rigs
+from mapctl.contacts import ContactSettings
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.formats import load
@@ -35,6 +36,13 @@ class Corpus:
     """Frames of each clip."""
     features: Float[Tensor, "frames size"]
     """All frames, float32, physical units."""
+
+    def identity(self) -> dict[str, str]:
+        """What tells this corpus from others: its size, and short hashes of names, lengths and features."""
+        hashed = {"clip names": repr(self.names).encode(), "clip lengths": repr(self.lengths).encode(),
+                  "features": self.features.contiguous().numpy().tobytes()}  # fmt: skip
+        size = {"clips": str(len(self.names)), "frames": str(len(self.features))}
+        return size | {name: sha256(content).hexdigest()[:12] for name, content in hashed.items()}
 
     def clips(self) -> list[Float[Tensor, "frames size"]]:
         """The features of each clip."""
@@ -95,8 +103,8 @@ def read(
         raise RequestError(f"no .bvh below {data} matches {match!r}")
     key = _fingerprint(data, files, skip_first)
     stored = cache / f"corpus-{key}.safetensors"
-    if stored.exists():
-        return _read_cache(stored)
+    if (kept := _read_cache(stored)) is not None:
+        return kept
     clips, names = [], []
     for number, file in enumerate(files):
         clips.append(clip_features(file, skip_first=skip_first))
@@ -134,15 +142,22 @@ def window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts
 
 
 def _fingerprint(data: Path, files: list[Path], skip_first: bool) -> str:
-    parts = [LAYOUT.fingerprint(), str(skip_first)]
+    """Of everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
+    parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known()), repr(ContactSettings()), str(skip_first)]
     parts += [f"{f.relative_to(data)} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files]
     return sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-def _read_cache(stored: Path) -> Corpus:
-    with safe_open(stored, framework="pt") as file:
-        index = json.loads(file.metadata()["index"])
-        return Corpus(tuple(index["names"]), tuple(index["lengths"]), file.get_tensor("features"))
+def _read_cache(stored: Path) -> Corpus | None:
+    """None where there is none, or only a damaged one: the clips themselves are read again."""
+    try:
+        with safe_open(stored, framework="pt") as file:
+            index = json.loads(file.metadata()["index"])
+            corpus = Corpus(tuple(index["names"]), tuple(index["lengths"]), file.get_tensor("features"))
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError):
+        return None
+    whole = len(corpus.names) == len(corpus.lengths) and sum(corpus.lengths) == len(corpus.features)
+    return corpus if whole else None
 
 
 def _write_cache(corpus: Corpus, stored: Path) -> None:

@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import mirror_features
+from mapctl.errors import MapctlError, RequestError
+from mapctl.features import LAYOUT, mirror_features
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus, window_starts
 
@@ -41,11 +42,19 @@ class TrainingSettings:
     bit_flips: float = 0.02
     """Share of input contact bits that are flipped."""
     mirror: bool = True
-    """Half of the windows are mirrored left to right."""
+    """Each window is mirrored left to right with probability one half."""
     weight_decay: float = 1e-4
     """Decoupled, for adam."""
     seed: int = 1
     """Of weights, windows and noise."""
+
+    def __post_init__(self):
+        for name in ("steps", "batch", "window"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name, known in (("optimiser", ("adam", "rmsprop")), ("schedule", ("cosine", "epochs"))):
+            if getattr(self, name) not in known:
+                raise RequestError(f"{name} must be {' or '.join(known)}, got {getattr(self, name)!r}")
 
 
 PAPER = (
@@ -56,7 +65,7 @@ PAPER = (
 """The variant as the paper prints it (30,000 iterations)."""
 
 
-def statistics(features: Float[Tensor, "frames size"], continuous: int) -> tuple[Tensor, Tensor]:
+def statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of features and their mirror image; floors keep held joints from exploding.
 
     Rotations are held to at least 0.01 rad (0.6 degrees), displacements to 1 mm; contact bits map to -1 and 1.
@@ -64,9 +73,10 @@ def statistics(features: Float[Tensor, "frames size"], continuous: int) -> tuple
     both = torch.cat([features, mirror_features(features)])
     mean, std = both.mean(0), both.std(0)
     floor = torch.full_like(std, 0.01)
-    floor[:2] = 0.001
-    floor[2] = 0.002
-    mean[continuous:], floor[continuous:], std[continuous:] = 0.5, 0.5, 0.5
+    floor[LAYOUT.slices["root_displacement_heading"]] = 0.001
+    floor[LAYOUT.slices["heading_change"]] = 0.002
+    for values in (mean, floor, std):
+        values[LAYOUT.slices["contacts"]] = 0.5
     return mean, torch.maximum(std, floor)
 
 
@@ -76,20 +86,22 @@ class Trainer:
     def __init__(self, config: LstmGmmConfig, settings: TrainingSettings, corpus: Corpus, device: str = "cpu"):
         self.settings, self.device, self.step = settings, device, 0
         self.generator = torch.Generator().manual_seed(settings.seed)
-        torch.manual_seed(settings.seed)
-        size = corpus.features.shape[1]
-        mean, std = statistics(corpus.features, size - 2)
-        self.model = LstmGmm(config, mean=mean, std=std).to(device)
+        mean, std = statistics(corpus.features)
+        with torch.random.fork_rng(devices=[]):  # torch draws weights from its global generator, which is the caller's
+            torch.default_generator.manual_seed(settings.seed)
+            self.model = LstmGmm(config, mean=mean, std=std).to(device)
         self.features = corpus.features
         self.starts = window_starts(corpus.lengths, settings.window + 1)
         self.optimiser = self._optimiser()
 
     def train_step(self) -> float:
-        """One optimiser step; returns the loss in nats a frame."""
+        """One optimiser step; returns the loss in nats a frame. MapctlError, and no step, where that is no number."""
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate()
         loss = -self._log_prob(self._windows()).mean()
+        if not torch.isfinite(loss):
+            raise _diverged(self.step + 1, f"the loss is {loss.item()} nats")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         if settings.optimiser == "rmsprop":
@@ -108,6 +120,11 @@ class Trainer:
             return settings.learning_rate * 0.95**passes
         warm = min(1.0, (self.step + 1) / 200)
         return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / settings.steps)))
+
+    def check_finite(self) -> None:
+        """MapctlError unless every weight is a number."""
+        if not all(bool(torch.isfinite(values).all()) for values in self.model.parameters()):
+            raise _diverged(self.step, "its weights are not finite")
 
     def state(self) -> dict:
         """Everything a bit-exact continuation needs; tensors and plain numbers only."""
@@ -133,8 +150,8 @@ class Trainer:
         frames = self.starts[picked, None] + torch.arange(settings.window + 1)
         windows = self.features[frames]
         if settings.mirror:
-            half = settings.batch // 2
-            windows = torch.cat([windows[:half], mirror_features(windows[half:])])
+            chosen = torch.rand(settings.batch, 1, 1, generator=self.generator) < 0.5
+            windows = torch.where(chosen, mirror_features(windows), windows)
         return windows.to(self.device)
 
     def _log_prob(self, windows: Tensor) -> Tensor:
@@ -153,6 +170,10 @@ class Trainer:
         flips = torch.rand(shape[0], shape[1], 2, generator=self.generator) < settings.bit_flips
         bits = torch.where(flips.to(inputs.device), -inputs[..., size:], inputs[..., size:])
         return torch.cat([inputs[..., :size] + noise.to(inputs.device), bits], dim=-1)
+
+
+def _diverged(step: int, how: str) -> MapctlError:
+    return MapctlError(f"training diverged at step {step}: {how}; the last checkpoint, if there is one, is kept")
 
 
 def validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:

@@ -5,12 +5,14 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import Place, decode
+from mapctl.formats.atomic import check_folder
 from mapctl.metrics import reference
 from priors import checkpoints
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
@@ -55,12 +57,19 @@ class TrainRequest:
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
 
+    def __post_init__(self):
+        for name in ("starts", "report_steps", "validate_steps"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+
 
 def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path:
     """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
 
-    Killed and resumed, a run gives the same weights bit for bit on one machine (a test holds it to that).
+    Killed and resumed, a run gives the same weights bit for bit on one machine (a test holds it to that). MapctlError
+    where training diverges; the last checkpoint then stays as it was.
     """
+    device = _device(request.device)
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     _check_run(request)
@@ -68,13 +77,14 @@ def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path
                           skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
     parts = corpora.split(corpus, request.settings.seed)
     progress(f"{len(corpus.names)} clips, {len(corpus.features)} frames; training on {len(parts.train.names)}")
-    trainer = Trainer(request.config, request.settings, parts.train, _device(request.device))
-    curve = _resume(request, trainer, progress)
-    _loop(request, trainer, parts, curve, progress)
+    trainer = Trainer(request.config, request.settings, parts.train, device)
+    data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed)}
+    curve = _resume(request, trainer, data, progress)
+    _loop(request, trainer, parts, curve, progress, save=partial(resume.save, request.out, trainer, curve, data))
     return export(request, trainer, parts, curve)
 
 
-def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: list[dict[str, float]]) -> Path:
+def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve) -> Path:
     """Write the model in float16 with its starts and card."""
     model = trainer.model.cpu().eval()
     found = choose(
@@ -89,7 +99,7 @@ def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve:
 
 
 def _card(
-    request: TrainRequest, model: LstmGmm, parts: corpora.Split, curve: list[dict[str, float]], starts: tuple[str, ...]
+    request: TrainRequest, model: LstmGmm, parts: corpora.Split, curve: resume.Curve, starts: tuple[str, ...]
 ) -> checkpoints.Card:
     data = {"clips": sum(len(p.names) for p in (parts.train, parts.validation, parts.test)),
             "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
@@ -123,8 +133,9 @@ def _mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
 
 
 def _loop(
-    request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: list[dict[str, float]], progress: Progress
-) -> None:
+    request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve, progress: Progress, *,
+    save: Callable[[], None],
+) -> None:  # fmt: skip
     saved, losses, began = time.monotonic(), [], time.monotonic()
     while trainer.step < request.settings.steps:
         losses.append(trainer.train_step())
@@ -132,25 +143,33 @@ def _loop(
         if trainer.step % request.report_steps == 0 or last:
             progress(f"step {trainer.step}: {sum(losses) / len(losses):.2f} nats, {time.monotonic() - began:.0f} s")
             losses = []
-        if trainer.step % request.validate_steps == 0 or last:
+        due = last or time.monotonic() - saved > 60 * request.checkpoint_minutes
+        validate = last or trainer.step % request.validate_steps == 0
+        if due or validate:
+            trainer.check_finite()
+        if validate:
             curve.append(_validate(trainer, parts))
             progress(json.dumps(curve[-1]))
-        if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
-            resume.save(request.out, trainer, curve)
+        if due:
+            save()
             saved = time.monotonic()
 
 
-def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float]:
-    """Validation likelihood and the free-run health gate: likelihood does not predict stability (design, 11.2)."""
+def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float | None]:
+    """Validation likelihood and the free-run health gate: likelihood does not predict stability (design, 11.2).
+
+    None stands for what is not finite, as after a free run that exploded.
+    """
     trainer.model.eval()
     row = {"step": trainer.step, "validation_nats": validation_nats(trainer.model, parts.validation)}
     row |= free_run(trainer.model, parts.validation)
     trainer.model.train()
-    return row
+    return {name: value if math.isfinite(value) else None for name, value in row.items()}
 
 
 def _check_run(request: TrainRequest) -> None:
-    """Before anything is read: the folder holds a run if and only if it is to be resumed."""
+    """Before anything is read: the folder can be written, and holds a run if and only if it is to be resumed."""
+    check_folder(request.out)
     present = resume.exists(request.out)
     if request.resume and not present:
         raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
@@ -158,11 +177,11 @@ def _check_run(request: TrainRequest) -> None:
         raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
 
 
-def _resume(request: TrainRequest, trainer: Trainer, progress: Progress) -> list[dict[str, float]]:
+def _resume(request: TrainRequest, trainer: Trainer, data: dict[str, str], progress: Progress) -> resume.Curve:
     if not request.resume:
         request.out.mkdir(parents=True, exist_ok=True)
         return []
-    curve = resume.load(request.out, trainer)
+    curve = resume.load(request.out, trainer, data)
     progress(f"resumed at step {trainer.step}")
     return curve
 
