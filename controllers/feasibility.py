@@ -11,6 +11,7 @@ from mapctl.motion import Motion
 from mapctl.protocols import Abilities
 
 _TOLERATED_CM = 15.0
+_OVERSHOOT = 0.15  # metres: the last frame of a walk may lie a step of one frame beyond the end
 _CORNER_SECONDS = 1.0
 
 
@@ -24,7 +25,7 @@ def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abili
     if slowest < abilities.slowest:
         notes.append(f"{slowest:.2f} m/s is slower than the prior's data, which begin at {abilities.slowest:.2f} m/s")
     notes += _corners(request, arcs, abilities)
-    if not request.curve.closed and float(arcs[-1]) > request.curve.length + 0.05:
+    if not request.curve.closed and float(arcs[-1]) > request.curve.length + _OVERSHOOT:
         over = float(arcs[-1]) - request.curve.length
         notes.append(
             f"the last {over:.1f} m go straight on beyond the end of the curve of {request.curve.length:.1f} m"
