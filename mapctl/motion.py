@@ -113,12 +113,12 @@ class Motion:
                        moving_offsets={j: linear(v) for j, v in self.moving_offsets.items()})  # fmt: skip
 
     def mirror(self) -> "Motion":
-        """Left and right exchanged through the plane x = 0; for skeletons named as the canonical one.
+        """Left and right exchanged through the plane x = 0; for canonical joint frames and names.
 
-        Bones are exchanged too. Raises MapctlError where a side's joint has no partner.
+        Bones are exchanged too. Raises MapctlError where a side's joint has no partner, or sides are named otherwise.
         """
         names = self.skeleton.names
-        swap = [self.skeleton.index(mirrored_name(name)) for name in names]
+        swap = self.skeleton.mirror_partners()
         flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
         # A reflection through x = 0 keeps rotation about x and reverses rotation about y and z.
         flip_quat = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)

@@ -134,9 +134,18 @@ def _straightened(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ..
         raise RequestError(f"cannot straighten {CANONICAL.names[index]}: the rig has no joint after it")
     bone = torch.nn.functional.normalize(skeleton.offsets[rig_child], dim=0)
     aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
-    axis = torch.linalg.cross(bone, aim)
+    return _shortest_turn(bone, aim)
+
+
+def _shortest_turn(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation from one unit vector to another; of opposite ones, one of the half turns."""
+    axis, cosine = torch.linalg.cross(start, stop), start @ stop
+    if cosine < 0 and axis.norm() < 1e-9:
+        across = torch.nn.functional.one_hot(start.abs().argmin(), 3).to(start.dtype)
+        axis = torch.linalg.cross(start, across)
+        return rotations.rotation_vector_to_matrix(axis / axis.norm() * torch.pi)
     sine = axis.norm().clamp_min(1e-12)
-    return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, bone @ aim))
+    return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
 
 
 def _bones(skeleton: Skeleton, joint_of: tuple[int | None, ...], tpose: Tensor):

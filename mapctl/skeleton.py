@@ -1,5 +1,6 @@
 """Skeletons: joint names, the tree, and bone offsets; and the canonical one that priors speak."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -48,6 +49,18 @@ class Skeleton:
         same_tree = self.names == other.names and self.parents == other.parents
         return same_tree and bool(torch.allclose(self.offsets, other.offsets, atol=tolerance, rtol=0))
 
+    def mirror_partners(self) -> list[int]:
+        """By joint, the index of its mirror image; itself in the middle of the body.
+
+        Sides are told by the canonical `left` and `right` alone. MapctlError for a skeleton that has none, names sides
+        in another way (which would pass for the middle), or lacks a partner.
+        """
+        foreign = [name for name in self.names if mirrored_name(name) == name and _OTHER_SIDES.search(name)]
+        if foreign or all(mirrored_name(name) == name for name in self.names):
+            some = ", ".join((foreign or self.names)[:3])
+            raise MapctlError(f"cannot tell left from right by the joints {some}; use retarget.to_canonical first")
+        return [self.index(mirrored_name(name)) for name in self.names]
+
     def children(self, joint: int) -> list[int]:
         """Indices of the joint's children."""
         return [j for j, parent in enumerate(self.parents) if parent == joint]
@@ -79,6 +92,10 @@ def _canonical() -> Skeleton:
 
 
 CANONICAL = _canonical()
+# How other rigs name sides: Hand_R, Bip01 L Hand, LeftHand, rHand, RHand, footleft.
+_OTHER_SIDES = re.compile(
+    r"(?i:(?:^|[^a-z0-9])(?:l|r|left|right)(?:$|[^a-z0-9]))|Left|Right|^[lrLR](?=[A-Z][a-z])|(?i:left|right)$"
+)
 TOE_REST_HEIGHT = 0.0425
 """Height of the canonical toe joints over the floor while the foot stands flat, metres."""
 

@@ -16,9 +16,7 @@ def travelling(frames=6, seed=0):
     """A motion whose joint 1 travels within its parent."""
     motion = random_motion(bandai_skeleton(), frames, seed=seed)
     track = torch.randn(frames, 3, generator=generator(seed), dtype=torch.float64)
-    return Motion(
-        motion.skeleton, motion.fps, motion.root_position, motion.local_quat_xyzw, {1: track}, "layout"
-    )
+    return Motion(motion.skeleton, motion.fps, motion.root_position, motion.local_quat_xyzw, {1: track}, "layout")
 
 
 def same(a, b, tolerance=1e-9):
@@ -52,9 +50,7 @@ def test_a_travelling_joint_moves_what_hangs_on_it():
 def test_unlike_motions_are_not_joined(other):
     motion = random_motion(CANONICAL, 3)
     fps = Fraction(60) if other == "fps" else Fraction(30)
-    longer = Skeleton(
-        CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * (1.1 if other == "skeleton" else 1)
-    )
+    longer = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * (1.1 if other == "skeleton" else 1))
     with pytest.raises(MapctlError, match="one skeleton and frame rate"):
         motion.join(random_motion(longer, 3, fps=fps))
 
@@ -129,12 +125,32 @@ def test_a_mirror_image_has_every_joint_on_the_other_side():
         ("rightToes", "leftToes"),
     ):
         place = motion.joint_positions()[:, CANONICAL.index(name)] * torch.tensor([-1.0, 1, 1])
-        torch.testing.assert_close(
-            image.joint_positions()[:, CANONICAL.index(other)], place, atol=1e-9, rtol=0
-        )
+        torch.testing.assert_close(image.joint_positions()[:, CANONICAL.index(other)], place, atol=1e-9, rtol=0)
 
 
 def test_a_side_without_partner_cannot_be_mirrored():
     one_armed = Skeleton(("hips", "leftHand"), (-1, 0), torch.zeros(2, 3).double())
     with pytest.raises(MapctlError, match="no joint 'rightHand'"):
         random_motion(one_armed).mirror()
+
+
+@pytest.mark.parametrize("name", ["Toes_R", "Hand_L", "LeftFoot", "mixamorig:LeftUpLeg", "Bip01 R Thigh", "rShldr",
+                                  "LHipJoint", "thigh.l", "footleft"])  # fmt: skip
+def test_sides_named_otherwise_are_not_mirrored_in_silence(name):
+    rig = Skeleton(("hips", "leftHand", "rightHand", name), (-1, 0, 0, 0), torch.zeros(4, 3).double())
+    with pytest.raises(MapctlError, match=f"cannot tell left from right by the joints {name}; use retarget"):
+        random_motion(rig).mirror()
+
+
+def test_skeletons_without_canonical_sides_are_not_mirrored_in_silence():
+    rig = Skeleton(("root", "lfemur", "rfemur"), (-1, 0, 0), torch.zeros(3, 3).double())
+    with pytest.raises(MapctlError, match="by the joints root, lfemur, rfemur; use retarget"):
+        random_motion(rig).mirror()
+    with pytest.raises(MapctlError, match=r"Shoulder_L, .* use retarget\.to_canonical first"):
+        random_motion(bandai_skeleton()).mirror()
+
+
+def test_joints_in_the_middle_are_their_own_mirror_image():
+    names = ("hips", "L5", "lowerSpine", "leftHand", "rightHand")
+    rig = Skeleton(names, (-1, 0, 0, 0, 0), torch.zeros(5, 3).double())
+    assert rig.mirror_partners() == [0, 1, 2, 4, 3]

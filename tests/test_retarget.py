@@ -78,9 +78,7 @@ def test_the_t_pose_comes_out_as_identity(rig):
 
 
 def test_bandai_bones_are_the_canonical_ones():
-    np.testing.assert_allclose(
-        retarget.map_rig(bandai_skeleton()).skeleton.offsets, CANONICAL.offsets, atol=1e-9
-    )
+    np.testing.assert_allclose(retarget.map_rig(bandai_skeleton()).skeleton.offsets, CANONICAL.offsets, atol=1e-9)
 
 
 def test_bent_limbs_of_cmu_are_straight_in_its_t_pose():
@@ -109,18 +107,13 @@ def test_joints_beyond_the_canonical_ones_keep_the_originals_rotation_or_rest():
     kept = retarget.from_canonical(canonical, rigmap, motion).local_quat_xyzw[:, thumb]
     assert turn_between(kept, motion.local_quat_xyzw[:, thumb]) < 1e-9
     longer = retarget.from_canonical(canonical.join(canonical), rigmap, motion)
-    assert (
-        turn_between(longer.local_quat_xyzw[:, thumb], torch.tensor([0.0, 0, 0, 1]).double().expand(10, 4))
-        < 1e-9
-    )
+    assert turn_between(longer.local_quat_xyzw[:, thumb], torch.tensor([0.0, 0, 0, 1]).double().expand(10, 4)) < 1e-9
 
 
 def test_the_static_root_of_an_original_stays():
     motion = random_on("bandai-namco")
     canonical, rigmap = retarget.to_canonical(motion)
-    moved = retarget.from_canonical(
-        replace(canonical, root_position=canonical.root_position + 1), rigmap, motion
-    )
+    moved = retarget.from_canonical(replace(canonical, root_position=canonical.root_position + 1), rigmap, motion)
     torch.testing.assert_close(moved.root_position, motion.root_position)
     hips = motion.joint_positions()[:, 1] + 1
     torch.testing.assert_close(moved.joint_positions()[:, 1], hips, atol=1e-9, rtol=0)
@@ -140,3 +133,14 @@ def test_an_unknown_rig_is_refused_with_the_known_ones():
     strange = Skeleton(("bone_1", "bone_2"), (-1, 0), torch.zeros(2, 3).double())
     with pytest.raises(RequestError, match=r"bone_1, bone_2.*canonical, bandai-namco, cmu-daz"):
         retarget.map_rig(strange)
+
+
+@pytest.mark.parametrize("start", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0], [0.6, 0, 0.8], [0.36, 0.48, 0.8]])
+def test_the_shortest_turn_leads_there_even_to_the_opposite(start):
+    start = torch.tensor(start).double()
+    start = start / start.norm()
+    for stop in (-start, start, start.roll(1), torch.nn.functional.normalize(-start + 1e-7 * start.roll(1), dim=0)):
+        turn = retarget._shortest_turn(start, stop)
+        torch.testing.assert_close(turn @ start, stop, atol=1e-9, rtol=0)
+        torch.testing.assert_close(turn @ turn.T, torch.eye(3).double(), atol=1e-9, rtol=0)
+        assert float(torch.linalg.det(turn)) == pytest.approx(1)
