@@ -56,13 +56,13 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     elsewhere. A channel is added where the source's layout cannot hold the motion. Same motion, same bytes.
     RequestError where the motion holds a NaN or the file cannot be written; then nothing is written.
     """
-    _check_finite(motion, path)
+    check_finite(motion, path)
     layout = bvh_layout.of(motion, path)
     order = [motion.skeleton.index(name) for name in layout.hierarchy.names]
-    quat_xyzw = _array(motion.local_quat_xyzw)[:, order]
-    translations = _all_translations(motion)[:, order] / layout.metres_per_unit
+    quat_xyzw = as_array(motion.local_quat_xyzw)[:, order]
+    translations = all_translations(motion)[:, order] / layout.metres_per_unit
     tree = bvh_layout.fitted(layout, translations, quat_xyzw)
-    values = _channel_values(tree, translations, quat_xyzw)
+    values = channel_values(tree, translations, quat_xyzw)
     text = bvh_text.compose(tree, layout.frame_time, values, decimals=layout.decimals)
     write_bytes(path, text.encode(layout.encoding))
 
@@ -113,7 +113,7 @@ def _quaternions(tree: Hierarchy, values: np.ndarray) -> Float[Tensor, "frames j
     return rotations.sign_continuous(torch.from_numpy(quat_xyzw))
 
 
-def _channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+def channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
     """The motion block (frames, channels), file unit and degrees."""
     values = np.zeros((len(quat_xyzw), len(tree.labels())))
     for joint, columns in enumerate(tree.position_columns()):
@@ -123,23 +123,25 @@ def _channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.nda
     return values
 
 
-def _all_translations(motion: Motion) -> np.ndarray:
+def all_translations(motion: Motion) -> np.ndarray:
     """(frames, joints, 3) metres: each joint in its parent's frame, the root in the world."""
-    translations = np.tile(_array(motion.skeleton.offsets), (motion.num_frames, 1, 1))
-    translations[:, 0] = _array(motion.root_position)
+    translations = np.tile(as_array(motion.skeleton.offsets), (motion.num_frames, 1, 1))
+    translations[:, 0] = as_array(motion.root_position)
     for joint, track in motion.moving_offsets.items():
-        translations[:, joint] = _array(track)
+        translations[:, joint] = as_array(track)
     return translations
 
 
-def _check_finite(motion: Motion, path: str | PathLike[str]) -> None:
-    length = np.linalg.norm(_array(motion.local_quat_xyzw), axis=-1)
-    bad = ~np.isfinite(_all_translations(motion)).all(-1) | ~(abs(length - 1) < 0.01)
+def check_finite(motion: Motion, path: str | PathLike[str]) -> None:
+    """RequestError, naming joint and frame, unless all positions and rotations can be written."""
+    length = np.linalg.norm(as_array(motion.local_quat_xyzw), axis=-1)
+    bad = ~np.isfinite(all_translations(motion)).all(-1) | ~(abs(length - 1) < 0.01)
     if bad.any():
         frame, joint = np.argwhere(bad)[0]
         what = f"{motion.skeleton.names[joint]} at frame {frame}"
         raise RequestError(f"cannot write {path}: {what} has no finite position and rotation")
 
 
-def _array(values: Tensor) -> np.ndarray:
+def as_array(values: Tensor) -> np.ndarray:
+    """Of float64, wherever the tensor is."""
     return values.detach().cpu().double().numpy()

@@ -61,9 +61,7 @@ class Scanner:
         """The next word as a finite number."""
         word = self.word()
         value = finite_number(word)
-        return (
-            self.fail(f"expected {meaning} as {NUMBER}, got {self.shown(word)}") if value is None else value
-        )
+        return self.fail(f"expected {meaning} as {NUMBER}, got {self.shown(word)}") if value is None else value
 
     def match(self, pattern: re.Pattern[str], meaning: str) -> str:
         """The first group of `pattern`, which must come next."""

@@ -49,16 +49,16 @@ class BvhStream:
 
     def append(self, piece: Motion) -> None:
         """Write the next frames; RequestError where they are not finite, MapctlError for another skeleton."""
-        bvh._check_finite(piece, self.path)
+        bvh.check_finite(piece, self.path)
         layout = bvh_layout.of(piece, self.path)
         order = [piece.skeleton.index(name) for name in layout.hierarchy.names]
-        quat_xyzw = bvh._array(piece.local_quat_xyzw)[:, order]
-        translations = bvh._all_translations(piece)[:, order] / layout.metres_per_unit
+        quat_xyzw = bvh.as_array(piece.local_quat_xyzw)[:, order]
+        translations = bvh.all_translations(piece)[:, order] / layout.metres_per_unit
         first = self._tree is None
         tree = self._tree or bvh_layout.fitted(layout, translations, quat_xyzw)
         if tree.names != layout.hierarchy.names:
             raise MapctlError(f"{self.path}: a piece has other joints than the first")
-        values = self._continued(tree, bvh._channel_values(tree, translations, quat_xyzw))
+        values = self._continued(tree, bvh.channel_values(tree, translations, quat_xyzw))
         text = bvh_text.compose(tree, layout.frame_time, values, decimals=layout.decimals)
         head, frame_time, rows = text.partition(f"Frame Time: {layout.frame_time}\n")
         if first:

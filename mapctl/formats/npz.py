@@ -96,9 +96,7 @@ def _motion(arrays: dict[str, np.ndarray]) -> Motion:
     end_names, moving = arrays["end_names"].tolist(), arrays["moving_joints"].tolist()
     if not set(end_names) <= set(names) or not set(moving) <= set(range(1, len(names))):
         raise MapctlError("end_names and moving_joints must be joints of the skeleton")
-    ends = {
-        name: (x, y, z) for name, (x, y, z) in zip(end_names, arrays["end_offsets"].tolist(), strict=True)
-    }
+    ends = {name: (x, y, z) for name, (x, y, z) in zip(end_names, arrays["end_offsets"].tolist(), strict=True)}
     tracks = zip(moving, arrays["moving_offsets"], strict=True)
     return Motion(
         skeleton=Skeleton(tuple(names), tuple(parents), _tensor(arrays["offsets"]), ends),
