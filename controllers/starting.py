@@ -24,6 +24,7 @@ _LOOK_AHEAD = 34
 _STROLL = 120  # frames of plain rollout that show how a candidate walks when nobody asks for anything
 _SPEED_SIGMA = 0.1  # m/s between a candidate's own speed and the wanted one that count as one standard deviation
 _SWAY_SECONDS = 0.35
+_USUAL_SWAY = 0.65  # quantile among candidates; over the median, since plain rollouts sway less than people
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +68,11 @@ def choose_start(
 
 
 def _oddness(features: Float[Tensor, "starts frames size"], wanted: float, fps: float) -> Float[Tensor, " starts"]:
-    """Nats: the squared distance of each candidate's own speed from the wanted one, and of its sway from the median."""
+    """Nats: the squared distance of each candidate's own speed from the wanted one, and of its sway from the usual one."""
     speed = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean(-1) * fps
     sway = _sway(features, fps)
     spread = (sway.quantile(0.75) - sway.quantile(0.25)).clamp_min(1e-4) / 2
-    return 0.5 * ((speed - wanted) / _SPEED_SIGMA).square() + 0.5 * ((sway - sway.median()) / spread).square()
+    return 0.5 * ((speed - wanted) / _SPEED_SIGMA).square() + 0.5 * ((sway - sway.quantile(_USUAL_SWAY)) / spread).square()
 
 
 def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:
