@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import fast_kinematics, kinematics, rotations
 from mapctl.features import LAYOUT, Place, root_places
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -36,8 +36,13 @@ class Trial:
     """Left and right toe planted in the frame before the window; unbatched or with the batch's shape."""
 
     @cached_property
+    def _fast(self) -> bool:
+        return fast_kinematics.serves(self.features, self.start, self.skeleton)
+
+    @cached_property
     def _root(self) -> tuple[Tensor, Tensor]:
-        return root_places(self.features, self.start)
+        places = fast_kinematics.root_places if self._fast else root_places
+        return places(self.features, self.start)
 
     @property
     def root_xz_world(self) -> Float[Tensor, "batch frames 2"]:
@@ -52,6 +57,8 @@ class Trial:
     @cached_property
     def joints_world(self) -> Float[Tensor, "batch frames joints 3"]:
         """World joint positions, metres, by forward kinematics of the whole body."""
+        if self._fast:
+            return fast_kinematics.joints_world(self.features, self.root_xz_world, self.heading, self.skeleton)
         tilt_xz = LAYOUT.pick(self.features, "root_tilt")
         tilt = torch.stack([tilt_xz[..., 0], torch.zeros_like(self.heading), tilt_xz[..., 1]], dim=-1)
         vectors = torch.cat([tilt, LAYOUT.pick(self.features, "joint_rotations")], dim=-1).unflatten(-1, (-1, 3))

@@ -1,0 +1,19 @@
+"""How the core's numba kernels are compiled: kept on disk where that can be, one core, no Python objects inside."""
+
+from numba import njit
+
+# Sums may be fused; NaN and infinity keep their meaning.
+_RELAXED = {"contract", "nsz"}
+
+
+def entry(function):
+    """Compile a function that Python calls, and all that it calls."""
+    options = {"error_model": "numpy", "fastmath": _RELAXED, "nogil": True}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # numba found no folder that it may write to
+        return njit(**options)(function)
+
+
+inner = njit(error_model="numpy", fastmath=_RELAXED, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Compile a function that only compiled code calls: without wrappers for Python the first use is quicker."""
