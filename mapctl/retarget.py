@@ -164,11 +164,15 @@ def _bones(skeleton: Skeleton, joint_of: tuple[int | None, ...], tpose: Tensor):
         site = torch.tensor(skeleton.end_offsets.get(skeleton.names[joint], (0.0, 0.0, 0.0)), dtype=torch.float64)
         return rotations.rotate(turn[joint], site)
 
-    spots = []
-    for c, joint in enumerate(joint_of):
-        above = joint_of[CANONICAL.parents[c]]
-        spots.append(place[joint] if joint is not None else place[above] + end_of(above))
-    spots = torch.stack(spots)
+    def spot_of(canonical: int) -> Tensor:
+        joint, above = joint_of[canonical], joint_of[CANONICAL.parents[canonical]]
+        if joint is not None:
+            return place[joint]
+        if above is None:
+            raise RequestError(f"the rig has neither {CANONICAL.names[canonical]} nor the joint above it")
+        return place[above] + end_of(above)
+
+    spots = torch.stack([spot_of(c) for c in range(CANONICAL.num_joints)])
     offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), spots[1:] - spots[list(CANONICAL.parents[1:])]])
     ends = {CANONICAL.names[c]: tuple(end_of(j).tolist()) for c, j in enumerate(joint_of)
             if j is not None and skeleton.names[j] in skeleton.end_offsets and not CANONICAL.children(c)}  # fmt: skip

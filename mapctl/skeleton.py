@@ -80,7 +80,7 @@ _ENDS = {"head": (0.0, 0.17, 0.0), "leftHand": (0.17, 0.0, 0.0), "rightHand": (-
 
 
 def _canonical() -> Skeleton:
-    bones = list(_SPINE)
+    bones: list[tuple[str, str, tuple[float, float, float]]] = list(_SPINE)
     for side, sign in (("left", 1), ("right", -1)):
         for limb in (_LEFT_ARM, _LEFT_LEG):
             for name, parent, (x, y, z) in limb:

@@ -12,10 +12,15 @@ from mapctl.trial import Trial
 class Term(Protocol):
     """Sigmas in physical units are a term's only weights; energies are negative log likelihoods (nats)."""
 
-    name: str
-    """In the ledger."""
-    unit: str
-    """Of the residual."""
+    @property
+    def name(self) -> str:
+        """In the ledger."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Of the residual."""
+        ...
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats."""
