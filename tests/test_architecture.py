@@ -51,9 +51,7 @@ def imports(file: Path, tree: ast.Module) -> set[str]:
             module = absolute(file, node)
             found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Call) and called_name(node) in LATE_IMPORTERS:
-            found |= {
-                arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
-            }
+            found |= {arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)}
     return found
 
 
@@ -76,11 +74,7 @@ def content_faults(tree: ast.Module) -> list[str]:
             faults.append(f"line {node.lineno}: bare except")
         elif isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load":
             faults.append(f"line {node.lineno}: torch.load unpickles")
-        elif (
-            isinstance(node, ast.keyword)
-            and node.arg == "allow_pickle"
-            and ast.unparse(node.value) != "False"
-        ):
+        elif isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
             faults.append(f"line {node.value.lineno}: allow_pickle")
     return faults
 

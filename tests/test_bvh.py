@@ -264,9 +264,7 @@ def test_positions_that_repeat_the_offset_up_to_rounding_are_the_offset(tmp_path
 
 
 def test_the_way_of_a_travelling_joint_does_not_count_as_body(tmp_path):
-    text = PLAIN.replace("CHANNELS 3 Zr", "CHANNELS 6 Xposition Yposition Zposition Zr").replace(
-        "leftFoot", "b"
-    )
+    text = PLAIN.replace("CHANNELS 3 Zr", "CHANNELS 6 Xposition Yposition Zposition Zr").replace("leftFoot", "b")
     rows = "0 0 0 0 0 0 10 95 0 1 2 3 0 -120 0 4 5 6\n0 0 0 0 0 0 400 90 0 1 2 3 0 -120 0 4 5 6\n"
     text = text.replace("OFFSET 10 0 0", "OFFSET 4 90 -400")
     (tmp_path / "in.bvh").write_text(f"{text.split('Frames:')[0]}Frames: 2\nFrame Time: 0.01\n{rows}")

@@ -26,9 +26,7 @@ def turn(axis: int, degrees: float) -> np.ndarray:
 
 def written_angles(quat, order, tmp_path):
     """What is written in the three channels of a single joint, degrees."""
-    tree = bvh_text.Hierarchy(
-        ("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {}
-    )
+    tree = bvh_text.Hierarchy(("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {})
     (tmp_path / "in.bvh").write_text(bvh_text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
     source = bvh.load(tmp_path / "in.bvh")
     root = torch.zeros(len(quat), 3, dtype=torch.float64)

@@ -28,8 +28,7 @@ def by_loop(toes, fps, run=3):
     for foot in range(2):
         floor = np.percentile(toes[:, foot, 1], 5)
         stands = [
-            toes[t, foot, 1] < floor + 0.025
-            and np.hypot(*(toes[t, foot, ::2] - toes[t - 1, foot, ::2])) * fps < 0.35
+            toes[t, foot, 1] < floor + 0.025 and np.hypot(*(toes[t, foot, ::2] - toes[t - 1, foot, ::2])) * fps < 0.35
             for t in range(1, len(toes))
         ]
         start = 0
@@ -82,9 +81,7 @@ def test_thresholds_are_settings():
     assert planted(toes, 30, ContactSettings(slow=99.0, reach=99.0)).all()
     lifted = torch.tensor(toes) + torch.tensor([0.0, 1.5, 0.0])
     torch.testing.assert_close(floor_heights(lifted), floor_heights(torch.tensor(toes)) + 1.5)
-    np.testing.assert_allclose(
-        floor_heights(lifted).numpy(), np.percentile(lifted[..., 1].numpy(), 5, axis=0)
-    )
+    np.testing.assert_allclose(floor_heights(lifted).numpy(), np.percentile(lifted[..., 1].numpy(), 5, axis=0))
 
 
 def test_a_clip_too_short_for_a_contact_has_none():

@@ -71,9 +71,7 @@ def test_left_is_plus_x_when_facing_plus_z():
     places = torch.tensor([[0.3, 0.9, 1.0], [-0.2, 0.0, 1.0]], dtype=torch.float64)
     arcs = line.nearest(places)
     torch.testing.assert_close(arcs, torch.ones(2, dtype=torch.float64))
-    torch.testing.assert_close(
-        line.signed_offset(places, arcs), torch.tensor([0.3, -0.2], dtype=torch.float64)
-    )
+    torch.testing.assert_close(line.signed_offset(places, arcs), torch.tensor([0.3, -0.2], dtype=torch.float64))
     inside = torch.tensor([[3.0, 1.0]], dtype=torch.float64)  # of a circle that turns left
     circle = curves.circle(radius=4.0)
     assert float(circle.signed_offset(inside, circle.nearest(inside))) > 0
@@ -136,9 +134,7 @@ def test_a_local_search_stays_on_its_branch_where_a_curve_crosses_itself():
     torch.testing.assert_close(bow.track(bow.point(arcs)), arcs, rtol=0, atol=1e-4)
     off_to_a_side = bow.point(arcs) + 0.05 * bow.left(arcs)
     found = bow.nearest(off_to_a_side, around=arcs + 0.1, reach=0.3)
-    torch.testing.assert_close(
-        bow.signed_offset(off_to_a_side, found), torch.full_like(arcs, 0.05), rtol=0, atol=1e-3
-    )
+    torch.testing.assert_close(bow.signed_offset(off_to_a_side, found), torch.full_like(arcs, 0.05), rtol=0, atol=1e-3)
 
 
 def test_a_walk_that_starts_elsewhere_is_tracked_from_there():

@@ -23,9 +23,7 @@ def moved(motion, *, turn, shift):
     local = motion.local_quat_xyzw.clone()
     local[:, 0] = rotations.multiply(about.expand(motion.num_frames, 4), local[:, 0])
     root = rotations.rotate(about.expand(motion.num_frames, 4), motion.root_position)
-    return replace(
-        motion, root_position=root + torch.tensor([shift[0], 0, shift[1]]).double(), local_quat_xyzw=local
-    )
+    return replace(motion, root_position=root + torch.tensor([shift[0], 0, shift[1]]).double(), local_quat_xyzw=local)
 
 
 @each_motion
@@ -59,9 +57,7 @@ def test_features_know_neither_place_nor_heading(kind, turn):
 @each_motion
 def test_mirrored_features_are_those_of_the_mirrored_motion(kind):
     motion = MOTIONS[kind]
-    torch.testing.assert_close(
-        mirror_features(encode(motion)[0]), encode(motion.mirror())[0], atol=1e-9, rtol=0
-    )
+    torch.testing.assert_close(mirror_features(encode(motion)[0]), encode(motion.mirror())[0], atol=1e-9, rtol=0)
     torch.testing.assert_close(mirror_features(mirror_features(encode(motion)[0])), encode(motion)[0])
 
 
@@ -73,9 +69,7 @@ def test_a_straight_walk_reads_in_metres_and_radians_a_frame():
         atol=1e-3,
         rtol=0,
     )
-    assert float(LAYOUT.pick(straight, "root_displacement_heading")[:, 1].mean()) * 30 == pytest.approx(
-        1.24, abs=0.01
-    )
+    assert float(LAYOUT.pick(straight, "root_displacement_heading")[:, 1].mean()) * 30 == pytest.approx(1.24, abs=0.01)
     turning, _ = encode(walk(90, turn_rate=0.6))
     assert float(LAYOUT.pick(turning, "heading_change").mean()) * 30 == pytest.approx(0.6, abs=0.02)
     bits = LAYOUT.pick(turning, "contacts")
@@ -87,12 +81,8 @@ def test_the_root_integration_is_eq_4_step_by_step():
     vectors, place = encode(walk(20, turn_rate=2.0))
     ground, heading = root_places(vectors, place)
     for t, frame in enumerate(vectors):
-        place = place.moved(
-            LAYOUT.pick(frame, "root_displacement_heading"), LAYOUT.pick(frame, "heading_change")[0]
-        )
-        torch.testing.assert_close(
-            (ground[t], heading[t]), (place.position_xz, place.heading), atol=1e-12, rtol=0
-        )
+        place = place.moved(LAYOUT.pick(frame, "root_displacement_heading"), LAYOUT.pick(frame, "heading_change")[0])
+        torch.testing.assert_close((ground[t], heading[t]), (place.position_xz, place.heading), atol=1e-12, rtol=0)
 
 
 def test_a_step_back_undoes_a_step():
@@ -104,9 +94,7 @@ def test_a_step_back_undoes_a_step():
 
 def test_gradients_of_the_root_integration_are_those_of_finite_differences():
     vectors = torch.randn(2, 7, LAYOUT.size, generator=generator(), dtype=torch.float64)
-    place = Place(
-        torch.randn(2, 2, generator=generator(1), dtype=torch.float64), torch.tensor([0.3, -2.0]).double()
-    )
+    place = Place(torch.randn(2, 2, generator=generator(1), dtype=torch.float64), torch.tensor([0.3, -2.0]).double())
     weight = torch.randn(2, 7, 2, generator=generator(2), dtype=torch.float64)
 
     def measure(values):

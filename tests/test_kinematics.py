@@ -33,9 +33,7 @@ def test_positions_and_rotations_are_the_product_of_transforms(skeleton):
     for frame in range(3):
         world = by_matrices(skeleton, motion.root_position[frame], motion.local_quat_xyzw[frame])
         np.testing.assert_allclose(motion.joint_positions()[frame], world[:, :3, 3], atol=1e-9)
-        np.testing.assert_allclose(
-            rotations.to_matrix(motion.joint_rotations()[frame]), world[:, :3, :3], atol=1e-9
-        )
+        np.testing.assert_allclose(rotations.to_matrix(motion.joint_rotations()[frame]), world[:, :3, :3], atol=1e-9)
 
 
 def test_any_batch_shape_gives_the_same_as_one_by_one():
@@ -53,9 +51,7 @@ def test_any_batch_shape_gives_the_same_as_one_by_one():
 def test_moving_bones_may_have_the_batch_shape():
     motion = random_motion(BRANCHED, 4)
     offsets = BRANCHED.offsets.expand(4, 5, 3) * torch.tensor([1.0, 2.0, 0.5, 1.0]).double()[:, None, None]
-    places, _ = kinematics.forward_kinematics(
-        offsets, BRANCHED.parents, motion.root_position, motion.local_quat_xyzw
-    )
+    places, _ = kinematics.forward_kinematics(offsets, BRANCHED.parents, motion.root_position, motion.local_quat_xyzw)
     stretched = Skeleton(BRANCHED.names, BRANCHED.parents, offsets[1])
     expected = by_matrices(stretched, motion.root_position[1], motion.local_quat_xyzw[1])[:, :3, 3]
     np.testing.assert_allclose(places[1], expected, atol=1e-9)
@@ -105,18 +101,14 @@ def test_heading_is_the_direction_that_the_hips_face(degrees):
 
 def test_the_canonical_skeleton_stands_as_the_conventions_say():
     identity = torch.tensor([0.0, 0, 0, 1]).double().expand(CANONICAL.num_joints, 4)
-    places, _ = kinematics.forward_kinematics(
-        CANONICAL.offsets, CANONICAL.parents, torch.zeros(3).double(), identity
-    )
+    places, _ = kinematics.forward_kinematics(CANONICAL.offsets, CANONICAL.parents, torch.zeros(3).double(), identity)
     at = dict(zip(CANONICAL.names, places, strict=True))
     assert CANONICAL.num_joints == 21
     assert at["leftHand"][0] > 0.5 > -0.5 > at["rightHand"][0]
     assert at["leftToes"][2] > at["leftFoot"][2]
     assert at["head"][1] > at["hips"][1] > at["leftLowerLeg"][1] > at["leftFoot"][1]
     for name in CANONICAL.names:
-        torch.testing.assert_close(
-            at[mirrored_name(name)] * torch.tensor([-1.0, 1, 1]), at[name], check_dtype=False
-        )
+        torch.testing.assert_close(at[mirrored_name(name)] * torch.tensor([-1.0, 1, 1]), at[name], check_dtype=False)
 
 
 @pytest.mark.parametrize(("names", "parents", "rows"), [

@@ -88,14 +88,10 @@ PROBLEMS: dict[str, tuple[Energy, Tensor]] = {
 }  # every one of them has its least energy 0
 
 
-def curve_of(
-    function: EnergyAndGradient, start: Tensor, options: LbfgsSettings
-) -> tuple[list[float], LbfgsResult]:
+def curve_of(function: EnergyAndGradient, start: Tensor, options: LbfgsSettings) -> tuple[list[float], LbfgsResult]:
     """Best energies of a single problem after each evaluation, and the result."""
     energies: list[float] = []
-    result = minimise(
-        function, start, settings=options, callback=lambda _, best: energies.append(float(best[0]))
-    )
+    result = minimise(function, start, settings=options, callback=lambda _, best: energies.append(float(best[0])))
     return energies, result
 
 
@@ -219,13 +215,9 @@ def test_surrounded_by_walls_the_start_is_kept():
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**16), limit=st.integers(1, 40), single=st.booleans())
-def test_rugged_ground_never_ends_worse_and_names_the_energy_of_its_point(
-    seed: int, limit: int, single: bool
-):
+def test_rugged_ground_never_ends_worse_and_names_the_energy_of_its_point(seed: int, limit: int, single: bool):
     dtype = torch.float32 if single else torch.float64
-    function = with_gradient(
-        lambda x: (x**2 + 3 * torch.sin(20 * x)).sum(-1) + torch.log(30 - x.abs().sum(-1))
-    )
+    function = with_gradient(lambda x: (x**2 + 3 * torch.sin(20 * x)).sum(-1) + torch.log(30 - x.abs().sum(-1)))
     start = 2 * torch.randn(3, 5, generator=torch.Generator().manual_seed(seed), dtype=dtype)
     result = minimise(function, start, meter=Meter(Budget(evaluations=3 * limit)))
     energy, gradient = function(result.x)

@@ -23,9 +23,7 @@ def walk(places_xz, *, headings=0.0, fps=30, swing=0.5, wobble=0.0, seed=0):
     """The canonical body at these places; its legs swing once a second and its joints wobble (radians)."""
     frames = len(places_xz)
     time = torch.arange(frames, dtype=torch.float64) / fps
-    vectors = wobble * torch.randn(
-        frames, 21, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
-    )
+    vectors = wobble * torch.randn(frames, 21, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     for side, sign in (("left", 1), ("right", -1)):
         vectors[:, CANONICAL.index(f"{side}UpperLeg"), 0] += sign * swing * torch.sin(2 * math.pi * time)
     quats = from_rotation_vector(vectors)
@@ -90,9 +88,7 @@ def test_sway_is_what_a_slow_gaussian_leaves():
     weights = np.exp(-0.5 * ((np.arange(-taps, taps + 1) / fps) / 0.35) ** 2)
     weights /= weights.sum()
     quick = [offset[t] - weights @ offset[t - taps : t + taps + 1] for t in range(taps, 200 - taps)]
-    assert path.sway(torch.tensor(offset), fps) == pytest.approx(
-        np.sqrt(np.mean(np.square(quick))), rel=1e-12
-    )
+    assert path.sway(torch.tensor(offset), fps) == pytest.approx(np.sqrt(np.mean(np.square(quick))), rel=1e-12)
     assert math.isnan(path.sway(torch.tensor(offset[: 2 * taps + 4]), fps))
 
 
@@ -206,9 +202,7 @@ def test_what_a_clip_cannot_tell_is_nan():
 
 def test_smoothing_keeps_constants_and_lines_inside():
     line = torch.linspace(0, 1, 200, dtype=torch.float64)
-    torch.testing.assert_close(
-        slow_part(torch.full_like(line, 3.0), seconds=0.5, fps=30), torch.full_like(line, 3.0)
-    )
+    torch.testing.assert_close(slow_part(torch.full_like(line, 3.0), seconds=0.5, fps=30), torch.full_like(line, 3.0))
     torch.testing.assert_close(slow_part(line, seconds=0.5, fps=30)[50:150], line[50:150])
     assert float(gaussian_kernel(0.5, 30).sum()) == pytest.approx(1)
 

@@ -22,8 +22,7 @@ from mapctl.skeleton import CANONICAL
 def example(frames=5, fps=Fraction(24000, 1001), seed=0) -> Motion:
     generator = torch.Generator().manual_seed(seed)
     root, quat, track = (
-        torch.randn(frames, *shape, generator=generator, dtype=torch.float64)
-        for shape in ((3,), (21, 4), (3,))
+        torch.randn(frames, *shape, generator=generator, dtype=torch.float64) for shape in ((3,), (21, 4), (3,))
     )
     return Motion(CANONICAL, fps, root, torch.nn.functional.normalize(quat, dim=-1), {4: track})
 

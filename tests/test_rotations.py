@@ -47,9 +47,7 @@ def test_a_turn_about_y_takes_z_toward_x(angle):
     torch.testing.assert_close(
         turned, torch.tensor([math.sin(angle), 0, math.cos(angle)], dtype=torch.float64), atol=1e-9, rtol=0
     )
-    ground = rotations.rotate_ground(
-        torch.tensor([0.0, 1.0]).double(), torch.tensor(angle, dtype=torch.float64)
-    )
+    ground = rotations.rotate_ground(torch.tensor([0.0, 1.0]).double(), torch.tensor(angle, dtype=torch.float64))
     torch.testing.assert_close(ground, turned[::2], atol=1e-9, rtol=0)
 
 

@@ -146,9 +146,7 @@ def test_first_use_in_a_read_only_folder_leaves_no_trace(tmp_path: Path):
     tmp_path.chmod(0o555)
     try:
         command = [sys.executable, "-c", textwrap.dedent(script)]
-        done = subprocess.run(
-            command, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
-        )
+        done = subprocess.run(command, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     finally:
         tmp_path.chmod(0o755)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "mine still here\n")
@@ -188,9 +186,7 @@ def test_costs_that_are_not_finite_count_as_infinity(bad: float, neighbours: int
     assert math.isfinite(found.energy)
     assert found.x[0] > 0
     assert found.energy == half(found.x[None]).item()
-    never = swarm(
-        lambda x: x.new_full((len(x),), bad), start=start, spread=1.0, settings=options, generator=seeded()
-    )
+    never = swarm(lambda x: x.new_full((len(x),), bad), start=start, spread=1.0, settings=options, generator=seeded())
     assert torch.equal(never.x, start)
     assert never.energy == math.inf
 
@@ -205,18 +201,11 @@ def test_budget_is_kept_to_exactly():
 
         meter = Meter(Budget(evaluations=limit))
         options = SwarmSettings(particles=16, iterations=6 if limit >= 16 else 1)
-        found = swarm(
-            cost, start=torch.ones(3), spread=1.0, settings=options, meter=meter, generator=seeded()
-        )
+        found = swarm(cost, start=torch.ones(3), spread=1.0, settings=options, meter=meter, generator=seeded())
         assert sum(seen) == found.evaluations == meter.evaluations == wanted
         assert found.energy <= 3.0 if limit else found.energy == math.inf
     meter = Meter(Budget(evaluations=10))
-    assert (
-        best_of(
-            sphere, start=torch.ones(3), spread=1.0, count=99, meter=meter, generator=seeded()
-        ).evaluations
-        == 10
-    )
+    assert best_of(sphere, start=torch.ones(3), spread=1.0, count=99, meter=meter, generator=seeded()).evaluations == 10
     late = Meter(Budget(seconds=0.0))
     for found in (
         swarm(sphere, start=torch.ones(3), spread=1.0, meter=late, generator=seeded()),

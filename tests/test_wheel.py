@@ -17,9 +17,7 @@ PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 DATA = ("mapctl/rigs/*.toml", "priors/weights/*", "scenes/*.toml", "scenes/data/*")
 LOCAL = shutil.ignore_patterns("__pycache__", ".*")
 # No path of the checkout may leak into the clean environment.
-ENVIRONMENT = {
-    name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
-}
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
 
 
 def run(*command: str | Path, cwd: Path) -> str:

@@ -21,9 +21,7 @@ def ground_speed(hips: Float[Tensor, "frames 3"], fps: float) -> float:
     return float(hips[:, ::2].diff(dim=0).norm(dim=-1).mean() * fps)
 
 
-def facing(
-    left_leg: Float[Tensor, "frames 3"], right_leg: Float[Tensor, "frames 3"]
-) -> Float[Tensor, "frames"]:
+def facing(left_leg: Float[Tensor, "frames 3"], right_leg: Float[Tensor, "frames 3"]) -> Float[Tensor, "frames"]:
     """Facing angle, radians, unwrapped, square to the line between the upper legs: 0 is +Z, pi/2 is +X."""
     across = left_leg - right_leg
     return unwrap_angle(torch.atan2(-across[:, 2], across[:, 0]))

@@ -13,9 +13,7 @@ def gaussian_kernel(seconds: float, fps: float) -> Float[Tensor, "taps"]:
     return kernel / kernel.sum()
 
 
-def slow_part_inside(
-    values: Float[Tensor, "frames"], kernel: Float[Tensor, "taps"]
-) -> Float[Tensor, "inside"]:
+def slow_part_inside(values: Float[Tensor, "frames"], kernel: Float[Tensor, "taps"]) -> Float[Tensor, "inside"]:
     """The smoothed signal where the whole kernel lies inside it: `taps` - 1 frames fewer."""
     return torch.nn.functional.conv1d(values[None, None], kernel[None, None])[0, 0]
 
