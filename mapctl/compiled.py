@@ -15,5 +15,7 @@ def entry(function):
         return njit(**options)(function)
 
 
-inner = njit(error_model="numpy", fastmath=_RELAXED, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-"""Compile a function that only compiled code calls: without wrappers for Python the first use is quicker."""
+# Called from compiled code only: leaving the wrappers for Python out makes the first use quicker.
+_INNER = {"error_model": "numpy", "fastmath": _RELAXED, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+inner = njit(**_INNER)
+"""Compile a function that only compiled code calls."""

@@ -1,0 +1,276 @@
+"""The compiled kinematics and curve search against the torch code that specifies them."""
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import pytest
+import torch
+from catalogue import FRAMES, TERMS
+from helpers import generator, walk
+
+from mapctl import curves, fast_kinematics
+from mapctl.curve_axes import axes_near
+from mapctl.curves import Curve
+from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.trial import Trial
+
+PAST = 8
+ROOT = FilePath(__file__).resolve().parent.parent
+CLOSED = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0], [0.0, 0.0]]).double()
+SPIRAL = torch.linspace(0, 6, 600).double()
+CURVES = {
+    "circle": curves.circle(radius=4.0),
+    "figure-8": curves.figure8(radius=2.0),
+    "line": curves.line(length=1.5),
+    "corners": Curve(curves.from_points(CLOSED).points, closed=True),
+    "small lap": curves.circle(radius=0.08),
+    "in space": curves.from_points(torch.stack([torch.cos(SPIRAL), 0.3 * SPIRAL, torch.sin(SPIRAL)], -1)),
+}
+each_curve = pytest.mark.parametrize("name", CURVES)
+each_term = pytest.mark.parametrize("name", TERMS)
+
+
+@pytest.fixture
+def reference(monkeypatch):
+    """A switch that leaves only the torch code."""
+
+    def switch():
+        monkeypatch.setattr(fast_kinematics, "serves", lambda features, start, skeleton: False)
+
+    return switch
+
+
+def trial(batch=3, *, features=None, place=None, skeleton=CANONICAL, dtype=torch.float32):
+    """Disturbed windows of a walk, with the walk before them; features are a leaf that gradients reach."""
+    motion = walk(PAST + FRAMES, turn_rate=0.2)
+    vectors, start = encode(motion)
+    ground, heading = root_places(vectors[:PAST], start)
+    if features is None:
+        noise = torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(0)).double()
+        features = vectors[PAST:] + 0.05 * vectors.std(0) * noise
+    place = place or Place(ground[-1], heading[-1])
+    draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(1))
+    bits = torch.rand(batch, FRAMES, 2, generator=generator(2)) < 0.6
+    return Trial(
+        features.to(dtype).requires_grad_(), Place(place.position_xz.to(dtype), place.heading.to(dtype)),
+        draw[..., 1:].to(dtype), draw[..., 0].to(dtype), bits, motion.joint_positions()[:PAST].to(dtype), skeleton,
+    )  # fmt: skip
+
+
+def close(found, expected, tolerance=1e-4):
+    """Within a share of the largest expected number."""
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(found.double(), expected.double(), rtol=0, atol=tolerance * scale + 1e-12)
+
+
+def root_of(whole):
+    return torch.cat([whole.root_xz_world, whole.heading.unsqueeze(-1)], dim=-1)
+
+
+def body_of(whole):
+    return whole.joints_world
+
+
+def everything_of(whole):
+    return torch.cat([root_of(whole), whole.joints_world.flatten(2)], dim=-1)
+
+
+PARTS = (root_of, body_of, everything_of)
+
+
+def value_and_gradient(whole, part):
+    value = part(whole)
+    weights = torch.randn(value.shape, generator=generator(3)).to(value.dtype)
+    if not value.requires_grad:  # a term of the prior's alone
+        return value, torch.zeros_like(whole.features)
+    return value.detach(), torch.autograd.grad((value * weights).sum(), whole.features)[0]
+
+
+def agree(part, **wishes):
+    """The compiled float32 answers lie close to the torch code's in float64."""
+    quick, exact = trial(**wishes), trial(**wishes, dtype=torch.float64)
+    assert quick._fast
+    assert not exact._fast
+    for found, expected in zip(value_and_gradient(quick, part), value_and_gradient(exact, part), strict=True):
+        assert found.dtype == torch.float32
+        close(found, expected, 1e-5)
+
+
+@each_term
+def test_every_term_agrees_in_value_and_gradient(name, reference):
+    quick = value_and_gradient(trial(), TERMS[name])
+    reference()
+    slow = value_and_gradient(trial(), TERMS[name])
+    for found, expected in zip(quick, slow, strict=True):
+        close(found, expected)
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("batch", [1, 3])
+def test_kinematics_agree_with_double_precision(part, batch):
+    agree(part, batch=batch)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-4, 0.0999, 0.1001, 3.0, 7.0])
+def test_rotation_vectors_of_any_size_have_exact_gradients(size):
+    features = torch.randn(2, FRAMES, LAYOUT.size, generator=generator(4)).double()
+    turns = features[..., LAYOUT.slices["root_tilt"].start : LAYOUT.slices["joint_rotations"].stop]
+    triples = turns[..., 2:].unflatten(-1, (-1, 3))
+    triples *= size / triples.norm(dim=-1, keepdim=True)
+    turns[..., :2] *= size / turns[..., :2].norm(dim=-1, keepdim=True)
+    agree(body_of, batch=2, features=features)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,)])
+def test_starts_may_be_shared_or_one_for_each_candidate(shape):
+    xz = 50 * torch.randn(*shape, 2, generator=generator(5)).double()
+    agree(everything_of, place=Place(xz, torch.randn(shape, generator=generator(6)).double()))
+
+
+def test_any_tree_and_bones():
+    order = torch.randperm(CANONICAL.num_joints - 1, generator=generator(7)) + 1
+    parents = (-1, *(int(torch.randint(j, (1,), generator=generator(8 + j))) for j in range(1, len(order) + 1)))
+    offsets = torch.randn(CANONICAL.num_joints, 3, generator=generator(9)).double()
+    agree(body_of, skeleton=Skeleton(CANONICAL.names, parents, offsets))
+
+
+def test_features_with_strides_agree():
+    wide = torch.randn(3, LAYOUT.size, FRAMES, generator=generator(10)).double().transpose(1, 2)
+    agree(everything_of, features=wide)
+
+
+def test_gradients_are_those_of_finite_differences():
+    whole, step = trial(1), 1e-3
+    value = everything_of(whole)
+    weights = torch.randn(value.shape, generator=generator(3))
+    gradient = value_and_gradient(whole, everything_of)[1]
+    way = torch.randn(whole.features.shape, generator=generator(11))
+    ends = [everything_of(trial(1, features=(whole.features + sign * step * way).detach())) for sign in (1, -1)]
+    slope = float(((ends[0] - ends[1]).detach().double() * weights).sum()) / (2 * step)
+    assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-3)
+
+
+def test_the_body_is_left_alone_while_only_the_root_is_asked_for(monkeypatch):
+    monkeypatch.setattr(fast_kinematics, "joints_world", None)
+    whole = trial()
+    assert TERMS["path of the hips"](whole).shape == (3, FRAMES)
+    with pytest.raises(TypeError):
+        TERMS["footing"](whole)
+
+
+def test_the_torch_code_serves_what_the_kernels_do_not():
+    whole = trial()
+    wanting = Place(whole.start.position_xz.requires_grad_(), whole.start.heading)
+    assert not replace(whole, start=wanting)._fast
+    (gradient,) = torch.autograd.grad(replace(whole, start=wanting).joints_world.sum(), wanting.position_xz)
+    torch.testing.assert_close(gradient, torch.full((2,), 3.0 * FRAMES * CANONICAL.num_joints))
+    assert not trial(dtype=torch.float64)._fast
+
+
+def test_the_same_candidates_give_the_same_bytes_alone_and_in_a_batch():
+    whole = trial()
+    alone = trial(1, features=whole.features[1:2].detach())
+    assert torch.equal(everything_of(alone)[0], everything_of(whole)[1])
+    assert torch.equal(value_and_gradient(trial(), body_of)[1], value_and_gradient(trial(), body_of)[1])
+
+
+def beside(curve, *, count=400, dtype=torch.float64):
+    """Arcs from before the start to beyond the end, and points about a foot away from them."""
+    arcs = torch.linspace(-0.8, curve.length + 0.8, count, dtype=torch.float64)
+    shifts = 0.3 * torch.rand(2, count, curve.dims, generator=generator(12)).double() - 0.15
+    return (curve.point(arcs) + shifts).to(dtype), arcs + 0.2 * torch.rand(count, generator=generator(13)).double()
+
+
+@each_curve
+def test_the_place_found_is_the_nearest(name):
+    curve = CURVES[name]
+    points, arcs = beside(curve)
+    found = axes_near(curve, points, arcs, reach=0.6)
+    reach = min(0.6, curve.length / 2) if curve.closed else 0.6
+    tried = curve.point(arcs.unsqueeze(-1) + torch.linspace(-reach, reach, 2401, dtype=torch.float64))
+    best = (tried - points.unsqueeze(-2)).norm(dim=-1).amin(-1)
+    distance = (found.place - points).norm(dim=-1)
+    assert float((distance - best).max()) < 1e-9
+    assert float((best - distance).max()) < 1e-3
+
+
+@each_curve
+def test_places_and_axes_are_the_curves_own(name):
+    curve = CURVES[name]
+    points, arcs = beside(curve)
+    found = axes_near(curve, points, arcs, reach=0.6)
+    nearest = curve.nearest(points, around=arcs.expand(2, -1), reach=0.6)
+    same = (curve.point(nearest) - found.place).norm(dim=-1) < 1e-8
+    assert float(same.double().mean()) > 0.9  # the rest are about as far from two places
+    torch.testing.assert_close(found.axes[same][:, 1], curve.tangent(nearest)[same], atol=1e-6, rtol=0)
+    left = found.axes[same][:, 0, :: curve.dims - 1]
+    torch.testing.assert_close(left, curve.left(nearest)[same], atol=1e-6, rtol=0)
+
+
+@each_curve
+def test_the_wanted_place_lies_straight_on_from_the_nearest(name):
+    curve = CURVES[name]
+    points, arcs = beside(curve)
+    found = axes_near(curve, points, arcs, reach=0.6)
+    apart = (found.axes @ (found.straightened - found.place).unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(apart[..., 0], torch.zeros_like(apart[..., 0]), atol=1e-9, rtol=0)
+    torch.testing.assert_close(curve.point(arcs - apart[..., 1]), found.place, atol=1e-9, rtol=0)
+
+
+@each_curve
+def test_single_precision_finds_the_same(name):
+    curve = CURVES[name]
+    points, arcs = beside(curve, dtype=torch.float32)
+    narrow, wide = (axes_near(curve, part, arcs, reach=0.6) for part in (points, points.double()))
+    torch.testing.assert_close(narrow.place, wide.place.float())
+    torch.testing.assert_close(narrow.axes, wide.axes.float())
+
+
+@each_curve
+def test_what_is_not_a_number_stays_so_and_harms_nobody_else(name):
+    curve = CURVES[name]
+    points, arcs = beside(curve, count=20)
+    clean = axes_near(curve, points, arcs, reach=0.6)
+    points[0, 3], arcs[7], arcs[9] = torch.nan, torch.inf, torch.nan
+    found = axes_near(curve, points, arcs, reach=0.6)
+    assert bool(torch.isnan(found.place[:, [7, 9]]).all())
+    rest = [t for t in range(20) if t not in (3, 7, 9)]
+    torch.testing.assert_close(found.axes[:, rest], clean.axes[:, rest], atol=0, rtol=0)
+
+
+def test_the_paths_memory_of_a_window_does_not_outlive_it():
+    term, whole = TERMS["path of the hips"], trial()
+    first = term(whole).detach()
+    moved = replace(whole, before=whole.before + 0.1)
+    assert float((term(moved).detach() - first).abs().max()) > 1e-3
+    assert torch.equal(term(whole), first)
+
+
+COMPILED = """
+import torch
+from mapctl import fast_kinematics
+from mapctl.features import Place
+from mapctl.skeleton import CANONICAL
+ground, heading = fast_kinematics.root_places(torch.ones(1, 2, 68), Place.origin())
+print(float(heading[0, 1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
+def test_kernels_work_where_nothing_can_be_written(tmp_path):
+    shutil.copytree(ROOT / "mapctl", tmp_path / "mapctl", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "mapctl" / "__pycache__").write_text("a file where the cache's folder would be")
+    # HOME is a file too, so neither the package's folder nor the user's cache can be made.
+    home = tmp_path / "home"
+    home.write_text("")
+    surroundings = {**os.environ, "HOME": str(home), "XDG_CACHE_HOME": str(home), "PYTHONDONTWRITEBYTECODE": "1"}
+    surroundings.pop("NUMBA_CACHE_DIR", None)
+    ran = subprocess.run([sys.executable, "-c", COMPILED], cwd=tmp_path, env=surroundings, capture_output=True,
+                         text=True, timeout=200)  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip() == "2.0"
