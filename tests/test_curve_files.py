@@ -125,9 +125,7 @@ def test_svg_drawings_are_read(tmp_path, drawing, length, closed, xmlns):
 def test_an_svg_page_is_the_ground_seen_from_above(tmp_path):
     path = write(tmp_path, "drawn.svg", "<svg><path d='M10,20 C 10,60 50,60 50,120'/></svg>")
     curve = curves.read(path, metres_per_unit=0.1)
-    torch.testing.assert_close(
-        curve.points[[0, -1]], torch.tensor([[1.0, 2.0], [5.0, 12.0]], dtype=torch.float64)
-    )
+    torch.testing.assert_close(curve.points[[0, -1]], torch.tensor([[1.0, 2.0], [5.0, 12.0]], dtype=torch.float64))
     t = 0.3  # Bernstein form of the drawn Bezier curve
     weights = np.array([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
     on_it = torch.tensor(weights @ np.array([[1, 2], [1, 6], [5, 6], [5, 12]]), dtype=torch.float64)
