@@ -61,11 +61,14 @@ class LatentMethod:
     the one before it is thrown away, since the plan itself is not part of the energy.
     """
 
-    rounds: int = 1
-    """Rounds at most. More than one forget L-BFGS's curvature in between, which costs more than new plans win."""
-    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=60))
+    rounds: int = 3
+    """Rounds at most."""
+    enough: float = 8.0
+    """Nats a frame below which no further round is begun: a new round forgets L-BFGS's curvature, which pays only where
+    the last one is stuck. Windows are worth the effort, since one that lags behind leaves a debt to all after it."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=36))
     """Of one round."""
-    budget: Budget = field(default_factory=lambda: Budget(evaluations=40))
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=120))
     """Of one window."""
     proposal: Proposal = zero_start
     """Where the first round starts."""
@@ -80,7 +83,7 @@ class LatentMethod:
         best = self._round(context, terms, unknowns, meter)
         start_energy = float(best[1].start_energy[0])
         for _ in range(self.rounds - 1):
-            if meter.exhausted:
+            if meter.exhausted or not best[1].energy[0] > self.enough * context.frames:
                 break
             again = self._round(context, terms, best[1].x, meter)
             if not again[1].energy[0] < best[1].energy[0]:
