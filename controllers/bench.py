@@ -86,11 +86,12 @@ def _in_sigmas(prior: Any, features: Tensor) -> Tensor:
 
 
 def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
-    """Starts and unknowns compared: energy, path error and time on three curves."""
+    """Starts and unknowns compared: energy, path error and time on three smooth curves and a corner."""
     shapes = {
         "circle:4": curves.circle(radius=4.0),
         "figure8:2": curves.figure8(radius=2.0),
         "s:6": curves.s(length=6.0),
+        "corner": curves.from_points([(0.0, 0.0), (0.0, 3.0), (3.0, 3.0)]),
     }
     return [
         {"curve": name, **_ablated(prior, curve, method, label, settings)}
@@ -106,8 +107,8 @@ def methods(prior: Any) -> dict[str, Method]:
     mean, std = prior.feature_mean[:size], prior.feature_std[:size]
     return {
         "latents, zero start": plain,
-        "latents, best of 32": replace(plain, proposal=BestOf(count=32), budget=Budget(evaluations=64)),
-        "latents, swarm 16 x 6": replace(plain, proposal=Swarm(), budget=Budget(evaluations=128)),
+        "latents, best of 32": replace(plain, proposal=BestOf(count=32), budget=Budget(evaluations=152)),
+        "latents, swarm 16 x 6": replace(plain, proposal=Swarm(), budget=Budget(evaluations=216)),
         "states, 160 evaluations": StateMethod(std, mean),
     }
 

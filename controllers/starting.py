@@ -68,11 +68,12 @@ def choose_start(
 
 
 def _oddness(features: Float[Tensor, "starts frames size"], wanted: float, fps: float) -> Float[Tensor, " starts"]:
-    """Nats: the squared distance of each candidate's own speed from the wanted one, and of its sway from the usual one."""
+    """Nats: how far each candidate's own speed is from the wanted one, and its sway from the usual one."""
     speed = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean(-1) * fps
     sway = _sway(features, fps)
     spread = (sway.quantile(0.75) - sway.quantile(0.25)).clamp_min(1e-4) / 2
-    return 0.5 * ((speed - wanted) / _SPEED_SIGMA).square() + 0.5 * ((sway - sway.quantile(_USUAL_SWAY)) / spread).square()
+    unusual = (sway - sway.quantile(_USUAL_SWAY)) / spread
+    return 0.5 * ((speed - wanted) / _SPEED_SIGMA).square() + 0.5 * unusual.square()
 
 
 def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:

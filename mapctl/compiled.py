@@ -1,21 +1,25 @@
-"""How the core's numba kernels are compiled: kept on disk where that can be, one core, no Python objects inside."""
+"""How numba kernels are compiled: kept on disk where that can be, one core, no Python objects inside."""
+
+from collections.abc import Callable
+from typing import Any
 
 from numba import njit
 
-# Sums may be fused; NaN and infinity keep their meaning.
-_RELAXED = {"contract", "nsz"}
+Compile = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def entry(function):
-    """Compile a function that Python calls, and all that it calls."""
-    options = {"error_model": "numpy", "fastmath": _RELAXED, "nogil": True}
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError:  # numba found no folder that it may write to
-        return njit(**options)(function)
+def compilers(*relaxed: str) -> tuple[Compile, Compile]:
+    """(entry, inner): decorators for functions that Python calls, and for those that only compiled code calls.
 
+    `relaxed` names LLVM's fast-math flags; NaN and infinity keep their meaning while `nnan` and `ninf` are not among
+    them. Inner functions go without the wrappers for Python, which makes the first use quicker.
+    """
+    shared = {"error_model": "numpy", "fastmath": set(relaxed)}
 
-# Called from compiled code only: leaving the wrappers for Python out makes the first use quicker.
-_INNER = {"error_model": "numpy", "fastmath": _RELAXED, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-inner = njit(**_INNER)
-"""Compile a function that only compiled code calls."""
+    def entry(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return njit(cache=True, nogil=True, **shared)(function)
+        except RuntimeError:  # numba found no folder that it may write to
+            return njit(nogil=True, **shared)(function)
+
+    return entry, njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)

@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 
-from mapctl.compiled import entry, inner
+from mapctl.compiled import compilers
+
+entry, inner = compilers("contract", "nsz")
 
 _FAR = 1e9  # metres; beyond it, and for arcs that are no numbers, there is no segment to count
 

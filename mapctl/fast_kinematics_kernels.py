@@ -8,7 +8,9 @@ import math
 
 import numpy as np
 
-from mapctl.compiled import entry, inner
+from mapctl.compiled import compilers
+
+entry, inner = compilers("contract", "nsz")
 
 _SMALL = 1e-2  # squared radians below which the series are exact to 1e-10 and the quotients begin to cancel
 

@@ -11,32 +11,21 @@ compiled code kept on disk goes stale by file.
 import math
 
 import numpy as np
-from numba import njit
 
+from mapctl.compiled import compilers
 from priors.fast_layout import DRAWN, GIVEN, LIKELIEST
 
-# Sums may be reordered and fused, which vectorises them; NaN and infinity keep their meaning (so no `True`).
-_RELAXED = {"reassoc", "contract", "nsz"}
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 _LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _EXP_LOW, _EXP_HIGH = np.float32(-87.0), np.float32(88.0)
 _EXP = tuple(np.float32(1 / math.factorial(k)) for k in range(8))
 
-# Called from compiled code only: leaving the wrappers for Python out makes the first use quicker.
-_INNER = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_inner = njit(fastmath=_RELAXED, **_INNER)
+# Sums may be reordered and fused, which vectorises them.
+_entry, _inner = compilers("reassoc", "contract", "nsz")
+_, _ordered = compilers("contract")
 
 
-def _entry(function):
-    """Compile a function that Python calls, and all that it calls; kept on disk where that can be."""
-    options = {"error_model": "numpy", "fastmath": _RELAXED, "nogil": True}
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError:  # numba found no folder that it may write to
-        return njit(**options)(function)
-
-
-@njit(fastmath={"contract"}, **_INNER)
+@_ordered
 def exp(x):
     """e^x to 2 ulp by range reduction and a Taylor polynomial: unlike libm's, it runs in vector registers."""
     x = _EXP_LOW if x < _EXP_LOW else (_EXP_HIGH if x > _EXP_HIGH else x)

@@ -261,20 +261,35 @@ def test_train_takes_its_options(tmp_path):
     assert paper.request().settings.optimiser == "rmsprop"
 
 
-def test_interruption_leaves_nothing_half_done(prior, tmp_path):
-    """Ctrl-C in the middle of hours of motion: status 130, no traceback, no file, no folder."""
-    words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
-    process = subprocess.Popen(
+def _started(words) -> subprocess.Popen[str]:
+    """mapctl in a process that heeds Ctrl-C, also where the tests run in the background and ignore it."""
+    return subprocess.Popen(
         [sys.executable, "-m", "mapctl.cli", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
+
+
+def _ended(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """What it said in the end; it is killed if it does not end."""
+    try:
+        return process.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
+
+
+def test_interruption_leaves_nothing_half_done(prior, tmp_path):
+    """Ctrl-C in the middle of hours of motion: status 130, no traceback, no file, no folder."""
+    words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
+    process = _started(words)
     give_up = time.monotonic() + 100
     while not list(tmp_path.glob("gen/.*")) and time.monotonic() < give_up:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, told = _ended(process)
     assert (process.returncode, told) == (130, "mapctl: interrupted\n")
     assert list(tmp_path.iterdir()) == []
 
@@ -326,11 +341,10 @@ def test_an_interrupted_demo_and_scene_are_written_without_films(prior, tmp_path
 
 def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_path):
     words = ("follow", "circle:4", "-o", tmp_path / "walk.bvh", "--seconds", 3000, "--prior", prior)
-    process = subprocess.Popen([sys.executable, "-m", "mapctl.cli", *map(str, words)], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True)  # fmt: skip
+    process = _started(words)
     time.sleep(8)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, told = _ended(process)
     assert process.returncode == 130
     assert "Traceback" not in told
     assert told.startswith("mapctl: interrupted")

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
+from numba import njit
 
 from mapctl.protocols import Plan
 from priors import fast_kernels
@@ -173,7 +174,7 @@ def test_exponential_is_accurate_over_its_range():
     wanted = np.exp(x.astype(np.float64))
     exp, tanh = fast_kernels.exp, fast_kernels.tanh
 
-    @fast_kernels.njit
+    @njit
     def both(values, exponentials, tangents):
         for i in range(len(values)):
             exponentials[i], tangents[i] = exp(values[i]), tanh(values[i])
