@@ -33,7 +33,7 @@ class BenchSettings:
 
     seconds: float = 5.0
     """Of motion in each solve of the ablation."""
-    repeats: int = 15
+    repeats: int = 40
     """Evaluations timed; the fastest counts, since other work on the machine only adds."""
     particles: tuple[int, ...] = (1, 4, 16, 32)
     """Batch sizes."""

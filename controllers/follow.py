@@ -26,11 +26,11 @@ from mapctl.terms import Footing, Noise, Path, Term
 class FollowSettings:
     """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
 
-    path_sigma_slow: float = 0.03
+    path_sigma_slow: float = 0.025
     """Sideways offset after its slow part is taken, metres."""
-    path_free_sway: float = 0.035
+    path_free_sway: float = 0.03
     """Sideways offset that is left to the walker, metres."""
-    path_sigma_raw: float = 0.03
+    path_sigma_raw: float = 0.025
     """Sideways offset beyond it, metres."""
     path_sigma_progress: float = 0.08
     """Arc missing or too much, metres."""

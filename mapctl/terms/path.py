@@ -28,11 +28,11 @@ class Path:
     """Wanted arc of each frame of the window, metres."""
     joint: str = "hips"
     """Which joint follows."""
-    sigma_slow: float = 0.03
+    sigma_slow: float = 0.025
     """Of the sideways offset after a Gaussian of `slow_seconds`, metres."""
-    free_sway: float = 0.035
+    free_sway: float = 0.03
     """Sideways offset that is nobody's business but the walker's, metres: mocap sways by 1.9 cm rms."""
-    sigma_raw: float = 0.03
+    sigma_raw: float = 0.025
     """Of the sideways offset beyond that, metres."""
     sigma_progress: float = 0.08
     """Of the arc that is missing or too much, metres."""
