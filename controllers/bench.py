@@ -91,7 +91,7 @@ def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]
         "circle:4": curves.circle(radius=4.0),
         "figure8:2": curves.figure8(radius=2.0),
         "s:6": curves.s(length=6.0),
-        "corner": curves.from_points([(0.0, 0.0), (0.0, 3.0), (3.0, 3.0)]),
+        "corner": curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0]], dtype=torch.float64)),
     }
     return [
         {"curve": name, **_ablated(prior, curve, method, label, settings)}

@@ -14,12 +14,18 @@ def compilers(*relaxed: str) -> tuple[Compile, Compile]:
     `relaxed` names LLVM's fast-math flags; NaN and infinity keep their meaning while `nnan` and `ninf` are not among
     them. Inner functions go without the wrappers for Python, which makes the first use quicker.
     """
-    shared = {"error_model": "numpy", "fastmath": set(relaxed)}
+    shared: dict[str, Any] = {"error_model": "numpy", "fastmath": set(relaxed)}
 
     def entry(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
-            return njit(cache=True, nogil=True, **shared)(function)
+            return _njit(cache=True, nogil=True, **shared)(function)
         except RuntimeError:  # numba found no folder that it may write to
-            return njit(nogil=True, **shared)(function)
+            return _njit(nogil=True, **shared)(function)
 
-    return entry, njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
+    return entry, _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
+
+
+def _njit(**options: Any) -> Compile:
+    """numba's decorator, whose overloads no type checker follows."""
+    compiler: Any = njit
+    return compiler(**options)
