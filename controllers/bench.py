@@ -13,11 +13,12 @@ from controllers.generate import GenerateSettings, begin
 from controllers.starting import choose_start
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.features import LAYOUT, PRIOR_FPS
+from mapctl.features import LAYOUT, PRIOR_FPS, ground_speed
 from mapctl.metrics import measure
+from mapctl.metrics.states import state_summary
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
-from mapctl.solver.methods import LatentMethod, Method, StateMethod
+from mapctl.solver.methods import LatentMethod, StateMethod
 from mapctl.solver.objective import Objective
 from mapctl.solver.proposals import BestOf, Swarm
 from mapctl.solver.result import Outcome, Solution
@@ -53,31 +54,26 @@ def speed(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
 def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) -> list[Row]:
     """Long free runs at temperature 1: a row each, and one of their means beside the training data's own values.
 
-    `stuck` is the lowest one-second speed over the median one; 0 would be a character that has stopped.
+    A character that had stopped would show in its slowest second; one that came apart in its largest feature, in
+    standard deviations.
     """
     rows, everything = [], []
     for run in range(runs):
         features = _free_run(prior, frames, seed + run)
         everything.append(features)
-        pace = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * PRIOR_FPS
+        pace = ground_speed(features)
         seconds = pace[: len(pace) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
-        rows.append({"run": str(run), **_free_run_values(features), "slowest_second_m_s": float(seconds.min()),
+        rows.append({"run": str(run), **state_summary(features), "slowest_second_m_s": float(seconds.min()),
                      "fastest_second_m_s": float(seconds.max()),
                      "largest_feature_sigma": float(_in_sigmas(prior, features).abs().max())})  # fmt: skip
     data = prior.card.quality["data"]
-    return [*rows, {"run": "all", **_free_run_values(torch.cat(everything))}, {"run": "training data", **data}]
+    return [*rows, {"run": "all", **state_summary(torch.cat(everything))}, {"run": "training data", **data}]
 
 
 def _free_run(prior: Any, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     state, _ = begin(prior, GenerateSettings(), None, generator)
     return prior.sample(state, frames, generator)[0][0]
-
-
-def _free_run_values(features: Tensor) -> Row:
-    return {"speed": float(LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean() * PRIOR_FPS),
-            "height": float(LAYOUT.pick(features, "root_height").mean()),
-            "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean())}  # fmt: skip
 
 
 def _in_sigmas(prior: Any, features: Tensor) -> Tensor:
@@ -94,31 +90,28 @@ def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]
         "corner": curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0]], dtype=torch.float64)),
     }
     return [
-        {"curve": name, **_ablated(prior, curve, method, label, settings)}
+        {"curve": name, **_ablated(prior, curve, wishes, label, settings)}
         for name, curve in shapes.items()
-        for label, method in methods(prior).items()
+        for label, wishes in variants(prior).items()
     ]
 
 
-def methods(prior: Any) -> dict[str, Method]:
+def variants(prior: Any) -> dict[str, FollowSettings]:
     """The variants of the ablation by name."""
-    plain = LatentMethod()
-    size = LAYOUT.continuous
-    mean, std = prior.feature_mean[:size], prior.feature_std[:size]
+    plain, size = LatentMethod(), LAYOUT.continuous
+    best = replace(plain, proposal=BestOf(count=32), budget=Budget(evaluations=152))
+    flown = replace(plain, proposal=Swarm(), budget=Budget(evaluations=216))
+    states = StateMethod(prior.feature_std[:size], prior.feature_mean[:size])
     return {
-        "latents, zero start": plain,
-        "latents, best of 32": replace(plain, proposal=BestOf(count=32), budget=Budget(evaluations=152)),
-        "latents, swarm 16 x 6": replace(plain, proposal=Swarm(), budget=Budget(evaluations=216)),
-        "states, 160 evaluations": StateMethod(std, mean),
+        "latents, zero start": FollowSettings(method=plain),
+        "latents, best of 32": FollowSettings(method=best),
+        "latents, swarm 16 x 6": FollowSettings(method=flown),
+        # Here the noise is that of the network's input, in units of its sigma, and the states need a density.
+        "states, 160 evaluations": FollowSettings(method=states, noise=Noise(sigma=1.0), extra=(Likelihood(),)),
     }
 
 
-def _ablated(prior: Any, curve: Curve, method: Method, label: str, settings: BenchSettings) -> Row:
-    wishes = FollowSettings(method=method)
-    if isinstance(
-        method, StateMethod
-    ):  # its noise is the network's input noise, in units of sigma, and states need a density
-        wishes = replace(wishes, noise=Noise(sigma=1.0), extra=(Likelihood(),))
+def _ablated(prior: Any, curve: Curve, wishes: FollowSettings, label: str, settings: BenchSettings) -> Row:
     began = time.process_time()
     solution = _followed(prior, curve, settings.seconds, settings.seed, wishes)
     spent = time.process_time() - began

@@ -26,13 +26,13 @@ from mapctl.terms import Footing, Noise, Path, Term
 class FollowSettings:
     """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
 
-    path_sigma_slow: float = 0.025
+    path_sigma_slow: float = Path.sigma_slow
     """Sideways offset after its slow part is taken, metres."""
-    path_free_sway: float = 0.03
+    path_free_sway: float = Path.free_sway
     """Sideways offset that is left to the walker, metres."""
-    path_sigma_raw: float = 0.025
+    path_sigma_raw: float = Path.sigma_raw
     """Sideways offset beyond it, metres."""
-    path_sigma_progress: float = 0.08
+    path_sigma_progress: float = Path.sigma_progress
     """Arc missing or too much, metres."""
     footing: Footing = field(default_factory=Footing)
     """Planted feet."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves import Curve
-from mapctl.features import LAYOUT, Place, decode, root_places
+from mapctl.features import LAYOUT, Place, decode, ground_speed, root_places
 from mapctl.rotations import wrap_angle
 from mapctl.skeleton import Skeleton
 from mapctl.solver.objective import Objective
@@ -69,7 +69,7 @@ def choose_start(
 
 def _oddness(features: Float[Tensor, "starts frames size"], wanted: float, fps: float) -> Float[Tensor, " starts"]:
     """Nats: how far each candidate's own speed is from the wanted one, and its sway from the usual one."""
-    speed = LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1).mean(-1) * fps
+    speed = ground_speed(features).mean(-1)
     sway = _sway(features, fps)
     spread = (sway.quantile(0.75) - sway.quantile(0.25)).clamp_min(1e-4) / 2
     unusual = (sway - sway.quantile(_USUAL_SWAY)) / spread

@@ -128,6 +128,11 @@ def root_places(
     return start.position_xz.unsqueeze(-2) + torch.cumsum(steps, dim=-2), heading
 
 
+def ground_speed(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch"]:
+    """Speed of the root over the ground in each frame, m/s."""
+    return LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * PRIOR_FPS
+
+
 def local_rotations(
     features: Float[Tensor, "*batch frames size"], heading: Float[Tensor, "*batch frames"]
 ) -> Float[Tensor, "*batch frames joints 4"]:

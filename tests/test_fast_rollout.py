@@ -11,7 +11,6 @@ from numba import njit
 from mapctl import compiled
 from mapctl.protocols import Plan
 from priors import fast_kernels
-from priors.benchmark import benchmark
 from priors.fast_rollout import FastRollout
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig, LstmState
 
@@ -203,12 +202,5 @@ def test_kernels_compile_where_nothing_can_be_kept(monkeypatch):
 
 
 def test_importing_the_module_does_not_import_the_compiler():
-    code = "import sys, priors.fast_rollout, priors.benchmark; sys.exit('numba' in sys.modules)"
+    code = "import sys, priors.fast_rollout; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
-
-
-def test_benchmark_times_both_paths():
-    model, _, _ = make(64, 1)
-    times = benchmark(model, frames=8, particles=(1, 4))
-    assert set(times) == {1, 4}
-    assert times[1]["ratio"] == pytest.approx(times[1]["reference_ms"] / times[1]["fast_ms"])

@@ -13,7 +13,8 @@ from safetensors.torch import load_file, save_file
 
 import priors
 from mapctl.errors import CheckpointError, MapctlError, RequestError
-from mapctl.features import LAYOUT, encode, mirror_features
+from mapctl.features import LAYOUT, encode, ground_speed, mirror_features
+from mapctl.metrics.states import state_summary
 from priors.lstm_gmm import LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import health, run, starts
@@ -359,12 +360,12 @@ def test_starts_are_the_states_after_stretches_of_clips():
         end = 1 + int((clip == found.state.previous[row]).all(-1).nonzero()[0])
         expected = trainer.model.advance(trainer.model.initial_state(clip[:1]), clip[None, 1:end])
         torch.testing.assert_close(found.state.hidden[:, row], expected.hidden[:, 0])
-        assert float(found.speed[row]) == pytest.approx(float(starts.speed(clip[end - 30 : end]).mean()), rel=1e-5)
+        assert float(found.speed[row]) == pytest.approx(float(ground_speed(clip[end - 30 : end]).mean()), rel=1e-5)
 
 
 def test_abilities_are_the_speeds_and_turns_of_the_data():
     found = starts.abilities(corpus())
-    speeds = [float(starts.speed(clip).mean()) for clip in corpus().clips()]
+    speeds = [float(ground_speed(clip).mean()) for clip in corpus().clips()]
     assert min(speeds) * 0.9 < found.slowest < found.fastest < max(speeds) * 1.05
     assert found.turn_rate == pytest.approx(0.3, abs=0.05)
     still = corpora.Corpus(("still",), (80,), torch.zeros(80, LAYOUT.size))
@@ -377,5 +378,5 @@ def test_free_runs_are_compared_with_the_data():
     assert found["free_run_finite"] == 1
     assert found["free_run_speed_ratio"] == pytest.approx(1, abs=0.3)
     assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)
-    summary = health.summary(encode(walk(60))[0].float())
+    summary = state_summary(encode(walk(60))[0].float())
     assert summary["speed"] == pytest.approx(1.24, abs=0.02)

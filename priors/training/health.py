@@ -1,13 +1,11 @@
 """Free-run health: does the density, sampled for long, stay a person moving as the data do?"""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from mapctl.features import LAYOUT
+from mapctl.features import ground_speed
+from mapctl.metrics.states import state_summary
 from priors.lstm_gmm import LstmGmm
 from priors.training.corpus import Corpus
-from priors.training.starts import speed
 
 _SETTLE = 300
 
@@ -25,14 +23,8 @@ def free_run(
     state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
     features, _ = model.sample(state, frames, torch.Generator().manual_seed(seed), temperature=temperature)
     settled = features[:, min(_SETTLE, frames // 2) :].cpu()
-    own, wanted = summary(settled.flatten(0, 1)), summary(corpus.features)
+    own, wanted = state_summary(settled.flatten(0, 1)), state_summary(corpus.features)
     result = {f"free_run_{name}_ratio": own[name] / wanted[name] for name in own}
-    result["free_run_slowest_m_s"] = float(speed(settled[:, -150:]).mean(-1).min())
+    result["free_run_slowest_m_s"] = float(ground_speed(settled[:, -150:]).mean(-1).min())
     result["free_run_finite"] = float(torch.isfinite(features).all())
     return result
-
-
-def summary(features: Float[Tensor, "frames size"]) -> dict[str, float]:
-    """Mean speed (m/s), mean root height (m) and mean spread of the joint rotations (rad)."""
-    return {"speed": float(speed(features).mean()), "height": float(LAYOUT.pick(features, "root_height").mean()),
-            "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean())}  # fmt: skip

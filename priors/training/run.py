@@ -14,11 +14,12 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import Place, decode
 from mapctl.formats.atomic import check_folder
 from mapctl.metrics import reference
+from mapctl.metrics.states import state_summary
 from priors import checkpoints
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import resume
-from priors.training.health import free_run, summary
+from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
 from priors.training.starts import abilities, choose
 
@@ -107,7 +108,7 @@ def _card(
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
     training = {"command": command(request), "settings": asdict(request.settings), "curve": curve}
     quality = {"test_nats_per_frame": validation_nats(model, parts.test), "mocap": _mocap(parts),
-               "data": summary(parts.train.features)}  # fmt: skip
+               "data": state_summary(parts.train.features)}  # fmt: skip
     return checkpoints.Card(
         kind="lstm-gmm", config=asdict(request.config), licence=request.licence, data=data, training=training,
         quality=quality, abilities=asdict(abilities(parts.train)), **checkpoints.Card.of_layout(),

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, PRIOR_FPS, Place, root_places
+from mapctl.features import PRIOR_FPS, Place, ground_speed, root_places
 from mapctl.protocols import Abilities, Starts
 from priors.lstm_gmm import LstmGmm, LstmState
 from priors.training.corpus import Corpus
@@ -21,7 +21,7 @@ def choose(model: LstmGmm, corpus: Corpus, *, count: int, generator: torch.Gener
     ends = [_WARM_UP + int(torch.randint(len(features[i]) - _WARM_UP - _SECOND // 2, (1,), generator=generator))
             for i in shuffled]  # fmt: skip
     speeds = torch.stack(
-        [speed(features[i][end - _SECOND : end]).mean() for i, end in zip(shuffled, ends, strict=True)]
+        [ground_speed(features[i][end - _SECOND : end]).mean() for i, end in zip(shuffled, ends, strict=True)]
     )
     picked = _spread(speeds, count)
     states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]
@@ -46,11 +46,6 @@ def abilities(corpus: Corpus) -> Abilities:
     speeds, turns = torch.cat(speeds), torch.cat(turns)
     turn_rate = float(turns.quantile(0.995)) if len(turns) else 0.0  # nobody may walk in the data
     return Abilities(float(speeds.quantile(0.01)), float(speeds.quantile(0.99)), turn_rate)
-
-
-def speed(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch"]:
-    """Ground speed of each frame, m/s."""
-    return LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * _SECOND
 
 
 def _spread(speeds: Tensor, count: int) -> list[int]:
