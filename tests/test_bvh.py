@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
+from turns import turn
 
 from mapctl import formats, rotations
 from mapctl.errors import MapctlError, RequestError
@@ -45,16 +46,6 @@ Frame Time: 0.0333333
 1 90 3 10 20 30 1 2 3 0.1 -0.2 0.3
 2 91 4 11 21 31 2 3 4 0.2 -0.3 100
 """
-
-
-def turn(axis: int, degrees: float) -> np.ndarray:
-    """Rotation matrix about one axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = np.cos(np.radians(degrees))
-    matrix[j, i] = np.sin(np.radians(degrees))
-    matrix[i, j] = -matrix[j, i]
-    return matrix
 
 
 def world(tree, values):

@@ -6,22 +6,13 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from turns import turn
 
 from mapctl import rotations
 from mapctl.formats import bvh, bvh_text
 
 AXES = "XYZ"
 EULER_ORDERS = [order for order in product(range(3), repeat=3) if order[0] != order[1] != order[2]]
-
-
-def turn(axis: int, degrees: float) -> np.ndarray:
-    """Rotation matrix about one axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = np.cos(np.radians(degrees))
-    matrix[j, i] = np.sin(np.radians(degrees))
-    matrix[i, j] = -matrix[j, i]
-    return matrix
 
 
 def written_angles(quat, order, tmp_path):
