@@ -97,7 +97,7 @@ def load(name: str) -> LstmGmmDensity:
             tensors.pop("starts.speed"), tuple(card.data["starts"]),
         )  # fmt: skip
         Abilities(**card.abilities)
-        model = LstmGmm(LstmGmmConfig(**card.config), mean=tensors["mean"], std=tensors["std"])
+        model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)
     except (KeyError, TypeError, RuntimeError, RequestError) as error:
         raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error

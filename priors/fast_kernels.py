@@ -240,8 +240,11 @@ def discrete_density(settings, count, head, component, contacts):
 
 
 @_inner
-def gaussian(settings, head, before, noise, after):
-    """The next frame's Gaussian values and their log density; the head's rows become sigma and slope."""
+def gaussian(settings, head, before, noise, after, mixing):
+    """The next frame's Gaussian values and their log density; the head's rows become sigma and slope.
+
+    `mixing` is the component's (C, C) triangle; it leaves volumes, and so densities, as they are.
+    """
     size = settings.continuous
     means, rows = head[:size], head[settings.log_sigma : settings.log_sigma + size]
     span, limit, density = settings.high - settings.low, settings.clamp, _ZERO
@@ -256,7 +259,10 @@ def gaussian(settings, head, before, noise, after):
         rows[j] = _FOUR * share * (_ONE - share)
         density -= log_sigma + _HALF * noise[j] * noise[j]
     for j in range(size):
-        after[j] += means[j] * noise[j]
+        row, total = mixing[j], _ZERO
+        for i in range(size):
+            total += row[i] * means[i] * noise[i]
+        after[j] += total
     return density - _HALF * np.float32(math.log(2 * math.pi)) * size
 
 
@@ -277,7 +283,8 @@ def compose(
         k = choices.component[b, t]
         affine(weights.head[k, :shared], biases.head[k, :shared], hidden[b : b + 1], head[b : b + 1])
         discrete = discrete_density(settings, count, head[b], k, choices.contacts[b, t])
-        density[b, t] = discrete + gaussian(settings, head[b], tape.frame[now, b], noise[b, t], following[b])
+        continuous = gaussian(settings, head[b], tape.frame[now, b], noise[b, t], following[b], settings.mixing[k])
+        density[b, t] = discrete + continuous
         for j in range(size):
             features[b, t, j] = following[b, j] * settings.std[j] + settings.mean[j]
         for side in range(2):
@@ -314,18 +321,28 @@ def forward(weights, biases, settings, tape, noise, choices, source, features, d
 
 
 @_inner
-def compose_pullback(settings, tape, noise, t, d_feature, d_density, d_frame, d_noise, d_head):
-    """Gradient on one frame to its noise, the rows of the head and (d_frame, in place) the frame before."""
+def compose_pullback(settings, tape, noise, component, t, d_feature, d_density, d_frame, d_noise, d_head, d_spread):
+    """Gradient on one frame to its noise, the rows of the head and (d_frame, in place) the frame before.
+
+    `d_spread` (C,) is scratch: the gradient on sigma times noise, before the mixing.
+    """
     size, first = settings.continuous, settings.log_sigma
     for b in range(len(noise)):
         head, before, gradient, d_rows = tape.head[t, b], tape.frame[t, b], d_frame[b], d_head[b]
         n, dn, df, up = noise[b, t], d_noise[b, t], d_feature[b, t], d_density[b, t]
         for j in range(size):
             d_rows[j] = gradient[j] + df[j] * settings.std[j]
+        mixing = settings.mixing[component[b, t]]
+        for i in range(size):
+            d_spread[i] = _ZERO
         for j in range(size):
-            dn[j] = d_rows[j] * head[j] - up * n[j]
+            row, pulled = mixing[j], d_rows[j]
+            for i in range(size):
+                d_spread[i] += row[i] * pulled
         for j in range(size):
-            d_rows[first + j] = (d_rows[j] * head[j] * n[j] - up) * head[first + j]
+            dn[j] = d_spread[j] * head[j] - up * n[j]
+        for j in range(size):
+            d_rows[first + j] = (d_spread[j] * head[j] * n[j] - up) * head[first + j]
         for j in range(settings.weight, len(head)):
             d_rows[j] = up * head[j]
         for j in range(size, len(gradient)):
@@ -349,8 +366,11 @@ def backward(
     d_head = np.zeros((batch, transposed.head.shape[2]), np.float32)
     d_third, d_above = np.zeros((batch, width), np.float32), np.zeros((batch, width), np.float32)
     d_gates, d_before = np.zeros((batch, 4 * width), np.float32), np.zeros_like(d_frame)
+    d_spread = np.zeros(settings.continuous, np.float32)
     for t in range(noise.shape[1] - 1, -1, -1):
-        compose_pullback(settings, tape, noise, t, d_feature, d_density, d_frame, d_noise, d_head)
+        compose_pullback(
+            settings, tape, noise, component, t, d_feature, d_density, d_frame, d_noise, d_head, d_spread,
+        )  # fmt: skip
         for b in range(batch):
             k, row = component[b, t], slice(b, b + 1)
             affine_pullback(weights.head[k], transposed.head[k], nothing, d_head[row], d_third[row])

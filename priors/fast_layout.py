@@ -64,6 +64,8 @@ class Settings(NamedTuple):
     """(Z,) of the features, physical units."""
     std: Array
     """(Z,), physical units; 1 where padded."""
+    mixing: Array
+    """(components, C, C): what correlates each component's Gaussian values; ones on the diagonal where nothing does."""
 
 
 class Tape(NamedTuple):
@@ -115,9 +117,11 @@ def settings_of(model: LstmGmm) -> Settings:
     mean, std = np.zeros(features, np.float32), np.ones(features, np.float32)
     mean[: model.layout.size], std[: model.layout.size] = _numpy(model.mean), _numpy(model.std)
     low, high = np.float32(config.min_log_sigma), np.float32(config.max_log_sigma)
+    alone = torch.eye(size).repeat(config.components, 1, 1)
+    mixing = np.ascontiguousarray(_numpy(alone if model.mixing is None else model.mixing))
     return Settings(
         size, rows, 2 * rows, 2 * rows + config.components,
-        np.float32(config.retain), np.float32(config.clamp), low, high, mean, std,
+        np.float32(config.retain), np.float32(config.clamp), low, high, mean, std, mixing,
     )  # fmt: skip
 
 

@@ -28,11 +28,11 @@ TERMS: dict[str, Term] = {
 
 
 def densities(dtype: torch.dtype = torch.float64) -> dict[str, LstmGmm]:
-    """Random networks: one Gaussian, several, and the paper's variant, which predicts frames absolutely."""
+    """Random networks: one Gaussian, several, and the paper's variant: absolute frames, diagonal Gaussians."""
     networks = {
         "one": tiny_model(components=1, dtype=dtype),
         "several": tiny_model(components=3, seed=1, dtype=dtype),
-        "absolute": tiny_model(components=2, seed=2, retain=0.0, dtype=dtype),
+        "absolute": tiny_model(components=2, seed=2, retain=0.0, correlated=False, dtype=dtype),
     }
     for seed, network in enumerate(networks.values()):
         excite(network, seed)
@@ -40,10 +40,13 @@ def densities(dtype: torch.dtype = torch.float64) -> dict[str, LstmGmm]:
 
 
 def excite(network: LstmGmm, seed: int) -> None:
-    """Larger output weights, so that components and contact bits change along a rollout."""
+    """Larger output weights, so that components and contact bits change along a rollout; values correlate."""
     with torch.no_grad():
         for values in (network.out.weight, network.out.bias):
             values += 0.3 * torch.randn(values.shape, generator=generator(seed), dtype=values.dtype)
+        if network.correlation is not None:
+            values = network.correlation
+            values += 0.1 * torch.randn(values.shape, generator=generator(seed), dtype=values.dtype)
 
 
 def moved_curve(curve: Curve, turn: float, shift: tuple[float, float]) -> Curve:

@@ -147,12 +147,13 @@ def write_corpus(folder: Path, count: int = 5, frames: int = 80) -> Path:
 
 
 def tiny_model(*, width: int = 8, components: int = 3, seed: int = 0, retain: float = 0.9,
-               dtype: torch.dtype = torch.float32) -> LstmGmm:  # fmt: skip
+               correlated: bool = True, dtype: torch.dtype = torch.float32) -> LstmGmm:  # fmt: skip
     """An untrained network with the statistics of the walks: it walks on at their mean pose and speed."""
     mean, std = statistics(corpus().features)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        model = LstmGmm(LstmGmmConfig(width=width, components=components, retain=retain), mean=mean, std=std)
+        config = LstmGmmConfig(width=width, components=components, retain=retain, correlated=correlated)
+        model = LstmGmm(config, mean=mean, std=std)
     return model.to(dtype).eval().requires_grad_(False)
 
 
@@ -163,7 +164,7 @@ def tiny_density(*, width: int = 8, components: int = 3, seed: int = 0, starts: 
     data = corpus()
     found = choose(model, data, count=starts, generator=generator(seed))
     shown, names = asdict(abilities(data)), {"starts": list(found.names)}
-    card = Card("lstm-gmm", asdict(model.config), licence="none", data=names, abilities=shown, **Card.of_layout())
+    card = Card("lstm-gmm", model.config.as_card(), licence="none", data=names, abilities=shown, **Card.of_layout())
     density = LstmGmmDensity("tiny", model.to(dtype), found, card, use_fast=False)
     if dtype is not torch.float32:
         for part in ("previous", "hidden", "cell"):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from catalogue import densities
 from helpers import corpus, finite_difference, generator, noise, tiny_density
-from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, Normal
+from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, MultivariateNormal
 
 from mapctl.features import LAYOUT
 from mapctl.protocols import Plan
@@ -44,7 +44,11 @@ def test_the_density_is_a_mixture_of_normals_times_two_bernoullis(kind):
     network, frames = NETWORKS[kind], clip()
     state = warm(network)
     mixture = mixture_of(network, state, frames)
-    normals = Independent(Normal(mixture.mean, mixture.log_sigma.exp()), 1)
+    mixing = torch.eye(SIZE).double().expand(network.config.components, -1, -1)
+    if network.whitening is not None:
+        mixing = torch.linalg.inv(network.whitening)
+        torch.testing.assert_close(network.mixing, mixing)
+    normals = MultivariateNormal(mixture.mean, scale_tril=mixing * mixture.log_sigma.exp().unsqueeze(-2))
     poses = MixtureSameFamily(Categorical(logits=mixture.log_weight), normals)
     bits = Independent(Bernoulli(logits=mixture.contact_logit), 1)
     expected = poses.log_prob(network.normalise(frames)[..., :SIZE]) + bits.log_prob(frames[..., SIZE:])
@@ -92,7 +96,10 @@ def test_noise_is_the_standardised_error_of_the_chosen_component(kind):
     mixture = mixture_of(network, state, frames)
     picked = plan.component[..., None, None].expand(-1, -1, 1, SIZE)
     mean, sigma = (part.gather(-2, picked)[..., 0, :] for part in (mixture.mean, mixture.log_sigma.exp()))
-    torch.testing.assert_close((network.normalise(frames)[..., :SIZE] - mean) / sigma, draws, atol=1e-7, rtol=1e-7)
+    error = network.normalise(frames)[..., :SIZE] - mean
+    if network.whitening is not None:
+        error = (network.whitening[plan.component] @ error.unsqueeze(-1))[..., 0]
+    torch.testing.assert_close(error / sigma, draws, atol=1e-7, rtol=1e-7)
     assert torch.equal(frames[..., SIZE:] > 0.5, plan.contacts)
 
 
@@ -171,7 +178,10 @@ def test_draws_follow_the_mixture(kind):
     mixture = mixture_of(network, state, clip(1, 1))
     weight = mixture.log_weight[0, 0].exp()[:, None]
     mean = (weight * mixture.mean[0, 0]).sum(0)
-    second = (weight * (mixture.mean[0, 0] ** 2 + (2 * mixture.log_sigma[0, 0]).exp())).sum(0)
+    variance = (2 * mixture.log_sigma[0, 0]).exp()
+    if network.mixing is not None:
+        variance = (network.mixing**2 @ variance.unsqueeze(-1))[..., 0]
+    second = (weight * (mixture.mean[0, 0] ** 2 + variance)).sum(0)
     error = (second - mean**2).sqrt() / count**0.5
     values = network.normalise(drawn)[:, 0]
     assert float(((values[:, :SIZE].mean(0) - mean) / error).abs().max()) < 4.5

@@ -29,7 +29,7 @@ def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8) -> Path:
     }
     card = checkpoints.Card(
         kind="lstm-gmm",
-        config=asdict(CONFIG),
+        config=CONFIG.as_card(),
         licence="none, it is made up",
         data={"starts": [f"start {number}" for number in range(starts)]},
         quality={"mocap": {"sway_cm": {"mean": 1.9, "p2": 1.2, "p98": 2.6}}},

@@ -5,7 +5,8 @@ comes from one generator whose state is in the checkpoint, so a resumed run cont
 """
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -13,8 +14,10 @@ from torch import Tensor
 
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, mirror_features
-from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.lstm_gmm import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus, window_starts
+from priors.training.labels import Labels
+from priors.training.matching import MatchingSettings, mismatch
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,20 @@ class TrainingSettings:
     input_noise: float = 0.05
     """Standard deviation of the noise on normalised inputs (section 4.1.3)."""
     noise_range: float = 4.0
-    """Each window draws its noise level log-uniformly between `input_noise` and this many times it; 1 is the paper."""
+    """Each window draws its noise level log-uniformly between `input_noise` and this many times it; 1 is the paper.
+    A network that knows the level is shown all levels down to none, low ones more often."""
     bit_flips: float = 0.02
     """Share of input contact bits that are flipped."""
     mirror: bool = True
     """Each window is mirrored left to right with probability one half."""
     weight_decay: float = 1e-4
     """Decoupled, for adam."""
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    """Free runs held to the data's moments."""
+    untold: float = 0.5
+    """Share of the windows of which no label is told; of the others each group (gait, style) is told with 0.7."""
+    bfloat16: bool = False
+    """The network computes in bfloat16, weights and loss stay in float32: faster where the processor has it."""
     seed: int = 1
     """Of weights, windows and noise."""
 
@@ -58,9 +68,9 @@ class TrainingSettings:
 
 
 PAPER = (
-    LstmGmmConfig(width=500, components=5, retain=0.0),
+    LstmGmmConfig(width=500, components=5, retain=0.0, correlated=False, knows_noise=False),
     TrainingSettings(batch=20, window=50, optimiser="rmsprop", schedule="epochs", noise_range=1.0, bit_flips=0.0,
-                     mirror=False, weight_decay=0.0, steps=30_000),
+                     mirror=False, weight_decay=0.0, steps=30_000, matching=MatchingSettings(begin=1.0)),
 )  # fmt: skip
 """The variant as the paper prints it (30,000 iterations)."""
 
@@ -83,14 +93,21 @@ def statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
 class Trainer:
     """Model, optimiser and generator, one step at a time."""
 
-    def __init__(self, config: LstmGmmConfig, settings: TrainingSettings, corpus: Corpus, device: str = "cpu"):
+    def __init__(
+        self, config: LstmGmmConfig, settings: TrainingSettings, corpus: Corpus, device: str = "cpu", *,
+        labels: Labels | None = None, init: Mapping[str, Tensor] | None = None,
+    ):  # fmt: skip
+        """`labels` of the corpus' clips, the network's own; `init` holds weights and statistics to begin with."""
         self.settings, self.device, self.step = settings, device, 0
         self.generator = torch.Generator().manual_seed(settings.seed)
         mean, std = statistics(corpus.features)
         with torch.random.fork_rng(devices=[]):  # torch draws weights from its global generator, which is the caller's
             torch.default_generator.manual_seed(settings.seed)
             self.model = LstmGmm(config, mean=mean, std=std).to(device)
-        self.features = corpus.features
+        if init is not None:
+            self.model.load_state_dict(dict(init))
+        self.features, self.labels = corpus.features, labels or Labels.none(len(corpus.lengths))
+        self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
         self.starts = window_starts(corpus.lengths, settings.window + 1)
         self.optimiser = self._optimiser()
 
@@ -99,7 +116,8 @@ class Trainer:
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate()
-        loss = -self._log_prob(self._windows()).mean()
+        windows, condition = self._windows()
+        loss = -self._log_prob(windows, condition).mean()
         if not torch.isfinite(loss):
             raise _diverged(self.step + 1, f"the loss is {loss.item()} nats")
         self.optimiser.zero_grad(set_to_none=True)
@@ -108,6 +126,8 @@ class Trainer:
             torch.nn.utils.clip_grad_value_(self.model.parameters(), settings.gradient_clip)
         else:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.gradient_clip)
+        if self.step >= settings.matching.begin * settings.steps:
+            self._match(windows)
         self.optimiser.step()
         self.step += 1
         return loss.item()
@@ -144,32 +164,68 @@ class Trainer:
             return torch.optim.RMSprop(parameters, lr=settings.learning_rate, alpha=0.9)
         return torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay)
 
-    def _windows(self) -> Float[Tensor, "batch window_and_one size"]:
+    def _match(self, windows: Tensor) -> None:
+        """Add the gradient of the free runs' mismatch, clipped on its own: neither loss drowns the other."""
+        parameters = [p for p in self.model.parameters() if p.requires_grad]
+        loss = mismatch(self.model, windows, self.settings.matching, self.generator)
+        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+        found = [(p, g) for p, g in zip(parameters, gradients, strict=True) if g is not None]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for _, g in found]))
+        if not torch.isfinite(norm):
+            return  # a free run that left the data's range says nothing
+        for parameter, gradient in found:
+            share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
+            parameter.grad = share * gradient if parameter.grad is None else parameter.grad + share * gradient
+
+    def _windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
+        """Windows of clips and the labels that are told of them."""
         settings = self.settings
         picked = torch.randint(len(self.starts), (settings.batch,), generator=self.generator)
         frames = self.starts[picked, None] + torch.arange(settings.window + 1)
         windows = self.features[frames]
+        labels = self.labels.held[torch.searchsorted(self.clip_ends, frames[:, 0].contiguous(), right=True)]
         if settings.mirror:
             chosen = torch.rand(settings.batch, 1, 1, generator=self.generator) < 0.5
             windows = torch.where(chosen, mirror_features(windows), windows)
-        return windows.to(self.device)
+            labels = torch.where(chosen[:, :, 0], labels[:, self.labels.mirrored], labels)
+        return windows.to(self.device), self._told(labels).to(self.device)
 
-    def _log_prob(self, windows: Tensor) -> Tensor:
+    def _told(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
+        """Most often nothing is told, or one group only, so that the network does well with whatever it is told."""
+        if not self.labels.names:
+            return labels
+        groups = self.labels.groups
+        told = torch.rand(len(labels), len(groups), generator=self.generator) < _TOLD_GROUP
+        told &= torch.rand(len(labels), 1, generator=self.generator) >= self.settings.untold
+        return labels * (told.to(labels.dtype) @ groups)
+
+    def _log_prob(self, windows: Tensor, told: Tensor) -> Tensor:
         """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
         model, size = self.model, self.model.layout.continuous
-        inputs = self._noisy(model.normalise(windows[:, :-1]), size)
+        inputs, level = self._noisy(model.normalise(windows[:, :-1]), size)
         memory = model.initial_state(windows[:, 0])
-        mixture, _ = model(inputs, (memory.hidden, memory.cell))
+        condition = torch.cat([level / NOISE_UNIT, told], -1) if model.config.knows_noise else told
+        with torch.autocast(self.device, torch.bfloat16, enabled=self.settings.bfloat16):
+            mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
-        return mixture.log_prob(target)
+        return mixture.log_prob(target, model.whitening)
 
-    def _noisy(self, inputs: Tensor, size: int) -> Tensor:
+    def _noisy(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
+        """Inputs with noise and flipped bits, and each window's level of noise."""
         settings, shape = self.settings, inputs.shape
-        level = torch.rand(shape[0], 1, 1, generator=self.generator) * math.log(settings.noise_range)
-        noise = torch.randn(shape[0], shape[1], size, generator=self.generator) * settings.input_noise * level.exp()
+        share = torch.rand(shape[0], 1, 1, generator=self.generator)
+        if self.model.config.knows_noise:
+            level = settings.input_noise * settings.noise_range * share.square()
+        else:
+            level = settings.input_noise * torch.exp(share * math.log(settings.noise_range))
+        noise = torch.randn(shape[0], shape[1], size, generator=self.generator) * level
         flips = torch.rand(shape[0], shape[1], 2, generator=self.generator) < settings.bit_flips
         bits = torch.where(flips.to(inputs.device), -inputs[..., size:], inputs[..., size:])
-        return torch.cat([inputs[..., :size] + noise.to(inputs.device), bits], dim=-1)
+        noisy = torch.cat([inputs[..., :size] + noise.to(inputs.device), bits], dim=-1)
+        return noisy, level[:, 0].to(inputs.device)
+
+
+_TOLD_GROUP = 0.7
 
 
 def _diverged(step: int, how: str) -> MapctlError:

@@ -67,7 +67,7 @@ def load(run: Path, trainer: Trainer, data: Mapping[str, str]) -> Curve:
 
 def _recipe(trainer: Trainer, data: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     """What must not change between a run's parts."""
-    return {"settings": asdict(trainer.settings), "network": asdict(trainer.model.config), "data": dict(data)}
+    return {"settings": asdict(trainer.settings), "network": trainer.model.config.as_card(), "data": dict(data)}
 
 
 def _check_same(run: Path, part: str, *, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:

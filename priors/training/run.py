@@ -4,7 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +15,10 @@ from mapctl.features import Place, decode
 from mapctl.formats.atomic import check_folder
 from mapctl.metrics import reference
 from mapctl.metrics.states import state_summary
-from priors import checkpoints
+from priors import checkpoints, density
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import resume
+from priors.training import labels, resume
 from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
 from priors.training.starts import abilities, choose
@@ -57,6 +57,10 @@ class TrainRequest:
     """Of the weights, for the card."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    labels: str = ""
+    """Regular expression whose named groups read labels from a clip's path, which the density can then be told."""
+    init: str | None = None
+    """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
     def __post_init__(self):
         for name in ("starts", "report_steps", "validate_steps"):
@@ -78,11 +82,22 @@ def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path
                           skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
     parts = corpora.split(corpus, request.settings.seed)
     progress(f"{len(corpus.names)} clips, {len(corpus.features)} frames; training on {len(parts.train.names)}")
-    trainer = Trainer(request.config, request.settings, parts.train, device)
-    data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed)}
+    trainer = _trainer(request, parts.train, device)
+    data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed),
+                                "labels": request.labels, "init": request.init or ""}  # fmt: skip
     curve = _resume(request, trainer, data, progress)
     _loop(request, trainer, parts, curve, progress, save=partial(resume.save, request.out, trainer, curve, data))
     return export(request, trainer, parts, curve)
+
+
+def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trainer:
+    """A new network for the corpus' labels, or the one to begin with and its own labels."""
+    known = labels.read(corpus.names, request.labels)
+    if request.init is None:
+        return Trainer(replace(request.config, labels=known.names), request.settings, corpus, device, labels=known)
+    before = density.load(request.init).reference
+    return Trainer(before.config, request.settings, corpus, device, labels=known.renamed(before.config.labels),
+                   init=before.state_dict())  # fmt: skip
 
 
 def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve) -> Path:
@@ -110,7 +125,7 @@ def _card(
     quality = {"test_nats_per_frame": validation_nats(model, parts.test), "mocap": _mocap(parts),
                "data": state_summary(parts.train.features)}  # fmt: skip
     return checkpoints.Card(
-        kind="lstm-gmm", config=asdict(request.config), licence=request.licence, data=data, training=training,
+        kind="lstm-gmm", config=model.config.as_card(), licence=request.licence, data=data, training=training,
         quality=quality, abilities=asdict(abilities(parts.train)), **checkpoints.Card.of_layout(),
     )  # fmt: skip
 
@@ -118,7 +133,9 @@ def _card(
 def command(request: TrainRequest) -> str:
     """What to type for the same run, for the card; options that are the defaults are left out."""
     plain, parts = TrainingSettings(), [f"mapctl train lstm-gmm --data DATA -o RUN --match '{request.match}'"]
-    parts += [f"--width {request.config.width}"]
+    parts += [f"--labels '{request.labels}'"] if request.labels else []
+    parts += [f"--init {request.init}"] if request.init else [f"--width {request.config.width}"]
+    parts += ["--bfloat16"] if request.settings.bfloat16 else []
     wanted, default = asdict(request.settings), asdict(plain)
     parts += [
         f"--{name} {wanted[name]}" for name in ("steps", "batch", "window", "seed") if wanted[name] != default[name]

@@ -1,0 +1,74 @@
+"""Labels of clips, read from their names: what a density can be told of a motion (gait, style)."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+
+_OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Which labels hold for which clip."""
+
+    names: tuple[str, ...]
+    """`group=value`, sorted: gait=run, style=active."""
+    held: Float[Tensor, "clips labels"]
+    """1 where a label holds."""
+
+    @staticmethod
+    def none(clips: int) -> "Labels":
+        """No labels."""
+        return Labels((), torch.zeros(clips, 0))
+
+    @property
+    def groups(self) -> Float[Tensor, "groups labels"]:
+        """1 where a label belongs to a group."""
+        kinds = [name.split("=")[0] for name in self.names]
+        return torch.tensor([[float(kind == group) for kind in kinds] for group in dict.fromkeys(kinds)])
+
+    @property
+    def mirrored(self) -> list[int]:
+        """Index of each label's mirror image: left and right change places where both are known."""
+        swapped = [re.sub("left|right", lambda side: _OTHER_SIDE[side[0]], name) for name in self.names]
+        return [self.names.index(other) if other in self.names else i for i, other in enumerate(swapped)]
+
+    def renamed(self, names: tuple[str, ...]) -> "Labels":
+        """The same clips under other labels: those that both know."""
+        held = torch.zeros(len(self.held), len(names))
+        for column, name in enumerate(names):
+            if name in self.names:
+                held[:, column] = self.held[:, self.names.index(name)]
+        return Labels(names, held)
+
+
+def read(clips: Sequence[str], pattern: str) -> Labels:
+    """From each clip's name by the named groups of a regular expression; an empty pattern reads none.
+
+    RequestError where it is no regular expression, has no named group or matches no clip.
+    """
+    if not pattern:
+        return Labels.none(len(clips))
+    try:
+        compiled = re.compile(pattern)
+    except re.error as error:
+        raise RequestError(f"labels must be a regular expression, got {pattern!r} ({error})") from error
+    if not compiled.groupindex:
+        raise RequestError(f"labels need named groups as in (?P<style>[a-z]+), got {pattern!r}")
+    found = [_of(compiled.search(name)) for name in clips]
+    names = tuple(sorted(set().union(*found)))
+    if not names:
+        raise RequestError(f"the labels {pattern!r} match no clip, such as {clips[0]!r}")
+    return Labels(names, torch.tensor([[float(name in clip) for name in names] for clip in found]))
+
+
+def _of(match: re.Match[str] | None) -> set[str]:
+    if match is None:
+        return set()
+    return {f"{group}={value}" for group, value in match.groupdict().items() if value}
