@@ -84,6 +84,8 @@ class Starts:
     """Mean speed over the second before, m/s."""
     names: tuple[str, ...]
     """The clip each was taken from."""
+    weight: Float[Tensor, " starts"]
+    """Share of the data that each stands for, all together 1: drawn by it, motions begin as the data do."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its starts and its card."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.protocols import Abilities, Plan, Starts
-from priors import checkpoints
+from priors import checkpoints, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig, LstmState
 
 if TYPE_CHECKING:
@@ -58,6 +59,29 @@ class LstmGmmDensity:
         """Spread of the training data."""
         return self.reference.std
 
+    def told(self, wanted: Sequence[str]) -> "LstmGmmDensity":
+        """The same density told labels of its data for good (`run`, `active`, `style=active`), with starts to match.
+
+        RequestError for labels that it does not know.
+        """
+        full = [self._label(name) for name in wanted]
+        known = labels.read(self.starts.names, self.card.data["labels"]).renamed(tuple(full))
+        fitting = known.held.sum(-1)
+        rows = (fitting == fitting.max()).nonzero()[:, 0]
+        weight = self.starts.weight[rows]
+        picked = Starts(self.starts.state.pick(rows), self.starts.speed[rows],
+                        tuple(self.starts.names[i] for i in rows.tolist()), weight / weight.sum())  # fmt: skip
+        return replace(self, reference=self.reference.told(full), starts=picked)
+
+    def _label(self, name: str) -> str:
+        """The whole label that a name, or its part after the `=`, stands for."""
+        known = self.reference.config.labels
+        for label in known:
+            if name in (label, label.split("=", 1)[-1]):
+                return label
+        values = ", ".join(label.split("=", 1)[-1] for label in known) or "none"
+        raise RequestError(f"the prior {self.name!r} knows no style {name!r}, only {values}")
+
     def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
         """A state with empty memory after one frame."""
         return self.reference.initial_state(previous)
@@ -94,7 +118,7 @@ def load(name: str) -> LstmGmmDensity:
     try:
         starts = Starts(
             LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
-            tensors.pop("starts.speed"), tuple(card.data["starts"]),
+            tensors.pop("starts.speed"), tuple(card.data["starts"]), tensors.pop("starts.weight"),
         )  # fmt: skip
         Abilities(**card.abilities)
         model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])

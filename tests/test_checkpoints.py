@@ -23,7 +23,7 @@ def write(folder: Path, *, card: Card = DENSITY.card, drop: str = "", half: bool
     state = DENSITY.starts.state
     tensors = dict(DENSITY.reference.state_dict())
     tensors |= {"starts.previous": state.previous, "starts.hidden": state.hidden, "starts.cell": state.cell}
-    tensors |= {"starts.speed": DENSITY.starts.speed}
+    tensors |= {"starts.speed": DENSITY.starts.speed, "starts.weight": DENSITY.starts.weight}
     tensors.pop(drop, None)
     checkpoints.save(tensors, card, folder / "model.safetensors", half=half)
     return folder / "model.safetensors"

@@ -1,15 +1,21 @@
 """Labels read from clip names, and what a density makes of being told them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import corpus, generator
 
 from mapctl.errors import RequestError
+from priors import labels
+from priors.checkpoints import Card
+from priors.density import LstmGmmDensity
+from priors.labels import Labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
-from priors.training import labels
-from priors.training.labels import Labels
+from priors.training.corpus import Corpus
 from priors.training.lstm_gmm import Trainer, TrainingSettings, statistics
 from priors.training.matching import MatchingSettings
+from priors.training.starts import choose
 
 CLIPS = ("set_walk_glad_1.bvh", "set_turn-left_glad_2.bvh", "set_turn-right_old_3.bvh", "set_run_old_4.bvh", "odd.bvh")
 PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"
@@ -73,3 +79,46 @@ def test_half_of_the_windows_are_told_nothing_and_none_more_than_is_known():
     silent = float((told.sum(-1) == 0).double().mean())
     assert pytest.approx(silent, abs=0.04) == 0.5 + 0.5 * 0.09
     assert {tuple(row) for row in told.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}
+
+
+def labelled_density() -> LstmGmmDensity:
+    model, data = told_network(), corpus(4)
+    names = ("a_run_old_1", "a_walk_old_2", "a_walk_new_3", "a_run_new_4")
+    found = choose(model, replace(data, names=names), count=4, generator=generator())
+    pattern = r"_(?P<gait>run)?(walk)?_(?P<style>old)?"
+    card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.of_layout())
+    return LstmGmmDensity("named", model, found, card, use_fast=False)
+
+
+def test_a_told_density_begins_where_the_labels_hold():
+    density = labelled_density()
+    old_runner = density.told(["run", "style=old"])
+    assert old_runner.starts.names == ("a_run_old_1",)
+    assert len(density.told(["old"]).starts.names) == 2
+    assert float(old_runner.starts.weight.sum()) == 1
+    assert len(density.told([]).starts.names) == 4
+    state, noise = density.starts.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
+    plan = density.plan(state, noise)
+    told, untold = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
+    assert not torch.allclose(told, untold)
+    with pytest.raises(RequestError, match="prior 'named' knows no style 'swim', only run, old"):
+        density.told(["swim"])
+
+
+def test_the_fast_path_is_told_too():
+    told = replace(labelled_density().told(["old"]), use_fast=True)
+    state, noise = told.starts.state.pick(torch.tensor([0])), torch.randn(1, 5, 66, generator=generator())
+    plan = told.reference.plan(state, noise)
+    fast, reference = (engine.rollout(state, noise, plan)[0] for engine in (told, told.reference))
+    torch.testing.assert_close(fast, reference, rtol=1e-4, atol=1e-5)
+
+
+def test_starts_weigh_as_much_as_the_data_has_of_their_speed():
+    data, model = corpus(5), told_network()
+    found = choose(model, data, count=5, generator=generator())
+    assert float(found.weight.sum()) == pytest.approx(1)
+    assert found.weight.tolist() == pytest.approx([0.2] * 5)  # each walk has a speed of its own, and all are as long
+    longer = Corpus(data.names, (*data.lengths[:-1], data.lengths[-1] + 100),
+                    torch.cat([data.features, data.features[-100:]]))  # fmt: skip
+    weight = choose(model, longer, count=5, generator=generator()).weight
+    assert sorted(weight.tolist()) == pytest.approx([1 / 6] * 4 + [2 / 6])

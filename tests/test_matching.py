@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import corpus, generator
+from helpers import corpus, finite_difference, generator, tiny_model
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
@@ -53,19 +53,41 @@ def test_stiller_feet_than_mocaps_cost_nothing():
     assert float(compare(sliding, windows(), only_feet)) > 0
 
 
-def test_training_lowers_the_mismatch_of_free_runs():
-    settings = TrainingSettings(steps=150, batch=8, window=24, learning_rate=1e-2,
-                                matching=MatchingSettings(begin=0.0, batch=8, context=10, frames=10))  # fmt: skip
-    trainer = Trainer(LstmGmmConfig(width=16, components=2), settings, corpus())
+def test_its_gradient_is_that_of_the_run_with_the_draws_held():
+    model = tiny_model(dtype=torch.float64).requires_grad_(True)
+    at = model.out.bias.detach().clone()
+    direction = torch.randn(at.shape, generator=generator(1), dtype=torch.float64)
 
-    def mean_mismatch() -> float:
+    def value(bias: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
-            return sum(float(mismatch(trainer.model, windows(), SETTINGS, generator(k))) for k in range(3)) / 3
+            model.out.bias.copy_(bias)
+        return mismatch(model, windows().double(), SETTINGS, generator())
 
-    before = mean_mismatch()
-    for _ in range(settings.steps):
+    (gradient,) = torch.autograd.grad(value(at), model.out.bias)
+    expected = finite_difference(lambda bias: value(bias).detach(), at, direction)
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-4)
+
+
+def test_descending_it_lowers_it():
+    model = tiny_model().requires_grad_(True)
+    optimiser = torch.optim.Adam(model.parameters(), 1e-2)
+    losses = []
+    for _ in range(25):
+        optimiser.zero_grad()
+        losses.append(mismatch(model, windows(), SETTINGS, generator()))
+        losses[-1].backward()
+        optimiser.step()
+    assert losses[-1].item() < 0.6 * losses[0].item()
+
+
+def test_training_runs_free_once_it_has_begun(monkeypatch):
+    settings = TrainingSettings(steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, batch=4))
+    trainer, runs = Trainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
+    draw = trainer.model.draw
+    monkeypatch.setattr(trainer.model, "draw", lambda *run: (runs.append(trainer.step), draw(*run))[1])
+    for _ in range(4):
         trainer.train_step()
-    assert mean_mismatch() < 0.7 * before
+    assert runs == [2, 3]
 
 
 def test_windows_too_short_for_a_run_are_refused():

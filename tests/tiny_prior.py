@@ -26,6 +26,7 @@ def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8) -> Path:
         "starts.hidden": torch.zeros(2, starts, CONFIG.width),
         "starts.cell": torch.zeros(2, starts, CONFIG.width),
         "starts.speed": torch.linspace(0.8, 1.6, starts),
+        "starts.weight": torch.full((starts,), 1 / starts),
     }
     card = checkpoints.Card(
         kind="lstm-gmm",

@@ -38,6 +38,12 @@ class Train:
     """Frames a window."""
     paper: bool = False
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
+    labels: Annotated[str, arg(metavar="REGEX")] = ""
+    """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
+    init: Annotated[str | None, arg(metavar="NAME")] = None
+    """Begin with the weights of this prior, bundled or trained, and fine-tune them; the network is then its own."""
+    bfloat16: bool = False
+    """Let the network compute in bfloat16: faster where the processor has it."""
     seed: options.MaybeCount = None
     """Of weights, windows, noise and the split of the clips."""
     resume: bool = False
@@ -76,7 +82,7 @@ class Train:
         return TrainRequest(
             data=self.data, out=self.out, match=self.match, config=config, settings=settings,
             resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
-            licence=self.licence, skip_first=self.skip_first,
+            licence=self.licence, skip_first=self.skip_first, labels=self.labels, init=self.init,
         )  # fmt: skip
 
     def _recipe(self) -> tuple["LstmGmmConfig", "TrainingSettings"]:
@@ -85,12 +91,17 @@ class Train:
 
         config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
         shape = {"width": self.width, "components": self.components}
+        if self.init is not None and (self.paper or any(value is not None for value in shape.values())):
+            raise RequestError(
+                "with --init the network is that prior's; --width, --components and --paper do not apply"
+            )
         recipe = {"steps": self.steps, "batch": self.batch, "window": self.window}
         for name, value in (shape | recipe).items():
             if value is not None and value < 1:
                 raise RequestError(f"--{name} must be at least 1, got {value}")
         if self.seed is not None:
             options.check_seed(self.seed)
+        settings = replace(settings, bfloat16=self.bfloat16)
         given = {name: value for name, value in (recipe | {"seed": self.seed}).items() if value is not None}
         return replace(config, **{k: v for k, v in shape.items() if v is not None}), replace(settings, **given)
 

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, mirror_features
+from priors.labels import Labels
 from priors.lstm_gmm import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus, window_starts
-from priors.training.labels import Labels
 from priors.training.matching import MatchingSettings, mismatch
 
 

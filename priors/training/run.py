@@ -15,10 +15,10 @@ from mapctl.features import Place, decode
 from mapctl.formats.atomic import check_folder
 from mapctl.metrics import reference
 from mapctl.metrics.states import state_summary
-from priors import checkpoints, density
+from priors import checkpoints, density, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import labels, resume
+from priors.training import resume
 from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
 from priors.training.starts import abilities, choose
@@ -108,7 +108,8 @@ def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve:
     )
     tensors = dict(model.state_dict())
     tensors |= {"starts.previous": found.state.previous, "starts.hidden": found.state.hidden,
-                "starts.cell": found.state.cell, "starts.speed": found.speed}  # fmt: skip
+                "starts.cell": found.state.cell, "starts.speed": found.speed,
+                "starts.weight": found.weight}  # fmt: skip
     path = request.out / "model.safetensors"
     checkpoints.save(tensors, _card(request, model, parts, curve, found.names), path)
     return path
@@ -119,7 +120,8 @@ def _card(
 ) -> checkpoints.Card:
     data = {"clips": sum(len(p.names) for p in (parts.train, parts.validation, parts.test)),
             "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
-            "match": request.match, "split_seed": request.settings.seed, "starts": list(starts),
+            "match": request.match, "labels": request.labels,
+            "split_seed": request.settings.seed, "starts": list(starts),
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
     training = {"command": command(request), "settings": asdict(request.settings), "curve": curve}
     quality = {"test_nats_per_frame": validation_nats(model, parts.test), "mocap": _mocap(parts),

@@ -27,7 +27,8 @@ def choose(model: LstmGmm, corpus: Corpus, *, count: int, generator: torch.Gener
     states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]
     state = LstmState(torch.cat([s.previous for s in states]), torch.cat([s.hidden for s in states], 1),
                       torch.cat([s.cell for s in states], 1))  # fmt: skip
-    return Starts(state, speeds[picked], tuple(corpus.names[shuffled[k]] for k in picked))
+    names = tuple(corpus.names[shuffled[k]] for k in picked)
+    return Starts(state, speeds[picked], names, _shares(corpus, speeds[picked]))
 
 
 def abilities(corpus: Corpus) -> Abilities:
@@ -61,6 +62,14 @@ def _spread(speeds: Tensor, count: int) -> list[int]:
         free[nearest] = False
         picked.append(int(nearest))
     return picked
+
+
+def _shares(corpus: Corpus, speeds: Float[Tensor, " starts"]) -> Float[Tensor, " starts"]:
+    """How much of the data has a speed that is nearest to each start's, clip by clip, every frame counting the same."""
+    pace = torch.stack([ground_speed(clip).mean() for clip in corpus.clips()])
+    nearest = (pace[:, None] - speeds).abs().argmin(-1)
+    frames = torch.zeros(len(speeds)).index_add_(0, nearest, torch.tensor(corpus.lengths, dtype=torch.float32))
+    return frames / frames.sum()
 
 
 def _state_after(model: LstmGmm, clip: Float[Tensor, "frames size"]) -> LstmState:
