@@ -36,6 +36,8 @@ class Train:
     """Windows a step."""
     window: options.MaybeCount = None
     """Frames a window."""
+    learning_rate: options.MaybeNumber = None
+    """At the start; 0.001 from scratch, less to fine-tune."""
     paper: bool = False
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
@@ -96,12 +98,14 @@ class Train:
                 "with --init the network is that prior's; --width, --components and --paper do not apply"
             )
         recipe = {"steps": self.steps, "batch": self.batch, "window": self.window}
+        if self.learning_rate is not None and not 0 < self.learning_rate < 1:
+            raise RequestError(f"the learning rate must lie between 0 and 1, got {self.learning_rate:g}")
         for name, value in (shape | recipe).items():
             if value is not None and value < 1:
                 raise RequestError(f"--{name} must be at least 1, got {value}")
         if self.seed is not None:
             options.check_seed(self.seed)
-        settings = replace(settings, bfloat16=self.bfloat16)
+        settings = replace(settings, bfloat16=self.bfloat16, learning_rate=self.learning_rate or settings.learning_rate)
         given = {name: value for name, value in (recipe | {"seed": self.seed}).items() if value is not None}
         return replace(config, **{k: v for k, v in shape.items() if v is not None}), replace(settings, **given)
 

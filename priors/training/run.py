@@ -139,9 +139,9 @@ def command(request: TrainRequest) -> str:
     parts += [f"--init {request.init}"] if request.init else [f"--width {request.config.width}"]
     parts += ["--bfloat16"] if request.settings.bfloat16 else []
     wanted, default = asdict(request.settings), asdict(plain)
-    parts += [
-        f"--{name} {wanted[name]}" for name in ("steps", "batch", "window", "seed") if wanted[name] != default[name]
-    ]
+    for name in ("steps", "batch", "window", "learning_rate", "seed"):
+        if wanted[name] != default[name]:
+            parts.append(f"--{name.replace('_', '-')} {wanted[name]}")
     return " ".join(parts) + (" --paper" if request.config.retain == 0 else "")
 
 
