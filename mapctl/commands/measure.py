@@ -1,27 +1,33 @@
-"""`mapctl measure`: the measures of a motion beside those of another clip and of mocap."""
+"""`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from mapctl.commands import options
 from mapctl.commands.tables import cell, print_table
+from mapctl.commands.threads import compute_on_one
 from mapctl.errors import CheckpointError, RequestError
 
 if TYPE_CHECKING:
+    from mapctl.commands.clip_sets import ClipSet
     from mapctl.curve import Curve
 
 
 @dataclass(frozen=True)
 class Measure:
-    """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values."""
+    """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
-    clip: Positional[options.File]
-    """.bvh or .npz."""
-    reference: options.MaybeFile = None
-    """Another clip to print beside it."""
+    Of a folder the means over its clips; beside a folder of mocap also whether the two can be told apart.
+    """
+
+    clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
+    """.bvh or .npz; or a folder, every .bvh and .npz below it."""
+    reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
+    """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
     curve: options.MaybeCurve = None
     """What it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
     speed: options.MaybeNumber = None
@@ -30,24 +36,33 @@ class Measure:
     """Scale of a CSV or SVG file."""
     prior: options.Name = "locomotion"
     """Whose card has mocap's values."""
+    seed: options.Count = 0
+    """Of the network that tells two folders apart."""
     json: bool = False
     """Print JSON instead of a table."""
 
     def run(self) -> int:
         """Measure and print."""
-        from mapctl import formats, metrics, report
+        folders = [path.is_dir() for path in options.given(self.clip, self.reference)]
+        if any(folders):
+            self._check_folders(all(folders))
+            compute_on_one()
+        values = self._folders() if any(folders) else self._clips()
+        if self.json:
+            from mapctl import report
+
+            print(report.as_json(values), end="")
+        else:
+            _print_tables(values)
+        return 0
+
+    def _clips(self) -> dict[str, Any]:
+        from mapctl import formats, metrics
 
         curve = self._curve()
         ours = metrics.measure(formats.load(self.clip), curve, speed=self.speed)
         reference = {} if self.reference is None else metrics.measure(formats.load(self.reference))
-        mocap = _mocap(self.prior)
-        if self.json:
-            values = {"clip": str(self.clip), "measures": ours, "reference": reference, "mocap": mocap}
-            print(report.as_json(values), end="")
-        else:
-            rows = [[name, value, reference.get(name), _spread(mocap.get(name))] for name, value in ours.items()]
-            print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows)
-        return 0
+        return {"clip": str(self.clip), "measures": ours, "reference": reference, "mocap": _mocap(self.prior)}
 
     def _curve(self) -> "Curve | None":
         if self.speed is not None and not 0 < self.speed < float("inf"):
@@ -55,6 +70,64 @@ class Measure:
         if self.curve is None and (self.speed is not None or self.metres_per_unit is not None):
             raise RequestError("--speed and --metres-per-unit are about a curve; name it with --curve")
         return None if self.curve is None else options.read_curve(self.curve, self.metres_per_unit)
+
+    def _check_folders(self, alike: bool) -> None:
+        options.check_seed(self.seed)
+        if not alike:
+            raise RequestError(f"{self.clip} and {self.reference}: a folder and a clip; name two of one kind")
+        if any(option is not None for option in (self.curve, self.speed, self.metres_per_unit)):
+            raise RequestError(f"{self.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
+
+    def _folders(self) -> dict[str, Any]:
+        from mapctl.commands.clip_sets import ClipSet
+
+        compared = self.reference is not None
+        ours = ClipSet.read(self.clip, with_windows=compared)
+        reference = ClipSet.read(self.reference, with_windows=True) if self.reference is not None else None
+        values = {
+            "clip": str(self.clip),
+            "clips": len(ours.motions),
+            "measures": ours.means,
+            "reference": {} if reference is None else reference.means,
+            "mocap": _mocap(self.prior),
+        }
+        return values if reference is None else values | self._compared(ours, reference)
+
+    def _compared(self, ours: "ClipSet", reference: "ClipSet") -> dict[str, Any]:
+        from mapctl.commands.clip_sets import compared_realism, compared_spread
+
+        realism = compared_realism(ours, reference, seed=self.seed)
+        return {
+            "reference_clips": len(reference.motions),
+            "realism": asdict(realism),
+            "spread": compared_spread(ours, reference),
+        }
+
+
+def _print_tables(values: Mapping[str, Any]) -> None:
+    """What there is of measures, realism and spread, each as a table."""
+    reference, mocap = values["reference"], values["mocap"]
+    rows = [[name, value, reference.get(name), _spread(mocap.get(name))] for name, value in values["measures"].items()]
+    title = None if "clips" not in values else f"means over {values['clips']} clips"
+    if "reference_clips" in values:
+        title = f"{title}, and over {values['reference_clips']} of the reference"
+    print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows, title=title)
+    if "realism" in values:
+        _print_realism(values["realism"])
+        rows = [[name, *row.values()] for name, row in values["spread"].items()]
+        print_table(
+            ["spread", "ours", "reference", "ratio"], rows, title="how widely the clips spread (in pieces of 3 s)"
+        )
+
+
+def _print_realism(realism: Mapping[str, Any]) -> None:
+    counts = f"{realism['made_windows']} and {realism['mocap_windows']} windows of one second"
+    rows = [
+        ["told apart, %", *(100 * realism[name] for name in ("accuracy", "floor_accuracy"))],
+        ["Frechet distance", realism["frechet"], realism["floor_frechet"]],
+    ]
+    columns = ["realism", "ours against the reference", "halves of the reference (floor)"]
+    print_table(columns, rows, title=f"{counts}; 50 % cannot be told apart")
 
 
 def _mocap(prior: str) -> Mapping[str, Any]:

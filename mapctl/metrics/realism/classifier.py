@@ -1,0 +1,128 @@
+"""How well a small network learns to tell two sets of windows apart: 50 % where it cannot (design, section 6)."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.errors import RequestError
+
+_LEAST_STD = 1e-3
+"""Floor of a channel's standard deviation, m or m/s."""
+
+
+@dataclass(frozen=True)
+class ClassifierSettings:
+    """The network and its training: about 10 s an accuracy on one core at 90 clips."""
+
+    folds: int = 4
+    """Parts of the clips; each is held out once while a network learns on the others."""
+    steps: int = 400
+    """Optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter judge."""
+    batch: int = 64
+    """Windows a step, half from each set."""
+    width: int = 48
+    """Channels of each convolution."""
+    dropout: float = 0.3
+    """Share of activations that are dropped while it learns."""
+    learning_rate: float = 1e-3
+    """Of AdamW."""
+    weight_decay: float = 1e-2
+    """Of AdamW."""
+
+    def __post_init__(self):
+        for name, least in (("folds", 2), ("steps", 1), ("batch", 2), ("width", 1)):
+            if getattr(self, name) < least:
+                raise RequestError(f"{name} must be at least {least}, got {getattr(self, name)}")
+
+
+def held_out_accuracy(
+    first: Sequence[Float[Tensor, "_ frames channels"]],
+    second: Sequence[Float[Tensor, "_ frames channels"]],
+    *,
+    generator: torch.Generator,
+    settings: ClassifierSettings = ClassifierSettings(),
+    tick: Callable[[], None] = lambda: None,
+) -> float:
+    """Balanced accuracy on clips that training did not see, 0 to 1: the mean over both sets and all folds.
+
+    Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap. The same generator state
+    gives the same bits; torch's global generator and thread count are left as they were. `tick` is called after each
+    fold. RequestError for sets of fewer clips than folds.
+    """
+    if min(len(first), len(second)) < settings.folds:
+        raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
+    sets = [_folded(clips, settings.folds, generator) for clips in (first, second)]
+    scores = []
+    for fold in range(settings.folds):
+        seen = [torch.cat([part for k, part in enumerate(parts) if k != fold]) for parts in sets]
+        with _private_torch(generator):
+            network = _trained(seen, settings)
+            scores.append(_balanced_accuracy(network, [parts[fold] for parts in sets]))
+        tick()
+    return sum(scores) / len(scores)
+
+
+def _folded(clips: Sequence[Tensor], folds: int, generator: torch.Generator) -> list[Tensor]:
+    """The windows of each fold's clips, dealt out in a drawn order."""
+    order = torch.randperm(len(clips), generator=generator).tolist()
+    return [torch.cat([clips[i] for i in order[fold::folds]]) for fold in range(folds)]
+
+
+@contextmanager
+def _private_torch(generator: torch.Generator) -> Iterator[None]:
+    """A global generator seeded from ours (weights and dropout draw from it) and one thread, both for the while."""
+    threads = torch.get_num_threads()
+    seed = int(torch.randint(2**62, (1,), generator=generator))
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)
+
+
+class _Standardise(nn.Module):
+    """Channels to zero mean and unit deviation, and to the front, where convolutions want them."""
+
+    def __init__(self, windows: Float[Tensor, "windows frames channels"]):
+        super().__init__()
+        self.mean, self.std = windows.mean((0, 1)), windows.std((0, 1), correction=0).clamp_min(_LEAST_STD)
+
+    def forward(self, windows: Float[Tensor, "batch frames channels"]) -> Float[Tensor, "batch channels frames"]:
+        return ((windows - self.mean) / self.std).transpose(1, 2)
+
+
+def _network(windows: Float[Tensor, "windows frames channels"], settings: ClassifierSettings) -> nn.Module:
+    """Three convolutions over time, the mean over what is left of it, and one logit: positive for the first set."""
+    layers: list[nn.Module] = [_Standardise(windows)]
+    channels = windows.shape[-1]
+    for stride in (1, 2, 2):
+        layers += [nn.Conv1d(channels, settings.width, 5, stride, padding=2), nn.LeakyReLU(0.2)]
+        layers.append(nn.Dropout(settings.dropout))
+        channels = settings.width
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0))
+
+
+def _trained(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
+    network = _network(torch.cat(list(sets)), settings)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    half = settings.batch // 2
+    target = torch.cat([torch.ones(half), torch.zeros(half)])
+    for _ in range(settings.steps):
+        batch = torch.cat([windows[torch.randint(len(windows), (half,))] for windows in sets])
+        loss = nn.functional.binary_cross_entropy_with_logits(network(batch), target)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+    return network.eval()
+
+
+def _balanced_accuracy(network: nn.Module, sets: Sequence[Float[Tensor, "_ frames channels"]]) -> float:
+    with torch.no_grad():
+        first, second = ((torch.cat([network(part) for part in windows.split(512)]) > 0) for windows in sets)
+    return (float(first.double().mean()) + 1 - float(second.double().mean())) / 2

@@ -1,0 +1,56 @@
+"""How different samples are from one another: average pairwise distance (stitching paper, section 5.1)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.metrics.realism.windows import HIPS, canonical_positions, facing_angle, seen_from
+from mapctl.motion import Motion
+
+_CM = 100.0
+
+
+class Diversity(NamedTuple):
+    """Average pairwise distance of samples."""
+
+    world_cm: float
+    """Of the joints in the world: where they go and how."""
+    root_aligned_cm: float
+    """Of the joints seen from each frame's own hips and facing: poses and their timing alone."""
+
+
+def sample_diversity(samples: Sequence[Motion]) -> Diversity:
+    """Of several samples from one start (any known rig); RequestError for fewer than two, or other lengths."""
+    lengths = sorted({sample.num_frames / sample.fps for sample in samples})
+    if len(samples) < 2 or len(lengths) > 1:
+        told = " and ".join(f"{float(length):.4g}" for length in lengths)
+        raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {told} s")
+    return diversity_of_positions(torch.stack([canonical_positions(sample) for sample in samples]))
+
+
+def diversity_of_positions(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
+    """The same from world positions of the canonical joints, metres."""
+    aligned = torch.stack([_root_aligned(sample) for sample in positions])
+    return Diversity(average_pairwise_distance(positions) * _CM, average_pairwise_distance(aligned) * _CM)
+
+
+def from_own_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+    """A clip as if it began at the origin and faced +Z: to compare clips that did not begin in one place."""
+    return seen_from(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
+
+
+def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
+    """Mean over pairs of samples, frames and joints of the distance between joints, in the unit of `positions`."""
+    samples, frames, joints, _ = positions.shape
+    # frame by frame, for the distances of a thousand samples at once would need gigabytes
+    total = sum(float(torch.cdist(at, at).sum()) for at in positions.permute(1, 2, 0, 3))
+    return total / (samples * (samples - 1) * frames * joints)
+
+
+def _root_aligned(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+    seen = seen_from(positions, positions[:, HIPS, ::2], facing_angle(positions))
+    return seen - seen[:, HIPS : HIPS + 1]

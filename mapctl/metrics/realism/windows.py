@@ -1,0 +1,73 @@
+"""One-second windows of motion as the realism measures see them: joint positions and velocities, place taken away."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.metrics import body
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+
+HIPS = CANONICAL.index("hips")
+_UPPER_LEGS = CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """How clips are cut."""
+
+    frames: int = 30
+    """Frames a window, at 30 a second; one more is needed before it for the velocities."""
+    step: int = 10
+    """Frames from the beginning of one window to that of the next."""
+
+    def __post_init__(self):
+        for name in ("frames", "step"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} of a window must be at least 1, got {getattr(self, name)}")
+
+
+def canonical_positions(motion: Motion) -> Float[Tensor, "frames joints 3"]:
+    """World positions (metres) of the canonical joints at 30 frames a second; RequestError for rigs not known."""
+    return retarget.to_canonical(motion)[0].resample(PRIOR_FPS).joint_positions()
+
+
+def facing_angle(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames"]:
+    """Facing of canonical joints, radians; positions alone tell it, so that every rig has the same."""
+    left, right = _UPPER_LEGS
+    return body.facing(positions[:, left], positions[:, right])
+
+
+def seen_from(
+    positions: Float[Tensor, "*batch frames joints 3"],
+    ground_xz: Float[Tensor, "*batch #frames 2"],
+    angle: Float[Tensor, "*batch #frames"],
+) -> Float[Tensor, "*batch frames joints 3"]:
+    """World positions as seen from places on the ground that face by `angle` radians; height stays."""
+    apart = positions[..., ::2] - ground_xz.unsqueeze(-2)
+    turned = rotations.rotate_ground(apart, -angle.unsqueeze(-1).expand(apart.shape[:-1]))
+    return torch.stack([turned[..., 0], positions[..., 1], turned[..., 1]], dim=-1)
+
+
+def clip_windows(
+    positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings = WindowSettings()
+) -> Float[Tensor, "windows frames channels"]:
+    """Windows of one clip, float32: joint positions (m), then velocities (m/s) on the way to each frame.
+
+    `positions` are those of `canonical_positions`. A window is seen from the hips' ground projection and the facing
+    of the frame before its first, which place the velocities. RequestError for a clip shorter than one window.
+    """
+    needed = settings.frames + 1
+    if len(positions) < needed:
+        raise RequestError(f"{len(positions)} frames at {PRIOR_FPS} fps; a window needs at least {needed}")
+    starts = torch.arange(0, len(positions) - settings.frames, settings.step)
+    pieces = positions[starts[:, None] + torch.arange(needed)]
+    first = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
+    seen = seen_from(pieces, first[0].unsqueeze(1), first[1].unsqueeze(1))
+    velocity = seen.diff(dim=1) * PRIOR_FPS
+    return torch.cat([seen[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()

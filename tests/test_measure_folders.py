@@ -1,0 +1,142 @@
+"""`mapctl measure` on folders: means, comparison with another folder, and one clear line for what cannot be."""
+
+import json
+
+import pytest
+from helpers import bandai_skeleton, walk
+
+from mapctl import cli, metrics, retarget
+from mapctl.commands import clip_sets
+from mapctl.metrics import realism
+from mapctl.metrics.realism import ClassifierSettings
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """A small network and few steps."""
+    small = ClassifierSettings(steps=5, width=4)
+    monkeypatch.setattr(clip_sets, "SETTINGS", realism.RealismSettings(classifier=small))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Eight clips, half of them in a folder below and in the other format."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "below").mkdir()
+    for k in range(8):
+        place = folder / "below" / f"{k}.NPZ" if k % 2 else folder / f"{k}.bvh"
+        walk(95, cadence=0.8 + 0.05 * k, seed=k).save(place)
+    (folder / "notes.txt").write_text("not a clip")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mocap(tmp_path_factory):
+    """Nine clips on another rig."""
+    folder = tmp_path_factory.mktemp("mocap")
+    rigmap = retarget.map_rig(bandai_skeleton())
+    for k in range(9):
+        clip = walk(92, cadence=0.7 + 0.05 * k, turn_rate=0.2, seed=20 + k)
+        retarget.from_canonical(clip, rigmap).save(folder / f"{k}.bvh")
+    return folder
+
+
+def run(*words: object) -> int:
+    return cli.main(["measure", *map(str, words)])
+
+
+def told(capsys, *words: object) -> dict:
+    assert run(*words, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_folder_shows_the_means_of_its_clips(made, capsys):
+    values = told(capsys, made)
+    rows = [metrics.measure(walk(95, cadence=0.8 + 0.05 * k, seed=k)) for k in range(8)]
+    assert values["clips"] == 8
+    assert values["measures"].keys() == rows[0].keys()
+    for name in ("speed_m_s", "skate_cm_s", "jitter_m_s3"):
+        assert values["measures"][name] == pytest.approx(sum(row[name] for row in rows) / 8, rel=1e-3)
+    assert "realism" not in values
+    assert run(made) == 0
+    table = capsys.readouterr().out
+    assert "means over 8 clips" in table
+    assert all(name in table for name in rows[0])
+
+
+def test_two_folders_are_compared(made, mocap, capsys):
+    values = told(capsys, made, "--reference", mocap)
+    assert (values["clips"], values["reference_clips"]) == (8, 9)
+    assert values["reference"].keys() == values["measures"].keys()
+    assert set(values["realism"]) == set(realism.Realism.__dataclass_fields__)
+    assert 0 <= values["realism"]["accuracy"] <= 1
+    assert (values["realism"]["made_windows"], values["realism"]["mocap_windows"]) == (8 * 7, 9 * 7)
+    for row in values["spread"].values():
+        assert row["ratio"] == pytest.approx(row["ours"] / row["reference"])
+    assert values["spread"]["std_of_speed_m_s"]["ours"] > 0
+    assert values["spread"]["pairwise_distance_world_cm"]["ours"] > 0
+    assert run(made, "--reference", mocap) == 0
+    table = capsys.readouterr().out
+    assert all(name in table for name in (*values["spread"], "told apart, %", "Frechet distance", "floor"))
+
+
+def test_the_seed_decides_alone(made, mocap, capsys):
+    first, again, other = (told(capsys, made, "--reference", mocap, "--seed", seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first["realism"]["accuracy"] != other["realism"]["accuracy"]
+    assert first["realism"]["frechet"] == other["realism"]["frechet"]
+
+
+def test_rigs_do_not_matter(made, tmp_path, capsys):
+    """The same walks on another rig have the same measures, jitter of every joint too."""
+    rigmap = retarget.map_rig(bandai_skeleton())
+    for k in range(8):
+        clip = walk(95, cadence=0.8 + 0.05 * k, seed=k)
+        retarget.from_canonical(clip, rigmap).save(tmp_path / f"{k}.bvh")
+    ours, theirs = told(capsys, made)["measures"], told(capsys, tmp_path)["measures"]
+    assert ours == pytest.approx(theirs, rel=1e-2, abs=1e-3)
+
+
+def refused(capsys, *words: object) -> str:
+    """The one line on standard error."""
+    assert run(*words) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    (line,) = output.err.splitlines()
+    return line
+
+
+def test_an_empty_folder_is_refused(tmp_path, capsys):
+    assert f"{tmp_path}: no .bvh or .npz file" in refused(capsys, tmp_path)
+
+
+def test_an_unreadable_clip_is_named(made, tmp_path, capsys):
+    walk(40).save(tmp_path / "a.bvh")
+    (tmp_path / "b.bvh").write_text("HIERARCHY\nnonsense")
+    line = refused(capsys, tmp_path)
+    assert str(tmp_path / "b.bvh") in line
+    assert line.count("b.bvh") == 1
+
+
+def test_a_clip_too_short_for_a_window_is_named(made, tmp_path, capsys):
+    walk(20).save(tmp_path / "short.bvh")
+    assert run(tmp_path) == 0  # for means it will do
+    capsys.readouterr()
+    line = refused(capsys, made, "--reference", tmp_path)
+    assert f"{tmp_path / 'short.bvh'}: 20 frames at 30 fps" in line
+
+
+def test_a_folder_and_a_clip_are_not_compared(made, capsys):
+    assert "a folder and a clip" in refused(capsys, made, "--reference", made / "0.bvh")
+    assert "a folder and a clip" in refused(capsys, made / "0.bvh", "--reference", made)
+
+
+def test_too_few_clips_are_refused(made, tmp_path, capsys):
+    walk(40).save(tmp_path / "a.bvh")
+    line = refused(capsys, tmp_path, "--reference", made)
+    assert f"{tmp_path}: 1 clips; a comparison needs at least 8" in line
+
+
+def test_options_of_one_clip_are_refused(made, capsys):
+    assert "for one clip" in refused(capsys, made, "--curve", "circle:3")
+    assert "seed" in refused(capsys, made, "--seed", -1)

@@ -1,0 +1,290 @@
+"""Realism measures: windows and distances against formulas written out anew, the classifier on sets that are known."""
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from helpers import bandai_skeleton, generator, walk
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapctl import retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.metrics import body, realism
+from mapctl.metrics.realism import classifier, frechet, gait, windows
+from mapctl.metrics.realism.diversity import average_pairwise_distance, from_own_start, sample_diversity
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+
+QUICK = realism.RealismSettings(classifier=realism.ClassifierSettings(steps=100, width=16, batch=32), dims=8)
+SMALL = QUICK.classifier
+
+
+def moved(motion: Motion, *, angle: float, x: float, z: float) -> Motion:
+    """The motion turned about the vertical axis through the origin, then shifted over the ground."""
+    turn = rotations.about_y(torch.tensor(angle, dtype=torch.float64))
+    root = rotations.rotate(turn.expand(motion.num_frames, 4), motion.root_position)
+    local = motion.local_quat_xyzw.clone()
+    local[:, 0] = rotations.multiply(turn.expand(motion.num_frames, 4), local[:, 0])
+    return replace(motion, root_position=root + torch.tensor([x, 0.0, z]).double(), local_quat_xyzw=local)
+
+
+def clip_set(count: int, frames: int = 61, *, seed: int = 0) -> list[Motion]:
+    """Different walks; sets of different seeds share no clip and are drawn alike."""
+    drawn = torch.rand(count, 2, generator=generator(seed)).tolist()
+    return [
+        walk(frames, turn_rate=0.6 * turn - 0.3, cadence=0.7 + 0.4 * cadence, seed=1000 * seed + k)
+        for k, (turn, cadence) in enumerate(drawn)
+    ]
+
+
+def shaken(motion: Motion, radians: float, seed: int) -> Motion:
+    noise = radians * torch.randn(motion.num_frames, 21, 3, generator=generator(seed), dtype=torch.float64)
+    trembling = rotations.multiply(motion.local_quat_xyzw, rotations.from_rotation_vector(noise))
+    return replace(motion, local_quat_xyzw=trembling)
+
+
+def windows_of(motions):
+    return [realism.clip_windows(realism.canonical_positions(motion)) for motion in motions]
+
+
+def test_windows_are_positions_from_the_first_frame_and_velocities():
+    clip = walk(75, turn_rate=0.4)
+    positions = clip.joint_positions().numpy()
+    left, right = (positions[:, CANONICAL.index(f"{side}UpperLeg")] for side in ("left", "right"))
+    got = realism.clip_windows(realism.canonical_positions(clip)).numpy()
+    assert got.shape == (5, 30, 2 * 3 * 21)
+    for number, start in enumerate(range(0, 45, 10)):
+        across = left[start] - right[start]
+        side = np.array([across[0], 0, across[2]]) / np.hypot(across[0], across[2])
+        axes = np.stack([side, [0, 1, 0], np.cross(side, [0, 1, 0])])
+        ground = positions[start, 0] * [1, 0, 1]
+        seen = (positions[start : start + 31] - ground) @ axes.T
+        expected = np.concatenate([seen[1:], np.diff(seen, axis=0) * 30], axis=1).reshape(30, -1)
+        np.testing.assert_allclose(got[number], expected, atol=1e-5)
+
+
+@given(angle=st.floats(-3, 3), x=st.floats(-20, 20), z=st.floats(-20, 20))
+def test_windows_forget_where_a_clip_stands_and_faces(angle, x, z):
+    clip = walk(45, turn_rate=0.3)
+    torch.testing.assert_close(*windows_of([clip, moved(clip, angle=angle, x=x, z=z)]), atol=1e-4, rtol=0)
+
+
+def test_windows_know_the_height():
+    clip = walk(45)
+    higher = replace(clip, root_position=clip.root_position + torch.tensor([0.0, 0.1, 0.0]).double())
+    low, high = (each.unflatten(-1, (2, 21, 3)) for each in windows_of([clip, higher]))
+    shift = torch.tensor([0.0, 0.1, 0.0])
+    torch.testing.assert_close(high[:, :, 0] - low[:, :, 0], shift.expand(2, 30, 21, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(high[:, :, 1], low[:, :, 1], atol=1e-4, rtol=0)
+
+
+def test_windows_of_any_known_rig_and_rate_are_the_same():
+    """A constant walk, for whose straight pieces resampling loses nothing that the tolerance would miss."""
+    clip = walk(61)
+    other_rig = retarget.from_canonical(clip, retarget.map_rig(bandai_skeleton()))
+    same, on_rig, slower = windows_of([clip, other_rig, clip.resample(60)])
+    torch.testing.assert_close(on_rig, same, atol=1e-4, rtol=0)
+    torch.testing.assert_close(slower, same, atol=1e-4, rtol=0)
+
+
+def test_a_window_needs_one_frame_more():
+    assert len(windows_of([walk(31)])[0]) == 1
+    with pytest.raises(RequestError, match=r"30 frames at 30 fps; a window needs at least 31"):
+        windows_of([walk(30)])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frechet_distance_is_the_formula(seed):
+    rng = np.random.default_rng(seed)
+    first = rng.normal(size=(60, 5)) @ rng.normal(size=(5, 5)) + rng.normal(size=5)
+    second = rng.normal(size=(80, 5)) @ rng.normal(size=(5, 5))
+    root = scipy.linalg.sqrtm(np.cov(first.T) @ np.cov(second.T)).real
+    apart = ((first.mean(0) - second.mean(0)) ** 2).sum()
+    expected = apart + np.trace(np.cov(first.T) + np.cov(second.T) - 2 * root)
+    got = frechet.frechet_distance(torch.from_numpy(first), torch.from_numpy(second))
+    assert got == pytest.approx(expected, rel=1e-9)
+    assert got == pytest.approx(frechet.frechet_distance(torch.from_numpy(second), torch.from_numpy(first)), rel=1e-9)
+
+
+def test_frechet_distance_of_a_shift_is_its_square_even_where_covariances_are_singular():
+    """Four points in twenty dimensions, where the covariances' product has no real root by the textbook."""
+    points = torch.randn(4, 20, generator=generator(1), dtype=torch.float64)
+    assert frechet.frechet_distance(points, points) == pytest.approx(0, abs=1e-12)
+    assert frechet.frechet_distance(points + 0.5, points) == pytest.approx(20 * 0.25, rel=1e-12)
+
+
+@pytest.mark.parametrize("count", [30, 200])
+def test_basis_holds_the_largest_variances(count):
+    """Whichever Gram matrix is the smaller; 30 frames of 4 channels are 120 features."""
+    drawn = torch.randn(count, 30, 4, generator=generator(2)) @ torch.diag(torch.tensor([3.0, 2.0, 1.0, 0.5]))
+    basis = frechet.Basis.of(drawn, 6)
+    flat = drawn.flatten(1).double()
+    standardised = (flat - flat.mean(0)) / flat.std(0, correction=0)
+    largest = torch.linalg.svdvals(standardised)[:6]
+    lengths = basis.project(drawn).norm(dim=0).sort(descending=True).values
+    torch.testing.assert_close(lengths, largest, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(basis.axes.T @ basis.axes, torch.eye(6), atol=1e-4, rtol=0)
+
+
+def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
+    mocap, alike = clip_set(24), clip_set(24, seed=1)
+    trembling = [shaken(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
+    same, other = (realism.realism(made, mocap, generator=generator(4), settings=QUICK) for made in (alike, trembling))
+    assert 0.2 < same.accuracy < 0.8
+    assert 0.2 < same.floor_accuracy < 0.8
+    assert other.accuracy > 0.9
+    assert other.frechet > same.frechet
+    assert (other.floor_accuracy, other.floor_frechet) == (same.floor_accuracy, same.floor_frechet)
+    assert (same.made_windows, same.mocap_windows) == (24 * 4, 24 * 4)
+
+
+def test_a_quicker_gait_is_far_in_frechet_distance():
+    mocap = clip_set(8)
+    quick = [walk(61, cadence=1.5, seed=50 + k) for k in range(8)]
+    found = realism.realism(quick, mocap, generator=generator(4), settings=QUICK)
+    assert found.frechet > 3 * found.floor_frechet
+
+
+def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
+    first, second = windows_of(clip_set(4)), windows_of(clip_set(4, seed=1))
+    torch.manual_seed(7)
+    expected = torch.rand(3)
+    torch.manual_seed(7)
+    threads = torch.get_num_threads()
+    score = classifier.held_out_accuracy(first, second, generator=generator(5), settings=SMALL)
+    assert torch.equal(torch.rand(3), expected)
+    assert torch.get_num_threads() == threads
+    torch.rand(5)  # another state of the global generator
+    assert classifier.held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
+
+
+def test_no_clip_is_both_learnt_and_held_out():
+    """Clips marked by their own channel can be learnt by heart, which must not help on clips that were not seen."""
+    marked = torch.zeros(8, 3, 30, 16)
+    for clip in range(8):
+        marked[clip, :, :, clip] = 1
+    clips = list(marked)
+    settings = realism.ClassifierSettings(steps=150, width=8, batch=32)
+    by_heart = classifier.held_out_accuracy(clips[::2], clips[1::2], generator=generator(1), settings=settings)
+    assert by_heart < 0.8
+
+
+def test_too_few_or_too_short_clips_are_refused():
+    clips = clip_set(8, 31)
+    with pytest.raises(RequestError, match="at least 8 clips of each, made and mocap; got 7 and 8"):
+        realism.realism(clips[:7], clips, generator=generator())
+    with pytest.raises(RequestError, match="mocap clip 3 of 8: 20 frames"):
+        realism.realism(clips, [*clips[:2], walk(20), *clips[3:]], generator=generator())
+    with pytest.raises(RequestError, match="4 folds"):
+        classifier.held_out_accuracy(windows_of(clips[:3]), windows_of(clips), generator=generator())
+
+
+@pytest.mark.parametrize("wrong", [{"folds": 1}, {"steps": 0}, {"batch": 1}, {"width": 0}])
+def test_settings_that_cannot_be_are_refused(wrong):
+    with pytest.raises(RequestError, match=next(iter(wrong))):
+        realism.ClassifierSettings(**wrong)
+
+
+def test_window_settings_that_cannot_be_are_refused():
+    with pytest.raises(RequestError, match="step"):
+        realism.WindowSettings(step=0)
+    with pytest.raises(RequestError, match="dims"):
+        realism.RealismSettings(dims=0)
+
+
+def test_average_pairwise_distance_is_the_mean_over_pairs():
+    positions = torch.randn(5, 7, 3, 3, generator=generator(3), dtype=torch.float64)
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    expected = np.mean([(positions[i] - positions[j]).norm(dim=-1).mean().item() for i, j in pairs])
+    assert average_pairwise_distance(positions) == pytest.approx(expected, rel=1e-6)
+
+
+def test_diversity_parts_places_from_poses():
+    """Copies that stand apart differ in the world alone; joints that swing otherwise differ in both."""
+    clip = walk(45)
+    apart = sample_diversity([clip, moved(clip, angle=0.0, x=0.3, z=0.4)])
+    assert apart.world_cm == pytest.approx(50, rel=1e-6)
+    assert apart.root_aligned_cm == pytest.approx(0, abs=1e-4)
+    turned = sample_diversity([clip, moved(clip, angle=1.0, x=0.0, z=0.0)])
+    assert turned.world_cm > 10
+    assert turned.root_aligned_cm == pytest.approx(0, abs=1e-4)
+    assert sample_diversity([clip, walk(45, seed=5)]).root_aligned_cm > 0.5
+
+
+def test_diversity_needs_samples_of_one_length():
+    with pytest.raises(RequestError, match="at least 2 samples of one length, got 1"):
+        sample_diversity([walk(45)])
+    with pytest.raises(RequestError, match=r"got 2 of 1\.5 and 2 s"):
+        sample_diversity([walk(45), walk(60)])
+
+
+def test_from_own_start_stands_at_the_origin_and_faces_ahead():
+    seen = from_own_start(moved(walk(40, turn_rate=0.5), angle=2.0, x=3.0, z=-1.0).joint_positions())
+    torch.testing.assert_close(seen[0, windows.HIPS, ::2], torch.zeros(2).double(), atol=1e-9, rtol=0)
+    assert float(windows.facing_angle(seen)[0]) == pytest.approx(0, abs=1e-9)
+
+
+def test_step_lengths_go_from_foot_to_other_foot():
+    planted = torch.zeros(60, 2, dtype=torch.bool)
+    for foot, start, stop in ((0, 5, 12), (1, 14, 20), (1, 22, 26), (0, 28, 33), (1, 59, 60)):
+        planted[start:stop, foot] = True
+    toes = torch.zeros(60, 2, 2, dtype=torch.float64)
+    toes[14, 1], toes[22, 1], toes[28, 0] = (torch.tensor(at).double() for at in ([0.3, 0.4], [0.0, 1.0], [0.0, 1.7]))
+    lengths = gait.step_lengths(toes, planted, 30.0)
+    told = {int(frame): float(lengths[frame]) for frame in (~lengths.isnan()).nonzero()[:, 0]}
+    # 22 sets the same foot down again; 59 is a second and more after the touch-down before it
+    assert told == pytest.approx({14: 0.5, 28: 0.7})
+
+
+def test_travel_turns_at_the_rate_of_a_circle_and_stands_without_any():
+    time = torch.arange(200, dtype=torch.float64) / 30
+    circle = 2 * torch.stack([1 - torch.cos(0.6 * time), torch.sin(0.6 * time)], dim=-1)
+    rate = gait.travel_turn_rate(circle, 30.0)
+    torch.testing.assert_close(rate[40:-40], torch.full((120,), 0.6, dtype=torch.float64), atol=1e-4, rtol=0)
+    assert bool(gait.travel_turn_rate(0.05 * circle, 30.0).isnan().all())
+    assert bool(gait.travel_turn_rate(circle[:2], 30.0).isnan().all())
+
+
+def test_gait_spread_measures_what_the_walks_were_made_with():
+    """Speeds of the procedural walk follow from its cadence; a stride is two steps."""
+    cadences = (0.8, 0.9, 1.0)
+    clips = [walk(200, cadence=cadence, turn_rate=0.2) for cadence in cadences]
+    spread = realism.gait_spread(clips, seconds=2.0)
+    speeds = [body.ground_speed(clip.root_position, 30) for clip in clips]
+    assert spread["speed_m_s"].pieces == 9
+    assert spread["speed_m_s"].std == pytest.approx(np.std(np.repeat(speeds, 3), ddof=1), rel=1e-6)
+    assert spread["turning_deg_s"].mean == pytest.approx(math.degrees(0.2), rel=0.1)
+    steps = [100 * speed / (2 * cadence) for speed, cadence in zip(speeds, cadences, strict=True)]
+    assert spread["step_length_cm"].mean == pytest.approx(np.mean(steps), rel=0.15)
+
+
+def test_spread_is_compared_in_pieces_of_one_length():
+    """Doubling every clip's length leaves pieces as they are, so the ratio is one however long clips are."""
+    short, long = ([walk(frames, cadence=c) for c in (0.7, 0.9, 1.1)] for frames in (90, 180))
+    ratios = realism.spread_ratios(realism.gait_spread(long), realism.gait_spread(short))
+    # three values twice against three values once: their standard deviations differ by sqrt(2/3 / (5/6))
+    assert ratios["speed_m_s"] == pytest.approx(math.sqrt((2 * 2) / 5), rel=1e-3)
+
+
+def test_clips_shorter_than_a_piece_add_nothing():
+    both = realism.gait_spread([walk(100), walk(100, cadence=1.1), walk(80)])
+    assert both["speed_m_s"].pieces == 2
+    none = realism.gait_spread([walk(80)])
+    assert none["speed_m_s"].pieces == 0
+    assert math.isnan(none["speed_m_s"].std)
+    assert math.isnan(realism.spread_ratios(none, both)["speed_m_s"])
+    with pytest.raises(RequestError, match="needs clips and a length"):
+        realism.gait_spread([])
+    with pytest.raises(RequestError, match="got 1 and 0 s"):
+        realism.gait_spread([walk(90)], seconds=0.0)
+
+
+def test_gait_is_of_any_frame_rate():
+    slow, fast = (realism.gait_spread([walk(3 * fps, fps=fps)])["speed_m_s"].mean for fps in (30, 60))
+    assert fast == pytest.approx(slow, rel=1e-6)
+    assert walk(180, fps=60).fps == Fraction(60)
