@@ -83,7 +83,7 @@ def realism(
     settings: RealismSettings = RealismSettings(),
     progress: Progress | None = None,
 ) -> Realism:
-    """Compare made clips with mocap, both of any known rig and frame rate; about a minute on one core.
+    """Compare made clips with mocap, both of any known rig and frame rate; half a minute on one core.
 
     The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
     balanced between them, so a small set's floor scatters around 0.5 from seed to seed. It does not depend on `made`.
