@@ -1,15 +1,23 @@
-"""Random generation of any length (rnn paper, sections 4.1.4 and 5.1): sample the prior frame after frame."""
+"""Random generation of any length (rnn paper, sections 4.1.4, 4.2.3, 4.3 and 5.1).
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+The prior is sampled frame after frame, a refiner makes the samples look captured, and a finishing pass makes the feet
+stand that the motion's own contact labels call planted. All three work piece by piece.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from controllers.finish import FinishSettings, finish
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, Place, decode, encode, root_places
 from mapctl.motion import Motion
+from mapctl.protocols import Refiner
 
 _CHUNK = 600
 
@@ -21,7 +29,9 @@ class GenerateSettings:
     temperature: float = 1.0
     """Spread of the draws: 0 is the prior's mean, 1 the prior itself."""
     start: int | None = None
-    """Which of the prior's starts; drawn if None."""
+    """Which of the prior's starts; drawn by their weight if None."""
+    finishing: FinishSettings | None = field(default_factory=FinishSettings)
+    """Of the pass that makes planted feet stand; None leaves it out."""
 
     def __post_init__(self):
         if not 0 <= self.temperature <= 2:
@@ -30,37 +40,31 @@ class GenerateSettings:
 
 def stream(
     prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None,
 ) -> Iterator[Motion]:  # fmt: skip
     """Consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its length.
 
     Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the memory.
     RequestError, at once, for a length or a start that cannot be.
     """
-    settings = settings or GenerateSettings()
-    if not 0 < seconds < float("inf"):
-        raise RequestError(f"seconds must be positive, got {seconds:g}")
-    frames = max(2, round(seconds * PRIOR_FPS))
-    state, place = begin(prior, settings, start_clip, generator)
-    return _pieces(prior, state, place, frames, generator, settings.temperature)
+    return _decoded(*_begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner))
 
 
-def _pieces(
-    prior: Any, state: Any, place: Place, frames: int, generator: torch.Generator, temperature: float
-) -> Iterator[Motion]:
-    while frames > 0:
-        features, state = prior.sample(state, min(frames, _CHUNK), generator, temperature=temperature)
-        yield decode(features[0], place)
-        ground, heading = root_places(features[0].double(), place)
-        place, frames = Place(ground[-1], heading[-1]), frames - features.shape[1]
+def stream_features(
+    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None,
+) -> Iterator[Float[Tensor, "piece size"]]:  # fmt: skip
+    """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
+    return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner)[0]
 
 
 def generate(
     prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None,
 ) -> Motion:  # fmt: skip
     """The whole motion at once; see `stream`."""
-    pieces = stream(prior, seconds=seconds, generator=generator, settings=settings, start_clip=start_clip)
+    pieces = stream(prior, seconds=seconds, generator=generator, settings=settings, start_clip=start_clip,
+                    refiner=refiner)  # fmt: skip
     motion = next(pieces)
     for piece in pieces:
         motion = motion.join(piece)
@@ -79,6 +83,51 @@ def begin(prior: Any, settings: GenerateSettings, clip: Motion | None, generator
     count = len(prior.starts.speed)
     if settings.start is not None and not 0 <= settings.start < count:
         raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
-    drawn = int(torch.randint(count, (1,), generator=generator))
+    drawn = int(torch.multinomial(prior.starts.weight, 1, generator=generator))
     pick = drawn if settings.start is None else settings.start
     return prior.starts.state.pick(torch.tensor([pick])), Place.origin(torch.float64)
+
+
+def _begun(
+    prior: Any, seconds: float, generator: torch.Generator, settings: GenerateSettings, clip: Motion | None,
+    refiner: Refiner | None,
+) -> tuple[Iterator[Float[Tensor, "piece size"]], Place]:  # fmt: skip
+    """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
+    if not 0 < seconds < float("inf"):
+        raise RequestError(f"seconds must be positive, got {seconds:g}")
+    frames = max(2, round(seconds * PRIOR_FPS))
+    state, place = begin(prior, settings, clip, generator)
+    pieces = _drawn(prior, state, generator, settings.temperature)
+    if refiner is not None:
+        pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
+    if settings.finishing is not None:
+        pieces = finish(prior, pieces, frames=frames, state=state, generator=generator, settings=settings.finishing)
+    return _in_chunks(pieces, frames), place
+
+
+def _drawn(
+    prior: Any, state: Any, generator: torch.Generator, temperature: float
+) -> Iterator[Float[Tensor, "piece size"]]:
+    """Draws without end."""
+    while True:
+        features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
+        yield features[0]
+
+
+def _in_chunks(pieces: Iterable[Float[Tensor, "piece size"]], frames: int) -> Iterator[Float[Tensor, "chunk size"]]:
+    """The first `frames` frames, _CHUNK at a time."""
+    held = None
+    for piece in pieces:
+        held = piece if held is None else torch.cat([held, piece])
+        while len(held) >= (count := min(frames, _CHUNK)):
+            yield held[:count]
+            held, frames = held[count:], frames - count
+            if frames == 0:
+                return
+
+
+def _decoded(pieces: Iterator[Float[Tensor, "piece size"]], place: Place) -> Iterator[Motion]:
+    for features in pieces:
+        yield decode(features, place)
+        ground, heading = root_places(features.double(), place)
+        place = Place(ground[-1], heading[-1])

@@ -43,7 +43,7 @@ def planted(
     step = max(1, round(settings.speed_step * fps))
     low = toes[..., 1] < floor_heights(toes, settings) + settings.reach
     slow = (toes[step:] - toes[:-step])[..., ::2].norm(dim=-1) * (fps / step) < settings.slow
-    stands = _without_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
+    stands = without_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
     return torch.cat([low[:step] & (stands[:1] if len(stands) else False), stands])
 
 
@@ -54,7 +54,7 @@ def floor_heights(
     return torch.quantile(toe_positions[..., 1], settings.floor_percentile / 100, dim=0)
 
 
-def _without_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
+def without_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
     """Runs of true shorter than `shortest` frames become false: a morphological opening."""
     if len(stands) < shortest:
         return torch.zeros_like(stands)

@@ -1,5 +1,6 @@
 """What the core asks of learned models. A model has the roles it can fill; none is given a fake one."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -44,6 +45,12 @@ class Density(Protocol[State]):
         """The likeliest discrete choices along the rollout that the noise gives."""
         ...
 
+    def latents(
+        self, features: Float[Tensor, "batch frames size"], state: State
+    ) -> tuple[Plan, Float[Tensor, "batch frames continuous"]]:
+        """The plan and the noise whose rollout is the features."""
+        ...
+
     def rollout(
         self, state: State, noise: Float[Tensor, "batch frames continuous"], plan: Plan
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
@@ -71,6 +78,10 @@ class Refiner(Protocol):
 
     def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
         """The refined frames."""
+        ...
+
+    def stream(self, pieces: Iterable[Float[Tensor, "batch piece size"]]) -> Iterator[Float[Tensor, "batch out size"]]:
+        """The same frames, from consecutive pieces, some frames behind them, in memory that does not grow."""
         ...
 
 

@@ -100,6 +100,10 @@ class LstmGmmDensity:
         """See Density."""
         return self._engine.sample(state, frames, generator, temperature=temperature)
 
+    def latents(self, features: Tensor, state: LstmState) -> tuple[Plan, Tensor]:
+        """See Density."""
+        return self.reference.latents(features, state)
+
     def plan(self, state: LstmState, noise: Tensor) -> Plan:
         """See Density."""
         return self._engine.plan(state, noise)

@@ -287,6 +287,24 @@ class LstmGmm(nn.Module):
             densities.append(density)
         return torch.stack(frames, 1), torch.stack(densities, 1)
 
+    def latents(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> tuple[Plan, Tensor]:
+        """The plan and the noise (batch, frames, continuous) whose rollout is the features; inverse of `rollout`.
+
+        Of each frame's components, the one that explains it best.
+        """
+        with torch.no_grad():
+            before = torch.cat([state.previous.unsqueeze(1), features[:, :-1]], dim=1)
+            mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
+            error = self._target(features)[..., : self.layout.continuous].unsqueeze(-2) - mixture.mean
+            if (whitening := self.whitening) is not None:
+                error = torch.einsum("kij,...kj->...ki", whitening, error)
+            noise = error * torch.exp(-mixture.log_sigma)
+            each = mixture.log_weight - mixture.log_sigma.sum(-1) - 0.5 * noise.square().sum(-1)
+            component = each.argmax(-1)
+            chosen = component[..., None, None].expand(*component.shape, 1, noise.shape[-1])
+            bits = self.layout.pick(features, "contacts") > 0.5
+            return Plan(component, bits), noise.gather(-2, chosen)[..., 0, :]
+
     def _step(self, state: LstmState) -> tuple[Mixture, LstmState]:
         inputs = self.normalise(state.previous).unsqueeze(1)
         mixture, (hidden, cell) = self(inputs, (state.hidden, state.cell))

@@ -39,8 +39,12 @@ class Generate:
     """A clip (.bvh, .npz) to go on from, or the number of one of the prior's starts; drawn if not given."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
+    style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    """Gait and style by the names of the prior's data, such as run or elderly,walk; `mapctl info PRIOR` lists them."""
+    refiner: options.Name = "auto"
+    """A bundled refiner, or the file or run folder of a trained one; auto is the prior's own, if it has one."""
     no_refine: bool = False
-    """Leave the draws as they are. There is no refiner yet, so today this changes nothing."""
+    """Leave the draws as they are: no refiner, and no pass that makes planted feet stand."""
     quiet: bool = False
     """No lines on the clips and no progress bar."""
 
@@ -54,7 +58,11 @@ class Generate:
         from controllers.generate import stream
 
         prior = priors.load(self.prior)
-        draw = partial(stream, prior, seconds=self.seconds, settings=settings, start_clip=clip)
+        if self.style is not None:
+            prior = prior.told([name.strip() for name in self.style.split(",")])
+        refiner = None if self.no_refine else priors.refiner_of(self.prior) if self.refiner == "auto" else (
+            priors.load_refiner(self.refiner))  # fmt: skip
+        draw = partial(stream, prior, seconds=self.seconds, settings=settings, start_clip=clip, refiner=refiner)
         with outputs.made_folder(self.out) as folder:
             for number, seed in enumerate(self._seeds()):
                 pieces = draw(generator=torch.Generator().manual_seed(seed))
@@ -62,6 +70,7 @@ class Generate:
         return 0
 
     def _checked(self) -> tuple["GenerateSettings", "Motion | None"]:
+        from controllers.finish import FinishSettings
         from controllers.generate import GenerateSettings
 
         options.check_seed(self.seed)
@@ -69,7 +78,11 @@ class Generate:
             raise RequestError(f"the count must be 1 to {_MOST_CLIPS}, got {self.count}")
         outputs.check_folder(self.out)
         numbered = self.start is not None and self.start.lstrip("-").isdecimal()
-        settings = GenerateSettings(self.temperature, int(self.start) if self.start and numbered else None)
+        if self.no_refine and self.refiner != "auto":
+            raise RequestError("--refiner and --no-refine exclude each other")
+        finishing = None if self.no_refine else FinishSettings()
+        start = int(self.start) if self.start and numbered else None
+        settings = GenerateSettings(self.temperature, start, finishing)
         if self.start is None or numbered:
             return settings, None
         from mapctl import formats

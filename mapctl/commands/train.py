@@ -18,20 +18,23 @@ if TYPE_CHECKING:
 class Train:
     """Train a prior on a folder of BVH; killed and resumed, a run gives the same weights."""
 
-    model: Positional[Annotated[Literal["lstm-gmm"], arg(metavar="lstm-gmm")]]
-    """What to train: lstm-gmm is the density that follow and generate use."""
+    model: Positional[Annotated[Literal["lstm-gmm", "refiner"], arg(metavar="lstm-gmm|refiner")]]
+    """What to train: lstm-gmm is the density that follow and generate use; refiner makes its samples look captured."""
     data: options.DataFolder
     """Folder of .bvh files, searched with everything below it."""
     out: options.OutFolder
     """Run folder: checkpoints, training curve, and at the end model.safetensors with its card."""
-    match: Annotated[str, arg(metavar="REGEX")] = ""
-    """Only clips whose path below the data folder holds this regular expression."""
+    match: Annotated[str | None, arg(metavar="REGEX")] = None
+    """Only clips whose path below the data folder holds this regular expression; of a refiner, by default the clips
+    that its density was trained on."""
+    density: options.Name = "locomotion"
+    """Of a refiner: the prior whose samples it refines."""
     width: options.MaybeCount = None
     """Units of every hidden layer."""
     components: options.MaybeCount = None
     """Gaussians in the mixture."""
     steps: options.MaybeCount = None
-    """Optimiser steps in all."""
+    """Optimiser steps in all; of a refiner, rounds of some updates of it and one of its critic."""
     batch: options.MaybeCount = None
     """Windows a step."""
     window: options.MaybeCount = None
@@ -63,13 +66,19 @@ class Train:
 
     def run(self) -> int:
         """Check, train, name the result."""
-        request = self.request()
-        outputs.check_folder(self.out)
-        from priors.training import run
+        say = (lambda line: None) if self.quiet else _say
+        if self.model == "refiner":
+            from mapctl.commands import train_refiner
 
-        path = run.train(request, (lambda line: None) if self.quiet else _say)
+            path, use = train_refiner.run(self, say), "--refiner"
+        else:
+            request = self.request()
+            outputs.check_folder(self.out)
+            from priors.training import run
+
+            path, use = run.train(request, say), "--prior"
         if not self.quiet:
-            print(f"wrote {path}; use it with --prior {self.out}")
+            print(f"wrote {path}; use it with {use} {self.out}")
         return 0
 
     def request(self) -> "TrainRequest":
@@ -82,7 +91,7 @@ class Train:
                 f"minutes between checkpoints must be positive, got {self.minutes_between_checkpoints:g}"
             )
         return TrainRequest(
-            data=self.data, out=self.out, match=self.match, config=config, settings=settings,
+            data=self.data, out=self.out, match=self.match or "", config=config, settings=settings,
             resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
             licence=self.licence, skip_first=self.skip_first, labels=self.labels, init=self.init,
         )  # fmt: skip

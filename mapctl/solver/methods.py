@@ -101,6 +101,38 @@ class LatentMethod:
 
 
 @dataclass(frozen=True, eq=False)
+class GuidedMethod:
+    """L-BFGS over the latents of a given motion: its components and contact bits are kept, its noise is where to start.
+
+    For motion that is to be changed a little; the terms say what about it.
+    """
+
+    guide: Float[Tensor, "frames size"]
+    """Features of the window's frames, physical units."""
+    share: float = 0.5
+    """Of the guide's noise that the search starts with: 1 starts at the guide itself, 0 at the prior's mean."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=24))
+    """Of one window."""
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=60))
+    """Of one window."""
+
+    def __call__(
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:  # fmt: skip
+        """See Method; the carry is the noise, where the next window starts instead of the guide."""
+        meter = Meter(self.budget.within(seconds))
+        plan, noise = context.density.latents(self.guide.unsqueeze(0), context.state)
+        start = self.share * noise[0]
+        start[: len(tail)] = tail[: len(start)]
+        unknowns = start.flatten().unsqueeze(0)
+        objective = Objective(Latents(context, plan).build, terms)
+        result = minimise(objective.energy_and_gradient, unknowns, settings=self.lbfgs, meter=meter)
+        carry = result.x[0].unflatten(-1, (context.frames, LAYOUT.continuous))
+        return _solved(objective, result, carry, meter, float(result.start_energy[0]))
+
+
+@dataclass(frozen=True, eq=False)
 class StateMethod:
     """L-BFGS over the states and the network's input noise, with teacher forcing (Eq. 14-19).
 

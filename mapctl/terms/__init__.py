@@ -1,12 +1,13 @@
 """The terms of the MAP problem. A new one is a file here, a name below and an instance in tests/catalogue.py."""
 
 from mapctl.terms.base import Term
+from mapctl.terms.closeness import Closeness
 from mapctl.terms.footing import Footing
 from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.noise import Noise
 from mapctl.terms.path import Path
 from mapctl.terms.seam import Seam
 
-ALL = (Likelihood, Noise, Path, Footing, Seam)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness)
 
-__all__ = ["ALL", "Footing", "Likelihood", "Noise", "Path", "Seam", "Term"]
+__all__ = ["ALL", "Closeness", "Footing", "Likelihood", "Noise", "Path", "Seam", "Term"]

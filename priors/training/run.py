@@ -18,7 +18,7 @@ from mapctl.metrics.states import state_summary
 from priors import checkpoints, density, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import resume
+from priors.training import resume, run_files
 from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
 from priors.training.starts import abilities, choose
@@ -190,7 +190,7 @@ def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float | None]
 def _check_run(request: TrainRequest) -> None:
     """Before anything is read: the folder can be written, and holds a run if and only if it is to be resumed."""
     check_folder(request.out)
-    present = resume.exists(request.out)
+    present = run_files.exists(request.out)
     if request.resume and not present:
         raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
     if present and not request.resume:

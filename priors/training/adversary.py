@@ -1,0 +1,49 @@
+"""The refiner's critic and its memory: a bidirectional LSTM on end effectors (rnn paper, Eq. 12, figure 5; 4.2.2)."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.features import LAYOUT
+from priors.end_effectors import channels, end_effectors
+
+
+class Critic(nn.Module):
+    """Tells captured windows from refined ones by end effectors and contact bits."""
+
+    reach_mean: Tensor
+    reach_std: Tensor
+
+    def __init__(self, joints: Sequence[str], *, width: int, reach_mean: Tensor, reach_std: Tensor):
+        """`width` units in the first layer and in each direction of the LSTM."""
+        super().__init__()
+        self.joints = tuple(joints)
+        self.register_buffer("reach_mean", reach_mean.clone())
+        self.register_buffer("reach_std", reach_std.clone())
+        self.first = nn.Linear(channels(joints) + 2, width)
+        self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
+        self.last = nn.Linear(2 * width, 1)
+
+    def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames_but_one"]:
+        """Log odds, frame by frame, that a window was captured."""
+        reach = (end_effectors(features, self.joints) - self.reach_mean) / self.reach_std
+        bits = 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1
+        hidden, _ = self.lstm(torch.relu(self.first(torch.cat([reach, bits], dim=-1))))
+        return self.last(hidden)[..., 0]
+
+
+class History:
+    """Refined windows of earlier refiners, so that the critic does not forget faults that it once knew."""
+
+    def __init__(self, windows: Float[Tensor, "size frames features"]):
+        self.windows = windows.clone()
+
+    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
+        """Half a batch of the fresh ones, half of kept ones; then the fresh half takes the place of kept ones."""
+        half = len(fresh) // 2
+        picked = torch.randperm(len(self.windows), generator=generator)
+        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
+        self.windows[picked[half : 2 * half]] = fresh[:half]
+        return mixed

@@ -1,0 +1,265 @@
+"""`mapctl train refiner`: from a density and the folder it was trained on to a run folder with a loadable refiner.
+
+A guard watches held-out samples: the best refiner seen is kept, and training stops and restores it where one side wins.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.features import Place, decode
+from mapctl.formats.atomic import check_folder
+from mapctl.metrics import measure
+from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows, realism_of_windows
+from priors import checkpoints, density
+from priors.density import LstmGmmDensity
+from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
+from priors.training import corpus as corpora
+from priors.training import run_files
+from priors.training.corpus import Corpus
+from priors.training.refiner import AdversarialSettings, AdversarialTrainer
+
+Progress = Callable[[str], None]
+"""Called with one line of news."""
+
+_WARM_UP = 60  # frames of a clip that the density has seen before it is let go
+_WON = 0.98  # share that the critic tells apart, over a report, from which it has won
+
+
+@dataclass(frozen=True)
+class RefinerRequest:
+    """What to train on, and how."""
+
+    data: Path
+    """Folder of BVH files, searched below."""
+    out: Path
+    """Run folder: checkpoint, curve, finished refiner."""
+    density: str = "locomotion"
+    """Prior whose samples are refined."""
+    match: str | None = None
+    """Regular expression for the clips; the density's own if None."""
+    config: RefinerConfig = field(default_factory=RefinerConfig)
+    """The network."""
+    settings: AdversarialSettings = field(default_factory=AdversarialSettings)
+    """The recipe."""
+    samples: int = 300
+    """Motions of `seconds` drawn from the density to train on."""
+    seconds: float = 10.0
+    """Of each."""
+    judged: int = 24
+    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
+    resume: bool = False
+    """Continue from the run folder's last checkpoint."""
+    checkpoint_minutes: float = 3.0
+    """Between checkpoints."""
+    report_rounds: int = 50
+    """Between lines of news."""
+    judge_rounds: int = 400
+    """Between measures of held-out samples."""
+    licence: str = "that of the training data"
+    """Of the weights, for the card."""
+    realism: RealismSettings = field(default_factory=RealismSettings)
+    """How samples are told from mocap."""
+
+
+def train(request: RefinerRequest, progress: Progress = lambda line: None) -> Path:
+    """Train to the end of the recipe, or until one side wins, and write RUN/model.safetensors; returns its path.
+
+    Killed and resumed, a run gives the same weights bit for bit on one machine.
+    """
+    _check(request)
+    prior = density.load(request.density)
+    match = prior.card.data.get("match", "") if request.match is None else request.match
+    corpus = corpora.read(request.data, match=match, cache=request.out / "cache")
+    parts = corpora.split(corpus, prior.card.data.get("split_seed", request.settings.seed))
+    generator = torch.Generator().manual_seed(request.settings.seed)
+    frames = round(request.seconds * 30)
+    raw = sampled(prior, parts.train, request.samples, frames, generator)
+    judge = Judge.of(sampled(prior, parts.train, request.judged, frames, generator), parts, request.realism)
+    trainer = AdversarialTrainer(request.config, request.settings, parts.train, raw)
+    run = _Run(request, trainer, judge, corpus.identity() | {"density": request.density, "match": match}, progress)
+    run.go()
+    return run.export(prior, raw)
+
+
+def sampled(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, generator: torch.Generator) -> Corpus:
+    """Free runs of the density, each after two seconds of a clip; clips are drawn by their length.
+
+    So the samples have the data's own shares of gaits and speeds, and the critic is left with their quality.
+    """
+    clips = [clip for clip in corpus.clips() if len(clip) >= _WARM_UP]
+    lengths = torch.tensor([float(len(clip)) for clip in clips])
+    picked = torch.multinomial(lengths, count, replacement=True, generator=generator).tolist()
+    state = prior.initial_state(torch.stack([clips[i][0] for i in picked]))
+    state = prior.advance(state, torch.stack([clips[i][1:_WARM_UP] for i in picked]))
+    features, _ = prior.sample(state, frames, generator)
+    return Corpus(tuple(f"sample {k}" for k in range(count)), (frames,) * count, features.float().flatten(0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Measures refined samples beside the raw ones and mocap that training does not see."""
+
+    raw: Float[Tensor, "count frames size"]
+    """Samples that are refined anew each time."""
+    mocap: dict[str, float]
+    """Mocap's measures."""
+    windows: list[Tensor]
+    """Mocap's windows for the classifier."""
+    settings: RealismSettings
+    """Of the classifier."""
+
+    @staticmethod
+    def of(raw: Corpus, parts: corpora.Split, settings: RealismSettings) -> "Judge":
+        """Against validation and test clips."""
+        clips = [c for part in (parts.validation, parts.test) for c in part.clips() if len(c) > settings.windows.frames]
+        motions = [decode(clip, Place.origin()) for clip in clips]
+        windows = [clip_windows(canonical_positions(motion), settings.windows) for motion in motions]
+        return Judge(torch.stack(raw.clips()), _means(clips), windows, settings)
+
+    def __call__(self, network: RefinerNetwork) -> dict[str, float]:
+        """Contact speed and jitter as ratios to mocap's, and the share told apart."""
+        refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
+        refined = refiner.refine(self.raw)
+        network.train()
+        means = _means(list(refined))
+        row = {f"{name}_ratio": means[name] / self.mocap[name] for name in ("contact_speed_cm_s", "jitter_m_s3")}
+        if min(len(refined), len(self.windows)) >= self.settings.fewest_clips:
+            made = [clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
+                    for clip in refined]  # fmt: skip
+            seeded = torch.Generator().manual_seed(0)
+            row["told_apart"] = realism_of_windows(
+                made, self.windows, generator=seeded, settings=self.settings
+            ).accuracy
+        return row
+
+
+def score(row: dict[str, float]) -> float:
+    """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart."""
+    ratios = [abs(math.log(value)) for name, value in row.items() if name.endswith("_ratio") and value > 0]
+    return sum(ratios) + 2 * max(0.0, row.get("told_apart", 0.5) - 0.5)
+
+
+_NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.of_layout())
+
+
+class _Run:
+    """The loop, its guard and its checkpoints."""
+
+    def __init__(
+        self, request: RefinerRequest, trainer: AdversarialTrainer, judge: Judge, data: dict, progress: Progress
+    ):
+        self.request, self.trainer, self.judge, self.data, self.progress = request, trainer, judge, data, progress
+        self.curve: list[dict[str, float]] = []
+        self.best = {name: value.clone() for name, value in trainer.refiner.state_dict().items()}
+        if request.resume:
+            self._load()
+            progress(f"resumed at round {trainer.round}")
+        else:
+            request.out.mkdir(parents=True, exist_ok=True)
+            self._judge([])
+
+    def go(self) -> None:
+        """To the end of the recipe, or until one side has won."""
+        request, trainer = self.request, self.trainer
+        saved, losses, began = time.monotonic(), [], time.monotonic()
+        while trainer.round < request.settings.rounds:
+            losses.append(trainer.train_round())
+            last = trainer.round == request.settings.rounds
+            if trainer.round % request.report_rounds == 0 or last:
+                told = sum(loss.told for loss in losses) / len(losses)
+                self.progress(
+                    f"round {trainer.round}: refiner {_mean(losses, 'refiner'):.3f}, critic"
+                    f" {_mean(losses, 'critic'):.3f} nats, {told:.2f} told apart, {losses[-1].updates} updates,"
+                    f" {time.monotonic() - began:.0f} s"
+                )
+                if told > _WON and len(losses) >= request.report_rounds:
+                    self.progress("the critic has won: training ends with the best refiner seen")
+                    break
+                if trainer.round % request.judge_rounds == 0 or last:
+                    self._judge(losses)
+                losses = []
+            if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
+                self._save()
+                saved = time.monotonic()
+
+    def export(self, prior: LstmGmmDensity, raw: Corpus) -> Path:
+        """Write the best refiner in float16 with its card."""
+        request, path = self.request, self.request.out / "model.safetensors"
+        card = checkpoints.Card(
+            kind="refiner", config=request.config.as_card(), licence=request.licence,
+            data={"density": request.density, "density_config": prior.reference.config.as_card(),
+                  "samples": len(raw.lengths), **self.data},
+            training={"settings": asdict(request.settings), "curve": self.curve, "command": command(request)},
+            quality=min(self.curve, key=score), **checkpoints.Card.of_layout(),
+        )  # fmt: skip
+        checkpoints.save(self.best, card, path)
+        return path
+
+    def _judge(self, losses: list) -> None:
+        row = self.judge(self.trainer.refiner)
+        if not self.curve or score(row) < min(score(before) for before in self.curve):
+            self.best = {name: value.clone() for name, value in self.trainer.refiner.state_dict().items()}
+        row |= {"round": self.trainer.round, "score": score(row)}
+        row |= {f"{kind}_loss": _mean(losses, kind) for kind in ("refiner", "critic") if losses}
+        self.curve.append(row)
+        self.progress(json.dumps(row))
+
+    def _save(self) -> None:
+        tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
+        run_files.write(self.request.out, step=self.trainer.round, tensors=tensors, index=self._index())
+
+    def _index(self) -> dict:
+        request = self.request
+        return {"settings": asdict(request.settings), "network": request.config.as_card(), "data": self.data,
+                "curve": self.curve}  # fmt: skip
+
+    def _load(self) -> None:
+        out = self.request.out
+        try:
+            index, tensors = run_files.read(out)
+            for part in ("settings", "network", "data"):
+                run_files.check_same(out, part, then=index[part], now=self._index()[part])
+            self.curve = [dict(row) for row in index["curve"]]
+            self.best = {name: tensors[f"best.{name}"] for name in self.best}
+            self.trainer.load_state(tensors)
+        except run_files.BROKEN as error:
+            raise run_files.unreadable(out, error) from error
+
+
+def command(request: RefinerRequest) -> str:
+    """What to type for the same run, for the card; options that are the defaults are left out."""
+    parts = [f"mapctl train refiner --data DATA -o RUN --density {request.density}"]
+    wanted, default = request.settings, AdversarialSettings()
+    parts += [f"--steps {wanted.rounds}"] if wanted.rounds != default.rounds else []
+    parts += [f"--seed {wanted.seed}"] if wanted.seed != default.seed else []
+    return " ".join(parts + (["--bfloat16"] if wanted.bfloat16 else []))
+
+
+def _check(request: RefinerRequest) -> None:
+    """Before anything is read."""
+    if not request.data.is_dir():
+        raise RequestError(f"{request.data} is not a folder of BVH files")
+    check_folder(request.out)
+    present = run_files.exists(request.out)
+    if request.resume and not present:
+        raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
+    if present and not request.resume:
+        raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
+
+
+def _means(clips: list[Tensor]) -> dict[str, float]:
+    rows = [measure(decode(clip, Place.origin())) for clip in clips]
+    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}
+
+
+def _mean(losses: list, kind: str) -> float:
+    return sum(getattr(loss, kind) for loss in losses) / len(losses)

@@ -1,0 +1,55 @@
+"""The checkpoint of a training run on disk: tensors and an index that names them, replaced together."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from mapctl.errors import CheckpointError
+from mapctl.formats.atomic import atomic_path
+from priors.checkpoints import as_json
+
+_TENSORS, _INDEX = "checkpoint.safetensors", "checkpoint.json"
+
+# What json, safetensors and torch raise for files that are damaged or are something else.
+BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError, SafetensorError)
+
+
+def exists(run: Path) -> bool:
+    """Whether the run folder holds a checkpoint."""
+    return (run / _INDEX).exists()
+
+
+def write(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor], index: Mapping[str, Any]) -> None:
+    """The index names the tensors' file of its own step, so a kill between the two leaves a pair that fits."""
+    name = f"step-{step}-{_TENSORS}"
+    text = as_json({"tensors": name, "step": step, **index}, run / _INDEX)
+    with atomic_path(run / name) as scratch:
+        save_file({key: value.contiguous() for key, value in tensors.items()}, scratch)
+    with atomic_path(run / _INDEX) as scratch:
+        scratch.write_text(text, encoding="utf-8")
+    for old in run.glob(f"step-*-{_TENSORS}"):
+        if old.name != name:
+            old.unlink()
+
+
+def read(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Index and tensors; one of BROKEN where they cannot be read."""
+    index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
+    return index, load_file(run / index["tensors"])
+
+
+def check_same(run: Path, part: str, *, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """CheckpointError that names what has changed since the run was begun."""
+    changed = [f"{name}: {then.get(name)} then, {value} now" for name, value in now.items() if then.get(name) != value]
+    if changed:
+        raise CheckpointError(f"{run}: the run was begun with other {part} ({'; '.join(changed)})")
+
+
+def unreadable(run: Path, error: Exception) -> CheckpointError:
+    """For a checkpoint that raised one of BROKEN."""
+    return CheckpointError(f"{run}: no readable checkpoint ({' '.join(f'{type(error).__name__}: {error}'.split())})")
