@@ -1,26 +1,34 @@
 """`mapctl bench`: cost of the solver, and the ablation of its choices, on this machine."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from mapctl.commands import options
 from mapctl.commands.tables import print_records
 from mapctl.commands.threads import compute_on_one
+from mapctl.errors import RequestError
 
 
 @dataclass(frozen=True)
 class Bench:
     """Cost of the solver on this machine, or the ablation of its choices."""
 
-    what: Positional[Annotated[Literal["speed", "ablation", "free-run"], arg(metavar="speed|ablation|free-run")]] = (
-        "speed"
-    )
+    what: Positional[
+        Annotated[
+            Literal["speed", "ablation", "free-run", "generation"], arg(metavar="speed|ablation|free-run|generation")
+        ]
+    ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
-    `free-run`: 8 random motions of 10,000 frames beside the training data."""
+    `free-run`: 8 random motions of 10,000 frames beside the training data; `generation`: raw, refined and finished
+    motion beside mocap that training did not see."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
+    data: options.MaybeFile = None
+    """For `generation`: the folder that the prior was trained on; its held-out clips are looked up there."""
+    count: options.Count = 48
+    """For `generation`: clips of 10 s to draw."""
     json: bool = False
     """Print JSON instead of a table."""
 
@@ -31,10 +39,30 @@ class Bench:
         from controllers import bench
         from mapctl import report
 
-        measure = {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what]
-        rows = measure(priors.load(self.prior))
+        prior = priors.load(self.prior)
+        if self.what == "generation":
+            rows = self._generation(prior)
+        else:
+            rows = {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what](prior)
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
         else:
             print_records(rows, title=f"{self.what}, one thread")
         return 0
+
+    def _generation(self, prior: Any) -> list[dict[str, Any]]:
+        import priors
+        from controllers.bench_generation import GenerationSettings, generation
+        from mapctl import formats, retarget
+        from mapctl.features import PRIOR_FPS
+
+        if self.data is None:
+            raise RequestError("bench generation compares with mocap: name the training data's folder with --data")
+        held = prior.card.data.get("held_out", {})
+        paths = [self.data / name for part in ("validation", "test") for name in held.get(part, ())]
+        if not paths or not all(path.is_file() for path in paths):
+            lost = next((path for path in paths if not path.is_file()), "no clip at all")
+            raise RequestError(f"{self.data} does not hold the clips kept from training: {lost}")
+        mocap = [retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS) for path in paths]
+        mocap = [clip for clip in mocap if clip.num_frames > PRIOR_FPS]
+        return generation(prior, priors.refiner_of(self.prior), mocap, GenerationSettings(count=self.count))
