@@ -84,26 +84,6 @@ def test_steps_lower_the_loss(recipe):
     assert sum(losses[-5:]) < sum(losses[:5]) - 10
 
 
-def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, data):
-    first = train(request_in(tmp_path / "first", data, labels=r"-(?P<number>[0-4])"))
-    slow = {"steps": 1, "learning_rate": 1e-6}
-    second = train(request_in(tmp_path / "second", data, init=str(first), match="walk-[0-2]", settings=slow))
-    before, after = (priors.load(str(path)) for path in (first, second))
-    assert after.reference.config == before.reference.config
-    assert len(after.reference.config.labels) == 3  # of the clips trained on
-    for name, value in before.reference.state_dict().items():
-        torch.testing.assert_close(after.reference.state_dict()[name], value, atol=2e-3, rtol=1e-3)
-    assert torch.equal(after.feature_std, before.feature_std)
-    assert f"--init {first}" in after.card.training["command"]
-
-
-def test_bfloat16_learns_and_keeps_its_weights_in_float32():
-    trainer = Trainer(TINY, replace(SETTINGS, steps=400, learning_rate=5e-3, bfloat16=True), corpus())
-    losses = [trainer.train_step() for _ in range(60)]
-    assert sum(losses[-5:]) < sum(losses[:5]) - 10
-    assert {weight.dtype for weight in trainer.model.parameters()} == {torch.float32}
-
-
 def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, data):
     out, news = tmp_path / "run", []
     path = train(request_in(out, data, licence="CC0", match="walk"), news.append)

@@ -1,0 +1,40 @@
+"""Training that begins with a prior's weights, and training in bfloat16."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from helpers import corpus, write_corpus
+
+import priors
+from priors.lstm_gmm import LstmGmmConfig
+from priors.training import health, run
+from priors.training.lstm_gmm import Trainer, TrainingSettings
+
+TINY = LstmGmmConfig(width=8, components=2)
+SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
+
+
+def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+    request = run.TrainRequest(write_corpus(tmp_path / "data"), tmp_path / "first", config=TINY, settings=SETTINGS,
+                               device="cpu", starts=4, labels=r"-(?P<number>[0-4])")  # fmt: skip
+    first = run.train(request)
+    slow = replace(SETTINGS, steps=1, learning_rate=1e-6)
+    tuned = replace(request, out=tmp_path / "second", init=str(first), match="walk-[0-2]", settings=slow, labels="")
+    before, after = (priors.load(str(path)) for path in (first, run.train(tuned)))
+    assert after.reference.config == before.reference.config
+    assert len(after.reference.config.labels) == 3  # of the clips trained on
+    for name, value in before.reference.state_dict().items():
+        torch.testing.assert_close(after.reference.state_dict()[name], value, atol=2e-3, rtol=1e-3)
+    assert torch.equal(after.feature_std, before.feature_std)
+    assert f"--init {first}" in after.card.training["command"]
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_both_precisions_learn_and_keep_their_weights_in_float32(bfloat16):
+    trainer = Trainer(TINY, replace(SETTINGS, steps=400, learning_rate=5e-3, bfloat16=bfloat16), corpus())
+    losses = [trainer.train_step() for _ in range(60)]
+    assert sum(losses[-5:]) < sum(losses[:5]) - 10
+    assert {weight.dtype for weight in trainer.model.parameters()} == {torch.float32}
