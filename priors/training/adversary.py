@@ -16,21 +16,24 @@ class Critic(nn.Module):
     reach_mean: Tensor
     reach_std: Tensor
 
-    def __init__(self, joints: Sequence[str], *, width: int, reach_mean: Tensor, reach_std: Tensor):
-        """`width` units in the first layer and in each direction of the LSTM."""
+    def __init__(self, joints: Sequence[str], *, width: int, around: int, reach_mean: Tensor, reach_std: Tensor):
+        """`width` units in the first layer and in each direction of the LSTM; the first layer sees `around` frames on
+        either side of its own.
+        """
         super().__init__()
         self.joints = tuple(joints)
         self.register_buffer("reach_mean", reach_mean.clone())
         self.register_buffer("reach_std", reach_std.clone())
-        self.first = nn.Linear(channels(joints) + 2, width)
+        self.first = nn.Conv1d(channels(joints) + 2, width, 2 * around + 1)
         self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
         self.last = nn.Linear(2 * width, 1)
 
-    def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames_but_one"]:
-        """Log odds, frame by frame, that a window was captured."""
+    def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
+        """Log odds, frame by frame, that a window was captured; for the frames that have enough on either side."""
         reach = (end_effectors(features, self.joints) - self.reach_mean) / self.reach_std
         bits = 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1
-        hidden, _ = self.lstm(torch.relu(self.first(torch.cat([reach, bits], dim=-1))))
+        seen = torch.cat([reach, bits], dim=-1).transpose(1, 2)
+        hidden, _ = self.lstm(torch.nn.functional.leaky_relu(self.first(seen), 0.2).transpose(1, 2))
         return self.last(hidden)[..., 0]
 
 

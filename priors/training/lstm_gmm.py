@@ -126,7 +126,8 @@ class Trainer:
             torch.nn.utils.clip_grad_value_(self.model.parameters(), settings.gradient_clip)
         else:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.gradient_clip)
-        if self.step >= settings.matching.begin * settings.steps:
+        matching = settings.matching
+        if self.step >= matching.begin * settings.steps and self.step % matching.every == 0:
             self._match(windows)
         self.optimiser.step()
         self.step += 1

@@ -26,10 +26,12 @@ _PAST = 3  # frames of context that a third difference reaches back
 class MatchingSettings:
     """When and how free runs are held to the data."""
 
-    begin: float = 0.6
+    begin: float = 0.75
     """Share of the steps after which it sets in: before, the network cannot run free yet. 1 leaves it out."""
+    every: int = 4
+    """Steps from one comparison to the next: at each step feet are stiller still, but samples are told from mocap."""
     batch: int = 32
-    """Free runs a step; the first windows of the step's batch."""
+    """Free runs of a comparison; the first windows of the step's batch."""
     context: int = 20
     """Frames of mocap before each run; half the window where that is less."""
     wander: int = 90
@@ -44,7 +46,7 @@ class MatchingSettings:
     """Weight of each joint's mean jerk."""
     pace: float = 20.0
     """Weight of the pace, among slow and among fast windows."""
-    spread: float = 20.0
+    spread: float = 5.0
     """Weight of each feature's spread and of its change from frame to frame."""
     drift: float = 20.0
     """Weight of the features' means over the second half of the runs: squared difference in standard deviations."""
@@ -53,6 +55,8 @@ class MatchingSettings:
         for name in ("batch", "context", "frames"):
             if getattr(self, name) < _PAST:
                 raise RequestError(f"{name} must be at least {_PAST}, got {getattr(self, name)}")
+        if self.every < 1:
+            raise RequestError(f"every must be at least 1, got {self.every}")
 
 
 def mismatch(

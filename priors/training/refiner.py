@@ -27,8 +27,13 @@ class AdversarialSettings:
     """Windows an update."""
     warm_up: int = 75
     """Updates of each before the rounds (section 4.2.2)."""
-    refiner_updates: int = 2
-    """Of the refiner for one of the critic (the paper's 5), to begin with; doubled and halved as either wins."""
+    head_start: int = 200
+    """Updates of the critic before anything else (the paper's 0): a refiner led by a critic that knows nothing spoils
+    samples that were nearly good."""
+    critic_updates: int = 2
+    """Of the critic in each round (the paper's 1)."""
+    refiner_updates: int = 1
+    """Of the refiner in each round (the paper's 5), to begin with; doubled and halved as either wins."""
     strong: float = 0.01
     """Critic's loss below which the refiner's updates are doubled."""
     weak: float = 1.0
@@ -41,19 +46,21 @@ class AdversarialSettings:
     """Weight of the squared distance between the roots' ways before and after (Eq. 13), per m^2."""
     optimiser: str = "adam"
     """`adam`, or the paper's `rmsprop`."""
-    refiner_rate: float = 3e-4
+    refiner_rate: float = 1e-4
     """Learning rate (the paper's 0.002)."""
-    critic_rate: float = 1e-3
+    critic_rate: float = 5e-4
     """Learning rate (the paper's 0.005)."""
     critic_width: int = 128
     """Units of the critic's layers (the paper's 500)."""
+    critic_around: int = 2
+    """Frames on either side that its first layer sees (the paper's 0): tremble is a matter of three frames."""
     bfloat16: bool = False
     """The networks compute in bfloat16; weights and losses stay in float32."""
     seed: int = 1
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        for name in ("rounds", "window", "batch", "refiner_updates", "most_updates"):
+        for name in ("rounds", "window", "batch", "refiner_updates", "critic_updates", "most_updates"):
             if getattr(self, name) < 1:
                 raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.history < self.batch or self.batch < 2:
@@ -66,7 +73,7 @@ PAPER = (
     RefinerConfig(width=500, memory=1000, lookahead=0, limit=1e6,
                   joints=("head", "leftHand", "rightHand", "leftToes", "rightToes")),
     AdversarialSettings(rounds=2000, optimiser="rmsprop", refiner_rate=2e-3, critic_rate=5e-3, critic_width=500,
-                        refiner_updates=5),
+                        head_start=0, critic_updates=1, refiner_updates=5, critic_around=0),
 )  # fmt: skip
 """The variant as the paper prints it; it does not say how long it trained."""
 
@@ -98,7 +105,7 @@ class AdversarialTrainer:
             torch.default_generator.manual_seed(settings.seed)
             self.refiner = RefinerNetwork(config, **statistics)
             reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
-            self.critic = Critic(config.joints, width=settings.critic_width, **reach)
+            self.critic = Critic(config.joints, width=settings.critic_width, around=settings.critic_around, **reach)
         self.given = settings.window + self.refiner.before + config.lookahead
         self.captured = window_starts(corpus.lengths, settings.window)
         self.sampled = window_starts(raw.lengths, self.given)
@@ -109,18 +116,21 @@ class AdversarialTrainer:
         self.history = History(torch.cat(first)[: settings.history])
 
     def warm_up(self) -> None:
-        """Both, before the rounds."""
+        """Before the rounds: the critic alone, then both."""
+        for _ in range(self.settings.head_start):
+            self._criticise()
         for _ in range(self.settings.warm_up):
             self._refine()
             self._criticise()
 
     def train_round(self) -> Losses:
-        """Updates of the refiner, one of the critic, and the balance of section 4.2.2."""
+        """Updates of the refiner, then of the critic, and the balance of section 4.2.2."""
         if self.round == 0:
             self.warm_up()
         updates, settings = self.updates, self.settings
         refiner = sum(self._refine() for _ in range(updates)) / updates
-        critic, told = self._criticise()
+        judged = [self._criticise() for _ in range(settings.critic_updates)]
+        critic, told = (sum(each) / settings.critic_updates for each in zip(*judged, strict=True))
         if critic < settings.strong:
             self.updates = min(2 * updates, settings.most_updates)
         elif critic > settings.weak:
@@ -160,7 +170,7 @@ class AdversarialTrainer:
         with self._precision():
             refined, _ = self.refiner(raw)
             odds = self.critic(refined.float())
-        loss = cross_entropy(odds.float(), torch.ones_like(odds, dtype=torch.float32))
+        loss = cross_entropy(odds.float(), torch.ones(odds.shape))
         total = loss + self.settings.root * _root_distance(raw[:, self.refiner.before :], refined.float())
         self._step(self.optimisers[0], self.refiner, total)
         return loss.item()

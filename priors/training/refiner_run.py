@@ -62,7 +62,7 @@ class RefinerRequest:
     """Between checkpoints."""
     report_rounds: int = 50
     """Between lines of news."""
-    judge_rounds: int = 400
+    judge_rounds: int = 300
     """Between measures of held-out samples."""
     licence: str = "that of the training data"
     """Of the weights, for the card."""
