@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
+from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.end_effectors import channels, end_effectors
 
@@ -44,6 +45,8 @@ class RefinerConfig:
     def __post_init__(self):
         if min(self.width, self.memory) < 1 or self.lookahead < 0 or not self.limit > 0:
             raise RequestError(f"a refiner needs positive width, memory and limit, and lookahead >= 0, got {self}")
+        if not self.joints or not set(self.joints) <= set(CANONICAL.names):
+            raise RequestError(f"a refiner needs end effectors among {', '.join(CANONICAL.names)}, got {self.joints}")
 
     def as_card(self) -> dict[str, Any]:
         """For a card's JSON, which knows no tuples."""
@@ -64,13 +67,15 @@ class RefinerNetwork(nn.Module):
     reach_std: Tensor
 
     def __init__(self, config: RefinerConfig, *, mean: Tensor, std: Tensor, reach_mean: Tensor, reach_std: Tensor):
-        """Statistics of the features (size,) and of `end_effectors` (channels,)."""
+        """Statistics of the features (size,) and of `end_effectors` (channels,); RuntimeError for other widths."""
         super().__init__()
         self.config = config
-        for name, values in (("mean", mean), ("std", std), ("reach_mean", reach_mean), ("reach_std", reach_std)):
-            self.register_buffer(name, values.clone())
+        reach = channels(config.joints)
+        for name, values, width in (("mean", mean, LAYOUT.size), ("std", std, LAYOUT.size),
+                                    ("reach_mean", reach_mean, reach), ("reach_std", reach_std, reach)):  # fmt: skip
+            self.register_buffer(name, values.expand(width).clone())
         seen = 2 * config.lookahead + 1
-        self.first = nn.Conv1d(LAYOUT.size + channels(config.joints), config.width, seen)
+        self.first = nn.Conv1d(LAYOUT.size + reach, config.width, seen)
         self.lstm = nn.LSTM(config.width, config.memory, batch_first=True)
         self.last = nn.Linear(config.memory, LAYOUT.size)
         nn.init.zeros_(self.last.weight)
@@ -111,7 +116,7 @@ class LstmRefiner:
         """The whole motion refined; contact bits are 0 or 1."""
         return torch.cat(list(self.stream([features])), dim=1)
 
-    def stream(self, pieces: Iterable[Float[Tensor, "batch piece size"]]) -> Iterator[Float[Tensor, "batch out size"]]:
+    def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
         """Consecutive pieces refined, `lookahead` frames behind their input, in memory that does not grow.
 
         At both ends the motion is taken to go on as its outermost frame does.

@@ -1,0 +1,238 @@
+"""The refiner: what it may change and what it may see, whole or in pieces, and its file."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from helpers import corpus, generator
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import load_file, save_file
+
+import priors
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.features import LAYOUT
+from priors import checkpoints
+from priors import refiner as refiners
+from priors.end_effectors import channels
+from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
+
+TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
+BITS = LAYOUT.slices["contacts"]
+
+
+walks = cache(corpus)
+
+
+def network_of(config=TINY, *, trained=True, scale=1.0):
+    """In float64, with the statistics of the walks; `trained` draws the last layer, which is zero at first."""
+    features = walks().features
+    reach = torch.linspace(-0.5, 0.5, channels(config.joints))
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        network = RefinerNetwork(config, mean=features.mean(0), std=features.std(0).clamp(min=0.002),
+                                 reach_mean=reach, reach_std=1 + reach.abs())  # fmt: skip
+        if trained:
+            torch.nn.init.normal_(network.last.weight, std=scale)
+            torch.nn.init.normal_(network.last.bias, std=scale)
+    return network.double().eval().requires_grad_(False)
+
+
+def refiner_of(config=TINY, **how):
+    card = checkpoints.Card("refiner", config.as_card(), licence="none", **checkpoints.Card.of_layout())
+    return LstmRefiner("tiny", network_of(config, **how), card)
+
+
+def clips(frames=40, count=2):
+    return torch.stack([clip[:frames] for clip in walks().clips()[:count]]).double()
+
+
+def with_soft_bits(features):
+    soft = features.clone()
+    soft[..., BITS] = torch.rand(soft[..., BITS].shape, generator=generator(), dtype=torch.float64)
+    return soft
+
+
+@pytest.mark.parametrize("lookahead", [0, 3])
+def test_untrained_it_returns_what_it_was_given_with_hard_bits(lookahead):
+    features = with_soft_bits(clips())
+    refined = refiner_of(replace(TINY, lookahead=lookahead), trained=False).refine(features)
+    torch.testing.assert_close(refined[..., : LAYOUT.continuous], features[..., : LAYOUT.continuous], atol=0, rtol=0)
+    assert torch.equal(refined[..., BITS], (features[..., BITS] > 0.5).double())
+
+
+@pytest.mark.parametrize("limit", [0.1, 2.0])
+def test_what_is_added_is_bounded_whatever_the_weights(limit):
+    refiner = refiner_of(replace(TINY, limit=limit), scale=1e4)
+    features = clips()
+    size = LAYOUT.continuous
+    change = (refiner.refine(features) - features)[..., :size] / refiner.network.std[:size]
+    assert float(change.abs().max()) <= limit * (1 + 1e-9)
+    assert float(change.abs().median()) > 0.9 * limit  # these weights ask for far more
+
+
+def test_a_trained_one_overrules_contact_bits_and_leaves_them_hard():
+    features = clips()
+    refined = refiner_of(scale=1e4).refine(features)[..., BITS]
+    assert set(refined.unique().tolist()) == {0.0, 1.0}
+    assert not torch.equal(refined, features[..., BITS])
+
+
+def test_the_networks_bits_are_probabilities_with_a_slope():
+    features = clips().requires_grad_()
+    bits = network_of()(features)[0][..., BITS]
+    assert bool(((bits > 0) & (bits < 1)).all())
+    (slope,) = torch.autograd.grad(bits.sum(), features)
+    assert float(slope[..., : LAYOUT.continuous].abs().max()) > 0
+
+
+@given(st.lists(st.integers(0, 13), min_size=1, max_size=12), st.integers(0, 4), st.integers(1, 9))
+@settings(max_examples=40, deadline=None)
+def test_pieces_of_any_sizes_give_the_whole(sizes, lookahead, piece):
+    """Whatever is given at once, and whatever is refined at once."""
+    refiner = refiner_of(replace(TINY, lookahead=lookahead))
+    features = clips(100).repeat(1, 2, 1)[:, : sum(sizes)]
+    pieces = features.split(sizes, dim=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refiners, "_PIECE", piece)
+        streamed = list(refiner.stream(pieces))
+    if not features.shape[1]:
+        assert streamed == []
+        return
+    assert all(out.shape[1] <= piece for out in streamed)
+    torch.testing.assert_close(torch.cat(streamed, dim=1), refiner.refine(features), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5, 601])
+@pytest.mark.parametrize("lookahead", [0, 2])
+def test_every_frame_comes_out_once(frames, lookahead):
+    """Also of a motion shorter than the look-ahead, or longer than what is refined at once."""
+    features = clips(1).expand(-1, frames, -1)
+    assert refiner_of(replace(TINY, lookahead=lookahead)).refine(features).shape == features.shape
+
+
+def test_a_stream_runs_no_further_behind_than_its_look_ahead():
+    seen = 0
+
+    def frame_by_frame():
+        nonlocal seen
+        for frame in clips().split(1, dim=1):
+            seen += 1
+            yield frame
+
+    lags, out = [], 0
+    for piece in refiner_of().stream(frame_by_frame()):
+        out += piece.shape[1]
+        lags.append(seen - out)
+    assert out == 40
+    assert lags == [2] * 38 + [0]  # all of the rest at the end, where nothing follows
+
+
+@pytest.mark.parametrize("lookahead", [0, 1, 3])
+@pytest.mark.parametrize("changed", [1, 20, 39])
+def test_a_frame_sees_the_past_and_its_look_ahead_but_nothing_later(changed, lookahead):
+    refiner = refiner_of(replace(TINY, lookahead=lookahead))
+    features = clips()
+    other = features.clone()
+    other[:, changed:, LAYOUT.slices["joint_rotations"]] += 0.3
+    added = [refiner.refine(motion) - motion for motion in (features, other)]
+    difference = (added[0] - added[1])[..., : LAYOUT.continuous].abs().amax((0, 2))
+    first = max(0, changed - lookahead)
+    assert float(difference[:first].sum()) == pytest.approx(0, abs=1e-12)
+    assert float(difference[first:].min()) > 0
+
+
+def test_it_does_not_matter_what_else_is_in_the_batch():
+    refiner, features = refiner_of(), clips(count=3)
+    one_by_one = torch.cat([refiner.refine(features[k : k + 1]) for k in range(3)])
+    torch.testing.assert_close(refiner.refine(features), one_by_one, atol=1e-12, rtol=0)
+
+
+def test_in_float32_too_the_whole_is_its_pieces():
+    whole = refiner_of(scale=0.1)
+    refiner = replace(whole, network=whole.network.float())
+    features = clips(100).float()
+    streamed = torch.cat(list(refiner.stream(features.split(17, dim=1))), dim=1)
+    assert streamed.dtype == torch.float32
+    torch.testing.assert_close(streamed, refiner.refine(features), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("change", [{"width": 0}, {"memory": -1}, {"lookahead": -1}, {"limit": 0.0},
+                                    {"limit": float("nan")}, {"joints": ("tail",)}, {"joints": ()}])  # fmt: skip
+def test_impossible_networks_are_refused(change):
+    with pytest.raises(RequestError, match="a refiner needs"):
+        replace(TINY, **change)
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """Written as training writes it."""
+    refiner = refiner_of(scale=0.1)
+    path = tmp_path / "run" / "model.safetensors"
+    path.parent.mkdir()
+    tensors = {name: value.float() for name, value in refiner.network.state_dict().items()}
+    checkpoints.save(tensors, refiner.card, path)
+    return path
+
+
+def test_a_stored_refiner_does_as_before_by_file_or_by_folder(stored):
+    features = clips().float()
+    expected = refiner_of(scale=0.1).refine(features.double()).float()
+    for name in (str(stored), str(stored.parent)):
+        loaded = priors.load_refiner(name)
+        assert loaded.network.config == TINY
+        assert loaded.name == name
+        refined = loaded.refine(features)
+        torch.testing.assert_close(refined, expected, atol=2e-3, rtol=0)
+        assert not refined.requires_grad
+
+
+def stored_again(path, *, tensors=None, **card):
+    before = checkpoints.read_card(path.with_suffix(".json"))
+    checkpoints.save(load_file(path) if tensors is None else tensors, replace(before, **card), path)
+
+
+@pytest.mark.parametrize("config", [
+    {**TINY.as_card(), "width": 7}, {**TINY.as_card(), "width": "wide"}, {**TINY.as_card(), "limit": 0},
+    {**TINY.as_card(), "depth": 2}, {**TINY.as_card(), "joints": ["hips"]}, {**TINY.as_card(), "joints": 3},
+    {**TINY.as_card(), "joints": ["hips", "leftHand", "tail"]}, {},
+])  # fmt: skip
+def test_a_card_that_does_not_fit_is_refused(stored, config):
+    stored_again(stored, config=config)
+    with pytest.raises(CheckpointError, match="do not fit its card"):
+        priors.load_refiner(str(stored))
+
+
+@pytest.mark.parametrize("name", ["mean", "reach_std", "first.weight", "last.bias"])
+def test_missing_and_misshapen_tensors_are_refused(stored, name):
+    whole = load_file(stored)
+    for tensors in ({k: v for k, v in whole.items() if k != name}, {**whole, name: whole[name][:1].contiguous()}):
+        stored_again(stored, tensors=tensors)
+        with pytest.raises(CheckpointError, match="do not fit its card"):
+            priors.load_refiner(str(stored))
+
+
+def test_weights_of_another_kind_or_layout_are_refused(stored):
+    stored_again(stored, kind="lstm-gmm")
+    with pytest.raises(CheckpointError, match="a lstm-gmm is no refiner"):
+        priors.load_refiner(str(stored))
+    stored_again(stored, kind="refiner", fingerprint="0" * 12)
+    with pytest.raises(CheckpointError, match="its features are"):
+        priors.load_refiner(str(stored))
+    with pytest.raises(CheckpointError, match="no prior 'nobody'"):
+        priors.load_refiner("nobody")
+
+
+def test_a_refiner_is_no_density(stored):
+    with pytest.raises(CheckpointError, match="a refiner is no density"):
+        priors.load(str(stored))
+
+
+def test_damaged_files_are_refused(stored):
+    save_file({"mean": torch.zeros(3)}, stored)
+    with pytest.raises(CheckpointError, match="do not fit its card"):
+        priors.load_refiner(str(stored))
+    stored.write_bytes(b"\0" * 99)
+    with pytest.raises(CheckpointError, match="no readable safetensors"):
+        priors.load_refiner(str(stored))
