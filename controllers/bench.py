@@ -72,8 +72,8 @@ def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) 
 
 def _free_run(prior: Any, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    state, _ = begin(prior, GenerateSettings(), None, generator)
-    return prior.sample(state, frames, generator)[0][0]
+    told, state, _ = begin(prior, GenerateSettings(), None, generator)
+    return told.sample(state, frames, generator)[0][0]
 
 
 def _in_sigmas(prior: Any, features: Tensor) -> Tensor:

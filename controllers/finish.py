@@ -36,8 +36,8 @@ class FinishSettings:
     """Way over the ground within a window, metres."""
     sigma_turn: float = Closeness.sigma_turn
     """Turn within a window, radians."""
-    footing: Footing = field(default_factory=Footing)
-    """Planted feet."""
+    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.06))
+    """Planted feet. Mocap's own move a little: feet that stood still would be told from them."""
     window: WindowSettings = field(default_factory=WindowSettings)
     """How windows are laid."""
     share: float = GuidedMethod.share

@@ -36,8 +36,9 @@ class FollowSettings:
     """Arc missing or too much, metres."""
     footing: Footing = field(default_factory=Footing)
     """Planted feet."""
-    noise: Noise = field(default_factory=Noise)
-    """The prior, in the latents of its rollout."""
+    noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
+    """The prior, in the latents of its rollout. A well trained prior's own spread is small: at sigma 1 the same walk
+    holds its path and its feet less well (docs/results.md)."""
     window: WindowSettings = field(default_factory=WindowSettings)
     """How windows are laid."""
     method: Method = field(default_factory=LatentMethod)

@@ -30,6 +30,9 @@ class GenerateSettings:
     """Spread of the draws: 0 is the prior's mean, 1 the prior itself."""
     start: int | None = None
     """Which of the prior's starts; drawn by their weight if None."""
+    as_start: bool = True
+    """Whether the prior is told what its data say of the start's clip (gait, style), if it can be told: left to itself
+    it lets most runs fall into a walk within ten seconds, which no clip of the data does."""
     finishing: FinishSettings | None = field(default_factory=FinishSettings)
     """Of the pass that makes planted feet stand; None leaves it out."""
 
@@ -71,21 +74,27 @@ def generate(
     return motion
 
 
-def begin(prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator) -> tuple[Any, Place]:
-    """The prior's state and the place (float64) before the first frame: a start of its own, or the end of a clip."""
+def begin(
+    prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator
+) -> tuple[Any, Any, Place]:
+    """The prior as it is to be told, its state and the place (float64) before the first frame.
+
+    Begins at a start of its own, or at the end of a clip, of which nothing is told.
+    """
     if clip is not None:
         canonical, _ = retarget.to_canonical(clip)
         features, place = encode(canonical.resample(PRIOR_FPS))
         ground, heading = root_places(features, place)
         seen = features.float()
         state = prior.advance(prior.initial_state(seen[:1]), seen[1:].unsqueeze(0))
-        return state, Place(ground[-1], heading[-1])
+        return prior, state, Place(ground[-1], heading[-1])
     count = len(prior.starts.speed)
     if settings.start is not None and not 0 <= settings.start < count:
         raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
     drawn = int(torch.multinomial(prior.starts.weight, 1, generator=generator))
     pick = drawn if settings.start is None else settings.start
-    return prior.starts.state.pick(torch.tensor([pick])), Place.origin(torch.float64)
+    state = prior.starts.state.pick(torch.tensor([pick]))
+    return prior.told_as_start(pick) if settings.as_start else prior, state, Place.origin(torch.float64)
 
 
 def _begun(
@@ -96,7 +105,7 @@ def _begun(
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
-    state, place = begin(prior, settings, clip, generator)
+    prior, state, place = begin(prior, settings, clip, generator)
     pieces = _drawn(prior, state, generator, settings.temperature)
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))

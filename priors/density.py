@@ -65,13 +65,20 @@ class LstmGmmDensity:
         RequestError for labels that it does not know.
         """
         full = [self._label(name) for name in wanted]
-        known = labels.read(self.starts.names, self.card.data["labels"]).renamed(tuple(full))
+        known = labels.read(self.starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
         fitting = known.held.sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
         weight = self.starts.weight[rows]
         picked = Starts(self.starts.state.pick(rows), self.starts.speed[rows],
                         tuple(self.starts.names[i] for i in rows.tolist()), weight / weight.sum())  # fmt: skip
         return replace(self, reference=self.reference.told(full), starts=picked)
+
+    def told_as_start(self, start: int) -> "LstmGmmDensity":
+        """The same density told what its data say of the clip that a start was taken from, so that it goes on so."""
+        held = labels.read(self.starts.names, self.card.data.get("labels", ""))
+        names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
+        known = [name for name in names if name in self.reference.config.labels]
+        return replace(self, reference=self.reference.told(known))
 
     def _label(self, name: str) -> str:
         """The whole label that a name, or its part after the `=`, stands for."""

@@ -40,7 +40,8 @@ class Generate:
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """Gait and style by the names of the prior's data, such as run or elderly,walk; `mapctl info PRIOR` lists them."""
+    """Gait and style by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior to itself.
+    If not given, motion goes on as the clip does that it begins from."""
     refiner: options.Name = "auto"
     """A bundled refiner, or the file or run folder of a trained one; auto is the prior's own, if it has one."""
     no_refine: bool = False
@@ -58,7 +59,7 @@ class Generate:
         from controllers.generate import stream
 
         prior = priors.load(self.prior)
-        if self.style is not None:
+        if self.style not in (None, "none"):
             prior = prior.told([name.strip() for name in self.style.split(",")])
         refiner = None if self.no_refine else priors.refiner_of(self.prior) if self.refiner == "auto" else (
             priors.load_refiner(self.refiner))  # fmt: skip
@@ -82,7 +83,7 @@ class Generate:
             raise RequestError("--refiner and --no-refine exclude each other")
         finishing = None if self.no_refine else FinishSettings()
         start = int(self.start) if self.start and numbered else None
-        settings = GenerateSettings(self.temperature, start, finishing)
+        settings = GenerateSettings(self.temperature, start, self.style is None, finishing)
         if self.start is None or numbered:
             return settings, None
         from mapctl import formats
