@@ -11,6 +11,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place, mirror_features, root_places
 from priors.end_effectors import end_effectors
 from priors.refiner import RefinerConfig, RefinerNetwork
+from priors.training import run_files
 from priors.training.adversary import Critic, History
 from priors.training.corpus import Corpus, window_starts
 
@@ -63,6 +64,8 @@ class AdversarialSettings:
         for name in ("rounds", "window", "batch", "refiner_updates", "critic_updates", "most_updates"):
             if getattr(self, name) < 1:
                 raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.window < 2:
+            raise RequestError(f"window must be at least 2, got {self.window}: the critic sees velocities")
         if self.history < self.batch or self.batch < 2:
             raise RequestError(f"the history must hold a batch of 2 or more, got {self.history} for {self.batch}")
         if self.optimiser not in ("adam", "rmsprop"):
@@ -144,8 +147,7 @@ class AdversarialTrainer:
                    "counts": torch.tensor([self.round, self.updates])}  # fmt: skip
         for kind, model, optimiser in self._sides():
             tensors |= {f"{kind}.{name}": value for name, value in model.state_dict().items()}
-            for number, entries in optimiser.state_dict()["state"].items():
-                tensors |= {f"{kind}-optimiser.{number}.{key}": torch.as_tensor(v) for key, v in entries.items()}
+            tensors |= run_files.optimiser_tensors(optimiser, f"{kind}-optimiser")
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -155,11 +157,7 @@ class AdversarialTrainer:
         self.round, self.updates = tensors["counts"].tolist()
         for kind, model, optimiser in self._sides():
             model.load_state_dict(_below(f"{kind}.", tensors))
-            entries: dict[int, dict[str, Tensor]] = {}
-            for name, value in _below(f"{kind}-optimiser.", tensors).items():
-                number, key = name.split(".", 1)
-                entries.setdefault(int(number), {})[key] = value
-            optimiser.load_state_dict({"state": entries, "param_groups": optimiser.state_dict()["param_groups"]})
+            optimiser.load_state_dict(run_files.optimiser_state(optimiser, f"{kind}-optimiser", tensors))
 
     def _sides(self) -> list[tuple[str, nn.Module, torch.optim.Optimizer]]:
         return [("refiner", self.refiner, self.optimisers[0]), ("critic", self.critic, self.optimisers[1])]

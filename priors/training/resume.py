@@ -19,8 +19,7 @@ def save(run: Path, trainer: Trainer, curve: Curve, data: Mapping[str, str]) -> 
     only.
     """
     tensors = {f"model.{name}": tensor for name, tensor in trainer.model.state_dict().items()}
-    for number, entries in trainer.optimiser.state_dict()["state"].items():
-        tensors |= {f"optimiser.{number}.{key}": torch.as_tensor(value) for key, value in entries.items()}
+    tensors |= run_files.optimiser_tensors(trainer.optimiser, "optimiser")
     tensors["generator"] = trainer.generator.get_state()
     run_files.write(run, step=trainer.step, tensors=tensors, index={**_recipe(trainer, data), "curve": curve})
 
@@ -46,19 +45,8 @@ def _recipe(trainer: Trainer, data: Mapping[str, str]) -> dict[str, dict[str, An
 
 
 def _restore(trainer: Trainer, tensors: Mapping[str, torch.Tensor], *, step: int) -> None:
-    state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in tensors.items():
-        if name.startswith("optimiser."):
-            _, number, key = name.split(".", 2)
-            state.setdefault(int(number), {})[key] = tensor
-    # Torch takes a partial state, and fails at the next step.
-    if (
-        len(state) != len(list(trainer.model.parameters()))
-        or len({frozenset(entries) for entries in state.values()}) > 1
-    ):
-        raise KeyError("the optimiser's state is not whole")
-    groups = trainer.optimiser.state_dict()["param_groups"]
     trainer.load_state({
         "model": {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")},
-        "optimiser": {"state": state, "param_groups": groups}, "generator": tensors["generator"], "step": int(step),
+        "optimiser": run_files.optimiser_state(trainer.optimiser, "optimiser", tensors),
+        "generator": tensors["generator"], "step": int(step),
     })  # fmt: skip

@@ -43,6 +43,29 @@ def read(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     return index, load_file(run / index["tensors"])
 
 
+def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, torch.Tensor]:
+    """What an optimiser keeps of each weight, flat."""
+    return {f"{prefix}.{number}.{key}": torch.as_tensor(value)
+            for number, entries in optimiser.state_dict()["state"].items()
+            for key, value in entries.items()}  # fmt: skip
+
+
+def optimiser_state(
+    optimiser: torch.optim.Optimizer, prefix: str, tensors: Mapping[str, torch.Tensor]
+) -> dict[str, Any]:
+    """For `load_state_dict`, from what `optimiser_tensors` gave; KeyError unless it is whole."""
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, tensor in tensors.items():
+        if name.startswith(f"{prefix}."):
+            number, key = name.removeprefix(f"{prefix}.").split(".", 1)
+            state.setdefault(int(number), {})[key] = tensor
+    groups = optimiser.state_dict()["param_groups"]
+    # Torch takes a partial state, and fails at the next step.
+    if len(state) != sum(len(group["params"]) for group in groups) or len(set(map(frozenset, state.values()))) > 1:
+        raise KeyError("the optimiser's state is not whole")
+    return {"state": state, "param_groups": groups}
+
+
 def check_same(run: Path, part: str, *, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """CheckpointError that names what has changed since the run was begun."""
     changed = [f"{name}: {then.get(name)} then, {value} now" for name, value in now.items() if then.get(name) != value]
