@@ -10,7 +10,7 @@ from priors.lstm_gmm import LstmGmmConfig
 from priors.training.lstm_gmm import Trainer, TrainingSettings
 from priors.training.matching import MatchingSettings, compare, mismatch
 
-SETTINGS = MatchingSettings(batch=8, context=10, frames=10)
+SETTINGS = MatchingSettings(batch=8, context=10, wander=0, frames=10)
 
 
 def windows(frames: int = 24) -> torch.Tensor:
@@ -39,15 +39,16 @@ def shaken(values: torch.Tensor) -> torch.Tensor:
         (changed("root_height", lambda height: height + 0.05), "feet"),
         (changed("joint_rotations", shaken), "jerk"),
         (changed("joint_rotations", lambda vectors: 0.5 * vectors), "spread"),
+        (changed("root_height", lambda height: height - 0.05), "drift"),
     ],
 )
 def test_each_fault_costs_under_the_weight_that_is_meant_for_it(made, weight):
-    off = {name: 0.0 for name in ("feet", "jerk", "pace", "spread") if name != weight}
+    off = {name: 0.0 for name in ("feet", "jerk", "pace", "spread", "drift") if name != weight}
     assert float(compare(made, windows(), MatchingSettings(**off))) > 0.05
 
 
 def test_stiller_feet_than_mocaps_cost_nothing():
-    only_feet = MatchingSettings(jerk=0, pace=0, spread=0)
+    only_feet = MatchingSettings(jerk=0, pace=0, spread=0, drift=0)
     sliding = changed("root_displacement_heading", lambda step: 1.5 * step)
     assert float(compare(windows(), sliding, only_feet)) == 0
     assert float(compare(sliding, windows(), only_feet)) > 0
@@ -81,7 +82,9 @@ def test_descending_it_lowers_it():
 
 
 def test_training_runs_free_once_it_has_begun(monkeypatch):
-    settings = TrainingSettings(steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, batch=4))
+    settings = TrainingSettings(
+        steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, every=1, wander=0, batch=4)
+    )
     trainer, runs = Trainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
     draw = trainer.model.draw
     monkeypatch.setattr(trainer.model, "draw", lambda *run: (runs.append(trainer.step), draw(*run))[1])
@@ -94,3 +97,24 @@ def test_windows_too_short_for_a_run_are_refused():
     trainer = Trainer(LstmGmmConfig(width=8, components=1), TrainingSettings(steps=1, batch=2, window=4), corpus())
     with pytest.raises(RequestError, match="at least 6 frames, got 5"):
         mismatch(trainer.model, windows(5), SETTINGS, generator())
+
+
+def test_runs_that_wander_first_are_compared_all_the_same():
+    far = MatchingSettings(batch=5, context=10, wander=40, frames=10)
+    lengths, model = [], tiny_model()
+    sample = model.sample
+    model.sample = lambda state, frames, generator: (lengths.append(frames), sample(state, frames, generator))[1]
+    values = [float(mismatch(model, windows(), far, generator(seed))) for seed in range(6)]
+    assert len(set(lengths)) > 2
+    assert max(lengths) <= 40
+    assert all(value > 0 for value in values)
+
+
+def test_it_is_compared_every_so_many_steps():
+    settings = TrainingSettings(steps=9, batch=4, window=12, matching=MatchingSettings(begin=0.0, every=4, batch=4))
+    trainer, steps = Trainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
+    match = trainer._match
+    trainer._match = lambda windows: (steps.append(trainer.step), match(windows))[1]
+    for _ in range(9):
+        trainer.train_step()
+    assert steps == [0, 4, 8]
