@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from controllers.finish import FinishSettings
-from controllers.generate import GenerateSettings, generate
+from controllers.generate import GenerateSettings, generate, spread_starts
 from mapctl.errors import RequestError
 from mapctl.metrics import measure
 from mapctl.metrics.realism import GaitSpread, RealismSettings, gait_spread, realism, sample_diversity, spread_ratios
@@ -79,9 +79,11 @@ def _variants(refiner: Refiner | None) -> list[_Variant]:
 def _drawn(prior: Any, variant: _Variant, settings: GenerationSettings) -> tuple[list[Motion], float]:
     """Clips, and milliseconds of processor time a frame."""
     wishes, clips = GenerateSettings(finishing=variant.finishing), []
+    starts = spread_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
     began = time.process_time()
-    for number in range(settings.count):
-        clips.append(_clip(prior, variant, wishes, settings.seconds, settings.seed + number))
+    for number, start in enumerate(starts):
+        own = replace(wishes, start=start)
+        clips.append(_clip(prior, variant, own, settings.seconds, settings.seed + number))
     spent = time.process_time() - began
     return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
 

@@ -20,6 +20,7 @@ from mapctl.motion import Motion
 from mapctl.protocols import Refiner
 
 _CHUNK = 600
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,19 @@ def begin(
     pick = drawn if settings.start is None else settings.start
     state = prior.starts.state.pick(torch.tensor([pick]))
     return prior.told_as_start(pick) if settings.as_start else prior, state, Place.origin(torch.float64)
+
+
+def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[int]:
+    """A start for each of several motions, which together begin as the data do: spread over the speeds by weight.
+
+    A golden-ratio sequence from a drawn beginning, so that a few motions are already spread, and the first of many are
+    those of a few.
+    """
+    slow_to_fast = torch.argsort(prior.starts.speed)
+    upto = prior.starts.weight[slow_to_fast].double().cumsum(0)
+    first = torch.rand((), generator=generator, dtype=torch.float64)
+    drawn = torch.remainder(first + _GOLDEN * torch.arange(count, dtype=torch.float64), 1.0) * upto[-1]
+    return slow_to_fast[torch.searchsorted(upto, drawn).clamp(max=len(upto) - 1)].tolist()
 
 
 def _begun(

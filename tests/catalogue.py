@@ -1,11 +1,12 @@
 """One instance of every term, and small densities: what the contract tests, and only they, must know of them."""
 
 import torch
-from helpers import generator, tiny_model
+from helpers import generator, tiny_model, walk
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.terms import Footing, Likelihood, Noise, Path, Seam, Term
+from mapctl.features import encode
+from mapctl.terms import Closeness, Footing, Likelihood, Noise, Path, Seam, Term
 from priors.lstm_gmm import LstmGmm
 
 FRAMES = 12
@@ -23,6 +24,7 @@ TERMS: dict[str, Term] = {
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
     "footing": Footing(),
     "seam": Seam(sigma=300.0),
+    "closeness": Closeness(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_turn=0.3),
 }
 """Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
 

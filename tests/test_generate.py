@@ -2,23 +2,27 @@
 
 import math
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 from helpers import bandai_skeleton, generator, tiny_density, turn_between, walk
 
-from controllers.generate import GenerateSettings, generate, stream
+from controllers.generate import _CHUNK, GenerateSettings, begin, generate, spread_starts, stream, stream_features
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.features import decode, encode
+from mapctl.features import LAYOUT, Place, decode, encode
 from mapctl.kinematics import heading
 from mapctl.skeleton import CANONICAL
 
 DENSITY = tiny_density()
 
 
-def made(seconds=1.0, *, seed=0, **wishes):
-    return generate(DENSITY, seconds=seconds, generator=generator(seed), **wishes)
+RAW = GenerateSettings(finishing=None)
+
+
+def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):
+    return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **wishes)
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(1.0, 30), (0.5, 15), (0.001, 2), (1.51, 45)])
@@ -45,7 +49,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
     whole = made(2.0, seed=5)
     monkeypatch.setattr(sys.modules["controllers.generate"], "_CHUNK", 13)
-    pieces = list(stream(DENSITY, seconds=2.0, generator=generator(5)))
+    pieces = list(stream(DENSITY, seconds=2.0, generator=generator(5), settings=RAW))
     assert [piece.num_frames for piece in pieces] == [13, 13, 13, 13, 8]
     joined = made(2.0, seed=5)
     torch.testing.assert_close(joined.joint_positions(), whole.joint_positions(), atol=1e-6, rtol=0)
@@ -55,18 +59,18 @@ def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
 
 
 def test_it_is_what_the_prior_samples_from_the_chosen_start():
-    motion = made(0.5, seed=3, settings=GenerateSettings(start=2, temperature=0.5))
+    motion = made(0.5, seed=3, settings=replace(RAW, start=2, temperature=0.5))
     draws = generator(3)
-    torch.randint(4, (1,), generator=draws)
+    torch.multinomial(DENSITY.starts.weight, 1, generator=draws)
     state = DENSITY.starts.state.pick(torch.tensor([2]))
-    features, _ = DENSITY.sample(state, 15, draws, temperature=0.5)
-    torch.testing.assert_close(encode(motion)[0][1:, 2:66], features[0, 1:, 2:66].double(), atol=1e-5, rtol=0)
+    features, _ = DENSITY.sample(state, _CHUNK, draws, temperature=0.5)
+    torch.testing.assert_close(encode(motion)[0][1:, 2:66], features[0, 1:15, 2:66].double(), atol=1e-5, rtol=0)
 
 
 def test_temperature_spreads_the_draws():
     one = tiny_density(components=1)
     calm, wild = (
-        generate(one, seconds=2.0, generator=generator(), settings=GenerateSettings(temperature=t, start=0))
+        generate(one, seconds=2.0, generator=generator(), settings=replace(RAW, temperature=t, start=0))
         for t in (0.0, 2.0)
     )
     jerks = [encode(m)[0][:, 6:66].diff(n=3, dim=0).square().mean().sqrt() for m in (calm, wild)]
@@ -88,7 +92,7 @@ def test_it_continues_where_a_clip_ends(rig):
 
 def test_a_clip_warms_up_the_memory():
     clip = walk(40)
-    motion = made(0.2, start_clip=clip, settings=GenerateSettings(temperature=0.0))
+    motion = made(0.2, start_clip=clip, settings=replace(RAW, temperature=0.0))
     features, place = encode(clip)
     state = DENSITY.advance(DENSITY.initial_state(features[:1].float()), features[None, 1:].float())
     drawn, _ = DENSITY.sample(state, 6, generator(0), temperature=0.0)
@@ -111,4 +115,50 @@ def test_impossible_temperatures_are_refused(temperature):
 @pytest.mark.parametrize("start", [-1, 4])
 def test_starts_that_are_not_there_are_refused(start):
     with pytest.raises(RequestError, match=f"the prior has starts 0 to 3, got {start}"):
-        made(settings=GenerateSettings(start=start))
+        made(settings=replace(RAW, start=start))
+
+
+class Raised:
+    """A refiner that lifts the hips by 10 cm, piece by piece, two frames behind."""
+
+    def refine(self, features):
+        return next(self.stream([features]))
+
+    def stream(self, pieces):
+        held = None
+        for piece in pieces:
+            held = piece.clone() if held is None else torch.cat([held, piece], 1)
+            held[:, -piece.shape[1] :, LAYOUT.slices["root_height"]] += 0.1
+            yield held[:, :-2]
+            held = held[:, -2:]
+
+
+def test_a_refiner_comes_before_the_motion_is_decoded():
+    plain, lifted = made(), made(refiner=Raised())
+    assert lifted.num_frames == plain.num_frames
+    torch.testing.assert_close(lifted.root_position[:, 1], plain.root_position[:, 1] + 0.1, atol=1e-5, rtol=0)
+
+
+def test_features_are_the_motion_and_its_contact_labels():
+    motion = made(seed=2)
+    features = torch.cat(list(stream_features(DENSITY, seconds=1.0, generator=generator(2), settings=RAW)))
+    rebuilt = decode(features, Place.origin(torch.float64))
+    torch.testing.assert_close(rebuilt.joint_positions(), motion.joint_positions(), atol=1e-6, rtol=0)
+    assert set(LAYOUT.pick(features, "contacts").unique().tolist()) <= {0.0, 1.0}
+
+
+def test_starts_are_drawn_by_their_weight():
+    only = replace(DENSITY, starts=replace(DENSITY.starts, weight=torch.tensor([0.0, 0.0, 1.0, 0.0])))
+    for seed in range(5):
+        _, state, _ = begin(only, RAW, None, generator(seed))
+        assert torch.equal(state.previous, DENSITY.starts.state.previous[2:3])
+
+
+def test_starts_of_several_motions_are_spread_by_weight_and_the_first_do_not_depend_on_how_many():
+    weight = torch.tensor([0.1, 0.2, 0.3, 0.4])
+    prior = replace(DENSITY, starts=replace(DENSITY.starts, weight=weight))
+    drawn = spread_starts(prior, 200, generator(1))
+    counts = torch.bincount(torch.tensor(drawn), minlength=4) / 200
+    torch.testing.assert_close(counts, weight, atol=0.015, rtol=0)
+    assert spread_starts(prior, 7, generator(1)) == drawn[:7]
+    assert spread_starts(prior, 7, generator(2)) != drawn[:7]

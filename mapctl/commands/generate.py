@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -32,11 +32,11 @@ class Generate:
     count: options.Count = 1
     """How many clips."""
     seed: options.Count = 0
-    """Of everything random; each clip draws its own seed from it."""
+    """Of everything random; each clip draws its own seed from it, and their starts are spread over the data's speeds."""
     temperature: options.Number = 1.0
     """Spread of the draws, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
     start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
-    """A clip (.bvh, .npz) to go on from, or the number of one of the prior's starts; drawn if not given."""
+    """A clip (.bvh, .npz) to go on from, or the number of one of the prior's starts for all; drawn if not given."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
@@ -56,17 +56,19 @@ class Generate:
         import torch
 
         import priors
-        from controllers.generate import stream
+        from controllers.generate import spread_starts, stream
 
         prior = priors.load(self.prior)
         if self.style not in (None, "none"):
             prior = prior.told([name.strip() for name in self.style.split(",")])
         refiner = None if self.no_refine else priors.refiner_of(self.prior) if self.refiner == "auto" else (
             priors.load_refiner(self.refiner))  # fmt: skip
-        draw = partial(stream, prior, seconds=self.seconds, settings=settings, start_clip=clip, refiner=refiner)
+        draw = partial(stream, prior, seconds=self.seconds, start_clip=clip, refiner=refiner)
+        starts = spread_starts(prior, self.count, torch.Generator().manual_seed(self.seed))
         with outputs.made_folder(self.out) as folder:
             for number, seed in enumerate(self._seeds()):
-                pieces = draw(generator=torch.Generator().manual_seed(seed))
+                own = settings if settings.start is not None else replace(settings, start=starts[number])
+                pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
                 self._write(pieces, folder / f"generated_{number:03d}.bvh", frames)
         return 0
 

@@ -1,0 +1,100 @@
+"""The finishing pass: as long as asked, the same however it comes in, feet stiller, contacts steady."""
+
+import pytest
+import torch
+from helpers import corpus, generator, tiny_density, tiny_model
+
+from controllers.finish import FinishSettings, finish
+from mapctl.contacts import without_short_runs
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, Place
+from mapctl.solver.methods import GuidedMethod
+from mapctl.solver.variables import Context
+from mapctl.solver.window import WindowSettings
+from mapctl.terms import Closeness, Footing
+from mapctl.trial import Trial
+
+SETTINGS = FinishSettings(window=WindowSettings(frames=12, overlap=6))
+DENSITY = tiny_density()
+
+
+def clip(frames: int = 60, *, noise: float = 0.01) -> torch.Tensor:
+    """A walk that trembles; its first frame is the state's."""
+    features = corpus().clips()[1][:frames].clone()
+    shake = noise * torch.randn(features.shape, generator=generator())
+    features[:, : LAYOUT.continuous] += shake[:, : LAYOUT.continuous] * DENSITY.feature_std[: LAYOUT.continuous] / 0.05
+    return features
+
+
+def finished(pieces, frames, *, settings=SETTINGS):
+    state = DENSITY.initial_state(corpus().clips()[1][:1])
+    return torch.cat(
+        list(finish(DENSITY, pieces, frames=frames, state=state, generator=generator(), settings=settings))
+    )
+
+
+def toe_speed(features: torch.Tensor) -> float:
+    """Mean ground speed of planted toes, m/s, by the labels of the walk itself."""
+    batch, bits = features[None], corpus().clips()[1][1 : len(features) + 1, -2:] > 0.5
+    origin = Place(torch.zeros(1, 2), torch.zeros(1))
+    trial = Trial(batch, origin, batch, batch[..., 0], bits[None], torch.zeros(0, 21, 3))
+    toes = torch.stack([trial.joint_world("leftToes"), trial.joint_world("rightToes")], 2)
+    held = (bits[1:] & bits[:-1])[None]
+    return float((30 * toes[..., ::2].diff(dim=1).norm(dim=-1))[held].mean())
+
+
+@pytest.mark.parametrize("frames", [5, 12, 31])
+def test_it_gives_as_many_frames_as_are_asked_for(frames):
+    made = finished([clip()[1:]], frames)
+    assert made.shape == (frames, LAYOUT.size)
+    assert bool(torch.isfinite(made).all())
+
+
+def test_how_the_pieces_are_cut_does_not_matter():
+    whole = finished([clip()[1:]], 24)
+    assert torch.equal(finished(list(clip()[1:].split(7)), 24), whole)
+
+
+def test_planted_toes_slow_down_and_the_motion_stays_what_it_was():
+    before = clip()[1:31]
+    after = finished([clip()[1:]], 30)
+    assert toe_speed(after) < 0.6 * toe_speed(before)
+    height = LAYOUT.pick(after - before, "root_height")
+    assert float(height.abs().mean()) < 0.03
+
+
+def test_contacts_and_gaps_of_one_or_two_frames_go():
+    flickering = clip()
+    flickering[20, -2:] = 1 - flickering[20, -2:]
+    flickering[31:33, -1] = 1 - flickering[31:33, -1]
+    bits = LAYOUT.pick(finished([flickering[1:]], 40), "contacts") > 0.5
+    inner = bits[:-4]
+    assert torch.equal(without_short_runs(inner, 3)[3:-3], inner[3:-3])
+    assert torch.equal(~without_short_runs(~inner, 3)[3:-3], inner[3:-3])
+
+
+def test_too_few_frames_to_look_ahead_are_refused():
+    with pytest.raises(RequestError, match="needs 12 more frames"):
+        finished([clip()[1:28]], 21 + 6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_latents_are_what_rolls_out_to_the_motion(seed):
+    model, frames = tiny_model(seed=seed).double(), clip(20).double()
+    state = model.initial_state(frames[:1])
+    plan, noise = model.latents(frames[None, 1:], state)
+    rebuilt, _ = model.rollout(state, noise, plan)
+    torch.testing.assert_close(rebuilt[0], frames[1:], atol=1e-8, rtol=1e-8)
+
+
+def test_a_guide_that_is_all_that_is_wished_comes_back():
+    guide = clip(13)[1:]
+    state = DENSITY.initial_state(clip(13)[:1])
+    context = Context(DENSITY, state, Place.origin(), torch.zeros(0, 21, 3), 12)
+    exact = GuidedMethod(guide, share=1.0)
+    tail = torch.zeros(0, LAYOUT.continuous)
+    solved = exact(context, [Closeness(guide)], tail, generator())
+    assert float((solved.trial.features[0] - guide).abs().max()) < 1e-3
+    assert torch.equal(solved.trial.contacts[0], guide[:, -2:] > 0.5)
+    pulled = GuidedMethod(guide, share=0.5)(context, [Closeness(guide), Footing()], tail, generator())
+    assert pulled.energy < pulled.start_energy
