@@ -1,7 +1,7 @@
 """`mapctl train refiner`: the options of `mapctl train` that a refiner has, and the run."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,8 +31,9 @@ def request(given: "Train") -> "RefinerRequest":
     from priors.training.refiner import PAPER, AdversarialSettings
     from priors.training.refiner_run import RefinerConfig, RefinerRequest
 
+    defaults = {option.name: option.default for option in fields(given)}
     for name in _OF_A_DENSITY:
-        if getattr(given, name):
+        if getattr(given, name) != defaults[name]:
             raise RequestError(f"--{name.replace('_', '-')} is for lstm-gmm; a refiner has no such option")
     if given.device == "cuda":
         raise RequestError("a refiner is trained on the processor; leave --device out")

@@ -1,5 +1,6 @@
 """Adversarial training of the refiner: rnn paper, sections 4.2.1 and 4.2.2, with departures kept as settings."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -61,11 +62,11 @@ class AdversarialSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        for name in ("rounds", "window", "batch", "refiner_updates", "critic_updates", "most_updates"):
+        for name in ("rounds", "batch", "refiner_updates", "critic_updates", "most_updates"):
             if getattr(self, name) < 1:
                 raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.window < 2:
-            raise RequestError(f"window must be at least 2, got {self.window}: the critic sees velocities")
+        if self.window < (least := 2 * self.critic_around + 2):
+            raise RequestError(f"window must be at least {least}, got {self.window}: the critic needs them to see one")
         if self.history < self.batch or self.batch < 2:
             raise RequestError(f"the history must hold a batch of 2 or more, got {self.history} for {self.batch}")
         if self.optimiser not in ("adam", "rmsprop"):
@@ -93,6 +94,11 @@ class Losses:
     """Share of the critic's batch that it told apart."""
     updates: int
     """Of the refiner."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether training has not diverged."""
+        return math.isfinite(self.refiner) and math.isfinite(self.critic)
 
 
 class AdversarialTrainer:

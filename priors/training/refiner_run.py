@@ -6,7 +6,7 @@ A guard watches held-out samples: the best refiner seen is kept, and training st
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -25,10 +25,13 @@ from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
 from priors.training import corpus as corpora
 from priors.training import run_files
 from priors.training.corpus import Corpus
-from priors.training.refiner import AdversarialSettings, AdversarialTrainer
+from priors.training.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
+
+Row = dict[str, float | None]
+"""Measures of held-out samples; None stands for what is not finite."""
 
 _WARM_UP = 60  # frames of a clip that the density has seen before it is let go
 _WON = 0.98  # share that the critic tells apart, over a report, from which it has won
@@ -131,7 +134,8 @@ class Judge:
         refined = refiner.refine(self.raw)
         network.train()
         means = _means(list(refined))
-        row = {f"{name}_ratio": means[name] / self.mocap[name] for name in ("contact_speed_cm_s", "jitter_m_s3")}
+        row = {f"{name}_ratio": means[name] / self.mocap[name]
+               for name in ("contact_speed_cm_s", "jitter_m_s3") if self.mocap[name] > 0}  # fmt: skip
         if min(len(refined), len(self.windows)) >= self.settings.fewest_clips:
             made = [clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
                     for clip in refined]  # fmt: skip
@@ -142,10 +146,16 @@ class Judge:
         return row
 
 
-def score(row: dict[str, float]) -> float:
-    """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart."""
-    ratios = [abs(math.log(value)) for name, value in row.items() if name.endswith("_ratio") and value > 0]
-    return sum(ratios) + 2 * max(0.0, row.get("told_apart", 0.5) - 0.5)
+def score(row: Mapping[str, float | None]) -> float:
+    """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart.
+
+    Infinite where a measure cannot be had, as of feet that never touch the floor.
+    """
+    ratios = [value or math.nan for name, value in row.items() if name.endswith("_ratio")]
+    if not all(value > 0 for value in ratios):
+        return math.inf
+    told = row.get("told_apart") or 0.0
+    return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, told - 0.5)
 
 
 _NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.of_layout())
@@ -158,35 +168,33 @@ class _Run:
         self, request: RefinerRequest, trainer: AdversarialTrainer, judge: Judge, data: dict, progress: Progress
     ):
         self.request, self.trainer, self.judge, self.data, self.progress = request, trainer, judge, data, progress
-        self.curve: list[dict[str, float]] = []
+        self.curve: list[Row] = []
+        self.losses: list[Losses] = []  # since the last line of news
         self.best = {name: value.clone() for name, value in trainer.refiner.state_dict().items()}
         if request.resume:
             self._load()
             progress(f"resumed at round {trainer.round}")
         else:
             request.out.mkdir(parents=True, exist_ok=True)
-            self._judge([])
+            self._judge()
 
     def go(self) -> None:
         """To the end of the recipe, or until one side has won."""
         request, trainer = self.request, self.trainer
-        saved, losses, began = time.monotonic(), [], time.monotonic()
+        saved = began = time.monotonic()
         while trainer.round < request.settings.rounds:
-            losses.append(trainer.train_round())
+            self.losses.append(trainer.train_round())
             last = trainer.round == request.settings.rounds
-            if trainer.round % request.report_rounds == 0 or last:
-                told = sum(loss.told for loss in losses) / len(losses)
-                self.progress(
-                    f"round {trainer.round}: refiner {_mean(losses, 'refiner'):.3f}, critic"
-                    f" {_mean(losses, 'critic'):.3f} nats, {told:.2f} told apart, {losses[-1].updates} updates,"
-                    f" {time.monotonic() - began:.0f} s"
-                )
-                if told > _WON and len(losses) >= request.report_rounds:
-                    self.progress("the critic has won: training ends with the best refiner seen")
-                    break
-                if trainer.round % request.judge_rounds == 0 or last:
-                    self._judge(losses)
-                losses = []
+            report = last or trainer.round % request.report_rounds == 0
+            if report:
+                self._report(time.monotonic() - began)
+            if (verdict := self._verdict()) is not None:
+                self.progress(f"{verdict}: training ends with the best refiner seen")
+                break
+            if last or (report and trainer.round % request.judge_rounds == 0):
+                self._judge()
+            if report:
+                self.losses = []
             if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
                 self._save()
                 saved = time.monotonic()
@@ -204,18 +212,36 @@ class _Run:
         checkpoints.save(self.best, card, path)
         return path
 
-    def _judge(self, losses: list) -> None:
+    def _report(self, seconds: float) -> None:
+        self.progress(
+            f"round {self.trainer.round}: refiner {self._mean('refiner'):.3f}, critic {self._mean('critic'):.3f} nats,"
+            f" {self._mean('told'):.2f} told apart, {self.losses[-1].updates} updates, {seconds:.0f} s"
+        )
+
+    def _verdict(self) -> str | None:
+        """Why to stop, if there is a reason."""
+        if not self.losses[-1].finite:
+            return f"training diverged at round {self.trainer.round}"
+        if len(self.losses) >= self.request.report_rounds and self._mean("told") > _WON:
+            return "the critic has won"
+        return None
+
+    def _judge(self) -> None:
         row = self.judge(self.trainer.refiner)
         if not self.curve or score(row) < min(score(before) for before in self.curve):
             self.best = {name: value.clone() for name, value in self.trainer.refiner.state_dict().items()}
         row |= {"round": self.trainer.round, "score": score(row)}
-        row |= {f"{kind}_loss": _mean(losses, kind) for kind in ("refiner", "critic") if losses}
-        self.curve.append(row)
-        self.progress(json.dumps(row))
+        row |= {f"{kind}_loss": self._mean(kind) for kind in ("refiner", "critic") if self.losses}
+        self.curve.append({name: value if math.isfinite(value) else None for name, value in row.items()})
+        self.progress(json.dumps(self.curve[-1]))
+
+    def _mean(self, kind: str) -> float:
+        return sum(getattr(loss, kind) for loss in self.losses) / len(self.losses)
 
     def _save(self) -> None:
         tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
-        run_files.write(self.request.out, step=self.trainer.round, tensors=tensors, index=self._index())
+        index = self._index() | {"losses": [asdict(loss) for loss in self.losses]}
+        run_files.write(self.request.out, step=self.trainer.round, tensors=tensors, index=index)
 
     def _index(self) -> dict:
         request = self.request
@@ -229,6 +255,7 @@ class _Run:
             for part in ("settings", "network", "data"):
                 run_files.check_same(out, part, then=index[part], now=self._index()[part])
             self.curve = [dict(row) for row in index["curve"]]
+            self.losses = [Losses(**row) for row in index["losses"]]
             self.best = {name: tensors[f"best.{name}"] for name in self.best}
             self.trainer.load_state(tensors)
         except run_files.BROKEN as error:
@@ -237,11 +264,14 @@ class _Run:
 
 def command(request: RefinerRequest) -> str:
     """What to type for the same run, for the card; options that are the defaults are left out."""
+    paper, wanted = request.config == PAPER[0], request.settings
+    default = PAPER[1] if paper else AdversarialSettings()
     parts = [f"mapctl train refiner --data DATA -o RUN --density {request.density}"]
-    wanted, default = request.settings, AdversarialSettings()
-    parts += [f"--steps {wanted.rounds}"] if wanted.rounds != default.rounds else []
-    parts += [f"--seed {wanted.seed}"] if wanted.seed != default.seed else []
-    return " ".join(parts + (["--bfloat16"] if wanted.bfloat16 else []))
+    parts += [f"--match '{request.match}'"] if request.match is not None else []
+    for option, name in (("steps", "rounds"), ("batch", "batch"), ("window", "window"), ("seed", "seed")):
+        if getattr(wanted, name) != getattr(default, name):
+            parts.append(f"--{option} {getattr(wanted, name)}")
+    return " ".join(parts + ["--bfloat16"] * wanted.bfloat16 + ["--paper"] * paper)
 
 
 def _check(request: RefinerRequest) -> None:
@@ -259,7 +289,3 @@ def _check(request: RefinerRequest) -> None:
 def _means(clips: list[Tensor]) -> dict[str, float]:
     rows = [measure(decode(clip, Place.origin())) for clip in clips]
     return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}
-
-
-def _mean(losses: list, kind: str) -> float:
-    return sum(getattr(loss, kind) for loss in losses) / len(losses)

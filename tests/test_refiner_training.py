@@ -1,0 +1,321 @@
+"""Adversarial training of the refiner: losses against their formulas, the history, the balance, and learning."""
+
+import math
+from dataclasses import asdict, replace
+from functools import cache
+
+import pytest
+import torch
+from helpers import corpus, generator, walks
+from torch.nn.functional import logsigmoid
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, Place, decode, encode, mirror_features
+from priors.refiner import RefinerConfig
+from priors.training import refiner as training
+from priors.training.adversary import History
+from priors.training.corpus import Corpus
+from priors.training.refiner import AdversarialSettings, AdversarialTrainer
+
+TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
+SETTINGS = AdversarialSettings(rounds=5, window=12, batch=4, warm_up=2, head_start=0, critic_updates=1, history=10,
+                               critic_width=8, critic_around=1, refiner_rate=1e-3, critic_rate=1e-3)  # fmt: skip
+SIZE = LAYOUT.continuous
+
+captured = cache(corpus)
+
+
+@cache
+def trembling() -> Corpus:
+    """Other walks, every joint shaken from frame to frame: obviously not captured."""
+    clips = [encode(motion)[0].float() for motion in walks(3, 60)]
+    joints = LAYOUT.slices["joint_rotations"]
+    for number, clip in enumerate(clips):
+        clip[:, joints] += 0.1 * torch.randn(clip[:, joints].shape, generator=generator(number))
+    return Corpus(("a", "b", "c"), (60,) * 3, torch.cat(clips))
+
+
+def trainer_of(config=TINY, **changes):
+    return AdversarialTrainer(config, replace(SETTINGS, **changes), captured(), trembling())
+
+
+def trained(trainer, rounds=2):
+    """Past the first steps, so that no weight is zero any more."""
+    for _ in range(rounds):
+        trainer.train_round()
+    return trainer
+
+
+def drawn_next(trainer, draw):
+    """What the trainer would draw, its generator left where it was."""
+    state = trainer.generator.get_state()
+    try:
+        return draw()
+    finally:
+        trainer.generator.set_state(state)
+
+
+def gradient(model):
+    return torch.cat([weight.grad.flatten() for weight in model.parameters()])
+
+
+def slopes(loss, model):
+    """By autograd, clipped to the norm that training allows."""
+    flat = torch.cat([slope.flatten() for slope in torch.autograd.grad(loss, list(model.parameters()))])
+    return flat * min(1.0, 5.0 / float(flat.norm()))
+
+
+@pytest.mark.parametrize("root", [0.0, 20.0])
+def test_the_refiner_follows_equations_9_and_13(root):
+    """-ln D of what it made, and the squared distance of the decoded hips' ways."""
+    trainer = trained(trainer_of(root=root))
+    raw = drawn_next(trainer, trainer._raw)
+    made, _ = trainer.refiner(raw)
+    adversarial = -logsigmoid(trainer.critic(made)).mean()
+    trainer.refiner.zero_grad()
+    ways = [torch.stack([way_of(clip) for clip in batch]) for batch in (raw[:, 2:-1], made)]
+    total = adversarial + root * (ways[0] - ways[1]).square().sum(-1).mean()
+    expected = slopes(total, trainer.refiner)
+    assert trainer._refine() == pytest.approx(adversarial.item(), rel=1e-5)
+    torch.testing.assert_close(gradient(trainer.refiner), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-3)
+
+
+def way_of(features):
+    """Hips in the world, (frames, 3), written out: a step of (x, z) is taken in the heading before it."""
+    turns = features[:, 2]
+    heading = torch.cumsum(turns, 0) - turns
+    x, z = features[:, 0], features[:, 1]
+    steps = torch.stack([x * heading.cos() + z * heading.sin(), z * heading.cos() - x * heading.sin()], -1)
+    ground = torch.cumsum(steps, 0)
+    return torch.stack([ground[:, 0], features[:, 3], ground[:, 1]], -1)
+
+
+def test_the_roots_distance_is_that_of_the_decoded_motions():
+    before, after = captured().clips()[0][None, :30], captured().clips()[2][None, :25]
+    hips = [decode(clip[0], Place.origin()).root_position[:25] for clip in (before, after)]
+    expected = float((hips[0] - hips[1]).square().sum(-1).mean())
+    assert expected > 0.01
+    assert float(training._root_distance(before, after)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_critic_follows_equation_10_on_as_many_captured_as_made():
+    trainer = trained(trainer_of())
+    history = History(trainer.history.windows)
+
+    def batch():
+        with torch.no_grad():
+            fresh = trainer.refiner(trainer._raw())[0]
+        made = history.mix(fresh, trainer.generator)
+        return trainer._windows(trainer.corpus, trainer.captured, SETTINGS.window), made
+
+    real, made = drawn_next(trainer, batch)
+    odds = trainer.critic(real), trainer.critic(made)
+    both = -(logsigmoid(odds[0]).mean() + (1 - torch.sigmoid(odds[1])).log().mean())
+    told = [*(odds[0].mean(1) > 0).tolist(), *(odds[1].mean(1) < 0).tolist()]
+    expected = slopes(both / 2, trainer.critic)
+    loss, share = trainer._criticise()
+    assert loss == pytest.approx(both.item() / 2, rel=1e-5)
+    assert share == pytest.approx(sum(told) / len(told))
+    torch.testing.assert_close(gradient(trainer.critic), expected, atol=1e-5 * float(expected.abs().max()), rtol=1e-3)
+
+
+@pytest.mark.parametrize("side", ["refiner", "critic"])
+def test_an_update_of_one_side_leaves_the_other_alone(side):
+    trainer = trained(trainer_of())
+    before = {name: value.clone() for name, value in trainer.state().items()}
+    (trainer._refine if side == "refiner" else trainer._criticise)()
+    after = trainer.state()
+    moved = {name.split(".")[0].split("-")[0] for name in after if not torch.equal(before[name], after[name])}
+    assert moved - {"generator", "history"} == {side}
+
+
+@pytest.mark.parametrize(("size", "batch"), [(10, 4), (4, 4), (9, 5), (2, 2)])
+def test_the_history_keeps_its_size_and_gives_half(size, batch):
+    kept = torch.arange(size).float()[:, None, None].expand(-1, 3, LAYOUT.size).clone()
+    history = History(kept)
+    drawn = generator(3)
+    for turn in range(6):
+        before = set(history.windows[:, 0, 0].tolist())
+        fresh = (100.0 * (turn + 1) + torch.arange(batch))[:, None, None].expand(-1, 3, LAYOUT.size)
+        mixed = history.mix(fresh, drawn)[:, 0, 0].tolist()
+        half = batch // 2
+        assert mixed[: batch - half] == fresh[: batch - half, 0, 0].tolist()
+        assert len(set(mixed[batch - half :])) == half
+        assert set(mixed[batch - half :]) <= before
+        after = set(history.windows[:, 0, 0].tolist())
+        assert len(after) == len(history.windows) == size
+        assert after - before == set(fresh[:half, 0, 0].tolist())
+    assert float(kept.max()) < 100  # what was given is the caller's
+
+
+def test_the_history_begins_with_what_the_refiner_makes():
+    trainer = trainer_of()
+    assert trainer.history.windows.shape == (10, 12, LAYOUT.size)
+    places = {tuple(row[:5].tolist()) for clip in (trembling().features, mirror_features(trembling().features))
+              for row in clip}  # fmt: skip
+    kept = trainer.history.windows[..., :5].flatten(0, 1)
+    assert all(tuple(row) in places for row in kept.tolist())  # an untrained refiner changes nothing
+
+
+@pytest.mark.parametrize(("loss", "updates"), [(0.0099, [2, 4, 5, 5]), (0.0101, [2, 2, 2, 2]), (0.99, [2, 2, 2, 2]),
+                                               (1.01, [2, 1, 1, 1])])  # fmt: skip
+def test_the_balance_doubles_and_halves_at_the_stated_losses(monkeypatch, loss, updates):
+    trainer = trainer_of(warm_up=0, refiner_updates=2, most_updates=5)
+    counts = {"refine": 0}
+
+    def refine():
+        counts["refine"] += 1
+        return 0.5
+
+    monkeypatch.setattr(trainer, "_refine", refine)
+    monkeypatch.setattr(trainer, "_criticise", lambda: (loss, 0.75))
+    found = [trainer.train_round() for _ in updates]
+    assert [row.updates for row in found] == updates
+    assert counts["refine"] == sum(updates)
+    assert asdict(found[0]) == {"refiner": 0.5, "critic": loss, "told": 0.75, "updates": 2}
+
+
+def test_the_head_start_is_the_critics_and_the_warm_up_of_both_and_both_come_once(monkeypatch):
+    trainer = trainer_of(head_start=3, warm_up=4, refiner_updates=2, critic_updates=3)
+    steps = []
+    monkeypatch.setattr(trainer, "_refine", lambda: steps.append("r") or 0.5)
+    monkeypatch.setattr(trainer, "_criticise", lambda: steps.append("c") or (0.5, 0.5))
+    trainer.train_round()
+    trainer.train_round()
+    assert "".join(steps) == "ccc" + "rc" * 4 + "rrccc" * 2
+    assert trainer.round == 2
+
+
+def test_a_rounds_losses_are_means_of_its_updates(monkeypatch):
+    trainer = trainer_of(warm_up=0, refiner_updates=2, critic_updates=2)
+    refined, judged = iter([0.2, 0.6]), iter([(0.5, 1.0), (0.7, 0.5)])
+    monkeypatch.setattr(trainer, "_refine", lambda: next(refined))
+    monkeypatch.setattr(trainer, "_criticise", lambda: next(judged))
+    found = trainer.train_round()
+    assert (found.refiner, found.critic, found.told) == pytest.approx((0.4, 0.6, 0.75))
+
+
+def test_the_critic_learns_to_tell_obviously_different_windows():
+    trainer = trainer_of(critic_rate=1e-2)
+    first = [trainer._criticise() for _ in range(4)]
+    for _ in range(40):
+        trainer._criticise()
+    last = [trainer._criticise() for _ in range(4)]
+    assert sum(loss for loss, _ in first) / 4 == pytest.approx(math.log(2), abs=0.15)
+    assert sum(loss for loss, _ in last) / 4 < 0.2
+    assert sum(told for _, told in last) / 4 > 0.95
+
+
+@cache
+def critic_that_knows():
+    """What a trained critic is made of."""
+    trainer = trainer_of(critic_rate=1e-2)
+    for _ in range(40):
+        trainer._criticise()
+    return trainer.critic.state_dict()
+
+
+@pytest.mark.parametrize("root", [0.0, 1e4])
+def test_the_refiner_lowers_its_loss_and_keeps_the_roots_way_where_that_weighs_much(root):
+    trainer = trainer_of(replace(TINY, limit=3.0), refiner_rate=2e-2, root=root)
+    trainer.critic.load_state_dict(critic_that_knows())
+    losses = [trainer._refine() for _ in range(40)]
+    raw = drawn_next(trainer, trainer._raw)
+    with torch.no_grad():
+        metres = float(training._root_distance(raw[:, 2:], trainer.refiner(raw)[0])) ** 0.5
+    if root:
+        assert metres < 0.02
+    else:
+        assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
+        assert metres > 0.05
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "rmsprop"])
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_rounds_go_on_from_a_state_to_the_bit(optimiser, bfloat16):
+    changes = {"optimiser": optimiser, "bfloat16": bfloat16}
+    whole = trained(trainer_of(**changes), 2)
+    state = {name: value.clone() for name, value in whole.state().items()}
+    resumed = trainer_of(**changes)
+    resumed.load_state(state)
+    assert [whole.train_round() for _ in range(3)] == [resumed.train_round() for _ in range(3)]
+    assert whole.state().keys() == resumed.state().keys()
+    for name, value in whole.state().items():
+        assert torch.equal(resumed.state()[name], value), name
+    assert {weight.dtype for weight in whole.refiner.parameters()} == {torch.float32}
+
+
+@pytest.mark.parametrize("drop", ["refiner-optimiser.0.exp_avg", "critic-optimiser.3.", "generator", "history",
+                                  "critic.last.bias"])  # fmt: skip
+def test_a_state_that_is_not_whole_is_refused(drop):
+    state = trained(trainer_of(), 1).state()
+    partial = {name: value for name, value in state.items() if not name.startswith(drop)}
+    assert len(partial) < len(state)
+    with pytest.raises((KeyError, RuntimeError)):
+        trainer_of().load_state(partial)
+
+
+def test_the_same_seed_gives_the_same_and_the_callers_random_numbers_are_left_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    first = trained(trainer_of())
+    assert torch.equal(torch.rand(3), expected)
+    again, other = trained(trainer_of()), trained(trainer_of(seed=2))
+    assert torch.equal(first.refiner.last.weight, again.refiner.last.weight)
+    assert not torch.equal(first.refiner.last.weight, other.refiner.last.weight)
+
+
+def test_windows_of_both_kinds_are_mirrored_with_even_odds():
+    trainer = trainer_of(batch=200, history=200)
+    drawn = trainer._windows(captured(), torch.tensor([7]), 12)
+    plain = captured().features[7:19]
+    mirrored = int((drawn == mirror_features(plain)).all(-1).all(-1).sum())
+    assert mirrored + int((drawn == plain).all(-1).all(-1).sum()) == 200
+    assert 70 < mirrored < 130
+
+
+def test_the_critic_sees_bits_and_end_effectors_but_not_where_a_window_stands():
+    critic = trainer_of().critic.double()
+    windows = captured().features[:24].double().unflatten(0, (2, 12))
+    odds = critic(windows)
+    assert odds.shape == (2, 12 - 1 - 2)  # a velocity, and a frame on either side
+    moved = windows.clone()
+    moved[:, 0, :3] += 0.5  # the way to the first frame
+    torch.testing.assert_close(critic(moved), odds, atol=1e-9, rtol=0)
+    for block in ("contacts", "joint_rotations"):
+        other = windows.clone()
+        other[:, 5, LAYOUT.slices[block]] += 0.3
+        assert float((critic(other) - odds).detach().abs().min()) > 0  # in both directions of time
+
+
+def test_statistics_are_of_the_captured_clips_with_floors():
+    network = trainer_of().refiner
+    features = captured().features
+    torch.testing.assert_close(network.mean[:SIZE], features.mean(0)[:SIZE])
+    assert network.mean[SIZE:].tolist() == network.std[SIZE:].tolist() == [0.5, 0.5]
+    assert float(network.std.min()) == pytest.approx(0.002)
+    heights = [decode(clip, Place.origin()).joint_positions()[:, 0, 1] for clip in captured().clips()]
+    assert float(network.reach_mean[1]) == pytest.approx(float(torch.cat(heights).mean()), abs=0.01)
+    assert float(network.reach_std.min()) == pytest.approx(0.01)  # of the hips, which stay above themselves
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"rounds": 0}, "rounds must be at least 1, got 0"), ({"batch": 0}, "batch must be at least 1"),
+    ({"refiner_updates": 0}, "refiner_updates"), ({"critic_updates": 0}, "critic_updates"),
+    ({"most_updates": 0}, "most_updates"), ({"batch": 1}, "batch of 2 or more"),
+    ({"history": 3}, "must hold a batch of 2 or more, got 3 for 4"),
+    ({"window": 3}, "window must be at least 4, got 3"), ({"optimiser": "sgd"}, "adam or rmsprop, got 'sgd'"),
+])  # fmt: skip
+def test_impossible_recipes_are_refused(change, said):
+    with pytest.raises(RequestError, match=said):
+        replace(SETTINGS, **change)
+
+
+def test_the_shortest_window_allowed_can_be_judged():
+    assert trained(trainer_of(window=4)).train_round().finite
+
+
+def test_samples_shorter_than_a_window_are_refused():
+    with pytest.raises(RequestError, match="no clip is as long as the window of 61 frames"):
+        trainer_of(window=58)
