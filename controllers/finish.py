@@ -45,9 +45,9 @@ class FinishSettings:
 
 
 def finish(
-    prior: Any, pieces: Iterable[Float[Tensor, "frames size"]], *, frames: int, state: Any, generator: torch.Generator,
+    prior: Any, pieces: Iterable[Float[Tensor, "_ size"]], *, frames: int, state: Any, generator: torch.Generator,
     settings: FinishSettings | None = None, skeleton: Skeleton = CANONICAL,
-) -> Iterator[Float[Tensor, "frames size"]]:  # fmt: skip
+) -> Iterator[Float[Tensor, "_ size"]]:  # fmt: skip
     """Finished features of the first `frames` of consecutive pieces, their contact labels steadied.
 
     `state` is the density's before the first frame (batch of one). Windows look ahead, so the pieces must hold

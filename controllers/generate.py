@@ -57,7 +57,7 @@ def stream(
 def stream_features(
     prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
     start_clip: Motion | None = None, refiner: Refiner | None = None,
-) -> Iterator[Float[Tensor, "piece size"]]:  # fmt: skip
+) -> Iterator[Float[Tensor, "_ size"]]:  # fmt: skip
     """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
     return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner)[0]
 
@@ -114,7 +114,7 @@ def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[in
 def _begun(
     prior: Any, seconds: float, generator: torch.Generator, settings: GenerateSettings, clip: Motion | None,
     refiner: Refiner | None,
-) -> tuple[Iterator[Float[Tensor, "piece size"]], Place]:  # fmt: skip
+) -> tuple[Iterator[Float[Tensor, "_ size"]], Place]:  # fmt: skip
     """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
@@ -130,14 +130,14 @@ def _begun(
 
 def _drawn(
     prior: Any, state: Any, generator: torch.Generator, temperature: float
-) -> Iterator[Float[Tensor, "piece size"]]:
+) -> Iterator[Float[Tensor, "_ size"]]:
     """Draws without end."""
     while True:
         features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
         yield features[0]
 
 
-def _in_chunks(pieces: Iterable[Float[Tensor, "piece size"]], frames: int) -> Iterator[Float[Tensor, "chunk size"]]:
+def _in_chunks(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:
     """The first `frames` frames, _CHUNK at a time."""
     held = None
     for piece in pieces:
@@ -149,7 +149,7 @@ def _in_chunks(pieces: Iterable[Float[Tensor, "piece size"]], frames: int) -> It
                 return
 
 
-def _decoded(pieces: Iterator[Float[Tensor, "piece size"]], place: Place) -> Iterator[Motion]:
+def _decoded(pieces: Iterator[Float[Tensor, "_ size"]], place: Place) -> Iterator[Motion]:
     for features in pieces:
         yield decode(features, place)
         ground, heading = root_places(features.double(), place)

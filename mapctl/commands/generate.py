@@ -32,7 +32,7 @@ class Generate:
     count: options.Count = 1
     """How many clips."""
     seed: options.Count = 0
-    """Of everything random; each clip draws its own seed from it, and their starts are spread over the data's speeds."""
+    """Of everything random; each clip draws its own seed from it. Their starts are spread over the data's speeds."""
     temperature: options.Number = 1.0
     """Spread of the draws, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
     start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
