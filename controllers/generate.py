@@ -128,9 +128,7 @@ def _begun(
     return _in_chunks(pieces, frames), place
 
 
-def _drawn(
-    prior: Any, state: Any, generator: torch.Generator, temperature: float
-) -> Iterator[Float[Tensor, "_ size"]]:
+def _drawn(prior: Any, state: Any, generator: torch.Generator, temperature: float) -> Iterator[Float[Tensor, "_ size"]]:
     """Draws without end."""
     while True:
         features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
