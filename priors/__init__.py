@@ -21,9 +21,11 @@ def load_refiner(name: str) -> "LstmRefiner":
     return refiner.load(name)
 
 
-def refiner_of(prior: str) -> "LstmRefiner | None":
-    """The bundled refiner of a bundled prior, if it has one."""
+def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":
+    """The refiner of that name; for `auto` the bundled one of a bundled prior, if it has one."""
     from priors import checkpoints
 
-    name = f"{prior}-refiner"
-    return load_refiner(name) if name in checkpoints.bundled() else None
+    if name != "auto":
+        return load_refiner(name)
+    own = f"{prior}-refiner"
+    return load_refiner(own) if own in checkpoints.bundled() else None

@@ -131,7 +131,11 @@ def test_generate_writes_different_clips(prior, tmp_path):
     assert [clip.name for clip in clips] == [f"generated_00{k}.bvh" for k in range(3)]
     assert {mapctl.load(clip).num_frames for clip in clips} == {45}
     assert len({clip.read_bytes() for clip in clips}) == 3
-    for name, words, same in (("one", (), True), ("raw", ("--no-refine",), False)):
+    for name, words, same in (
+        ("one", (), True),
+        ("raw", ("--no-refine",), False),
+        ("sliding", ("--no-footing",), False),
+    ):
         assert run("generate", "-o", tmp_path / name, "--seconds", 1.5, "--prior", prior, *words) == 0
         assert ((tmp_path / name / "generated_000.bvh").read_bytes() == clips[0].read_bytes()) is same
 

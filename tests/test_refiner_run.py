@@ -153,7 +153,7 @@ def scripted(monkeypatch):
         def train_round(trainer):
             step(trainer)
             with torch.no_grad():
-                trainer.refiner.last.bias.fill_(trainer.round)
+                trainer.averaged.last.bias.fill_(trainer.round)
             return losses(trainer.round)
 
         def judged(judge, network):
@@ -251,7 +251,6 @@ def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_
     quick = RealismSettings(classifier=ClassifierSettings(folds=2, steps=5, width=4, batch=8), dims=2)
     trainer = AdversarialTrainer(TINY, SETTINGS, parts.train, raw)
     row = refiner_run.Judge.of(raw, parts, quick)(trainer.refiner)
-    assert trainer.refiner.training
     assert row["jitter_m_s3_ratio"] == pytest.approx(1, abs=1e-3)  # the very same clips
     assert row["contact_speed_cm_s_ratio"] == pytest.approx(1, abs=1e-3)
     assert "told_apart" not in row  # two clips are too few

@@ -11,15 +11,18 @@ from torch.nn.functional import logsigmoid
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place, decode, encode, mirror_features
+from priors.end_effectors import channels
 from priors.refiner import RefinerConfig
 from priors.training import refiner as training
-from priors.training.adversary import History
+from priors.training.adversary import Critic, History
 from priors.training.corpus import Corpus
-from priors.training.refiner import AdversarialSettings, AdversarialTrainer
+from priors.training.matching import compare
+from priors.training.refiner import MOMENTS, AdversarialSettings, AdversarialTrainer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
 SETTINGS = AdversarialSettings(rounds=5, window=12, batch=4, warm_up=2, head_start=0, critic_updates=1, history=10,
-                               critic_width=8, critic_around=1, refiner_rate=1e-3, critic_rate=1e-3)  # fmt: skip
+                               critic_width=8, critic_around=1, moments=0.0, refiner_rate=1e-3,
+                               critic_rate=1e-3)  # fmt: skip
 SIZE = LAYOUT.continuous
 
 captured = cache(corpus)
@@ -126,7 +129,8 @@ def test_an_update_of_one_side_leaves_the_other_alone(side):
     (trainer._refine if side == "refiner" else trainer._criticise)()
     after = trainer.state()
     moved = {name.split(".")[0].split("-")[0] for name in after if not torch.equal(before[name], after[name])}
-    assert moved - {"generator", "history"} == {side}
+    kept = {"averaged"} if side == "refiner" else set()
+    assert moved - {"generator", "history"} == {side} | kept
 
 
 @pytest.mark.parametrize(("size", "batch"), [(10, 4), (4, 4), (9, 5), (2, 2)])
@@ -319,3 +323,53 @@ def test_the_shortest_window_allowed_can_be_judged():
 def test_samples_shorter_than_a_window_are_refused():
     with pytest.raises(RequestError, match="no clip is as long as the window of 61 frames"):
         trainer_of(window=58)
+
+
+def test_the_critic_can_see_slow_feet_magnified():
+    """A creep over the ground of 3 cm/s moves what the critic sees far more where it is magnified."""
+    windows = captured().features[:20][None]
+    crept = windows.clone()
+    crept[..., LAYOUT.slices["root_displacement_heading"]] += 0.001
+    seen = {}
+    for slow in (0.0, 0.05):
+        reach, rows = torch.zeros(channels(TINY.joints)), []
+        critic = Critic(TINY.joints, width=6, around=0, slow=slow, reach_mean=reach, reach_std=reach + 1)
+        critic.first.register_forward_pre_hook(lambda _, given, rows=rows: rows.append(given[0]))
+        for given in (windows, crept):
+            critic(given)
+        seen[slow] = float((rows[1] - rows[0]).abs().amax())
+    assert seen[0.05] > 3 * seen[0.0]
+
+
+def test_what_is_kept_is_the_running_mean_of_the_weights():
+    last, mean = (trained(trainer_of(average=average), rounds=1) for average in (0.0, 0.9))
+    for name, value in last.refiner.state_dict().items():
+        assert torch.equal(value, last.averaged.state_dict()[name])
+    kept, latest = (model.last.weight.detach().norm() for model in (mean.averaged, mean.refiner))
+    assert 0 < float(kept) < 0.7 * float(latest)
+
+
+def test_moments_alone_bring_feet_and_jerk_nearer_to_the_captured():
+    """Against a critic that says the same of everything."""
+    trainer = trainer_of(moments=10.0, refiner_rate=1e-2)
+    torch.nn.init.zeros_(trainer.critic.last.weight)
+    given, real = torch.stack(trembling().clips())[:, :40], torch.stack(captured().clips())[:, :40]
+
+    def mismatch():
+        with torch.no_grad():
+            refined = trainer.refiner(given)[0]
+            return float(compare(refined, real[: len(refined), : refined.shape[1]], MOMENTS))
+
+    before = mismatch()
+    for _ in range(90):
+        trainer._refine()
+    assert mismatch() < 0.95 * before
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"moments": 1.0, "window": 7}, "window must be at least 8 for moments to be compared, got 7"),
+    ({"average": 1.0}, r"average must lie in \[0, 1\), got 1"),
+])  # fmt: skip
+def test_impossible_moments_and_means_are_refused(change, message):
+    with pytest.raises(RequestError, match=message):
+        replace(SETTINGS, **change)

@@ -29,6 +29,8 @@ class Bench:
     """For `generation`: the folder that the prior was trained on; its held-out clips are looked up there."""
     count: options.Count = 48
     """For `generation`: clips of 10 s to draw."""
+    refiner: options.Name = "auto"
+    """For `generation`: a bundled refiner, or the file or run folder of a trained one; auto is the prior's own."""
     json: bool = False
     """Print JSON instead of a table."""
 
@@ -65,4 +67,6 @@ class Bench:
             raise RequestError(f"{self.data} does not hold the clips kept from training: {lost}")
         mocap = [retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS) for path in paths]
         mocap = [clip for clip in mocap if clip.num_frames > PRIOR_FPS]
-        return generation(prior, priors.refiner_of(self.prior), mocap, GenerationSettings(count=self.count))
+        return generation(
+            prior, priors.refiner_of(self.prior, self.refiner), mocap, GenerationSettings(count=self.count)
+        )

@@ -1,6 +1,7 @@
 """Adversarial training of the refiner: rnn paper, sections 4.2.1 and 4.2.2, with departures kept as settings."""
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,11 @@ from priors.refiner import RefinerConfig, RefinerNetwork
 from priors.training import run_files
 from priors.training.adversary import Critic, History
 from priors.training.corpus import Corpus, window_starts
+from priors.training.matching import MatchingSettings, compare
+
+MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)
+"""That a refiner is held to, as pieces of a window show them."""
+_SHORTEST = 8  # frames of a window that moments can be had of
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,13 @@ class AdversarialSettings:
     """Units of the critic's layers (the paper's 500)."""
     critic_around: int = 2
     """Frames on either side that its first layer sees (the paper's 0): tremble is a matter of three frames."""
+    critic_slow: float = 0.05
+    """Ground speed of feet, m/s, below which the critic sees it magnified; 0 (the paper's) leaves that out."""
+    moments: float = 10.0
+    """Weight of feet, jerk and spread as they are in captured windows (see matching.compare; the paper's 0). The
+    critic alone lets feet slide twice as fast while it is still learning to see them."""
+    average: float = 0.99
+    """Share of the past in the running mean of the refiner's weights, which is what is kept; 0 keeps the last."""
     bfloat16: bool = False
     """The networks compute in bfloat16; weights and losses stay in float32."""
     seed: int = 1
@@ -69,6 +82,10 @@ class AdversarialSettings:
             raise RequestError(f"window must be at least {least}, got {self.window}: the critic needs them to see one")
         if self.history < self.batch or self.batch < 2:
             raise RequestError(f"the history must hold a batch of 2 or more, got {self.history} for {self.batch}")
+        if self.moments > 0 and self.window < _SHORTEST:
+            raise RequestError(f"window must be at least {_SHORTEST} for moments to be compared, got {self.window}")
+        if not 0 <= self.average < 1:
+            raise RequestError(f"average must lie in [0, 1), got {self.average:g}")
         if self.optimiser not in ("adam", "rmsprop"):
             raise RequestError(f"optimiser must be adam or rmsprop, got {self.optimiser!r}")
 
@@ -77,7 +94,8 @@ PAPER = (
     RefinerConfig(width=500, memory=1000, lookahead=0, limit=1e6,
                   joints=("head", "leftHand", "rightHand", "leftToes", "rightToes")),
     AdversarialSettings(rounds=2000, optimiser="rmsprop", refiner_rate=2e-3, critic_rate=5e-3, critic_width=500,
-                        head_start=0, critic_updates=1, refiner_updates=5, critic_around=0),
+                        head_start=0, critic_updates=1, refiner_updates=5, critic_around=0, critic_slow=0.0,
+                        moments=0.0, average=0.0),
 )  # fmt: skip
 """The variant as the paper prints it; it does not say how long it trained."""
 
@@ -114,7 +132,9 @@ class AdversarialTrainer:
             torch.default_generator.manual_seed(settings.seed)
             self.refiner = RefinerNetwork(config, **statistics)
             reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
-            self.critic = Critic(config.joints, width=settings.critic_width, around=settings.critic_around, **reach)
+            self.critic = Critic(config.joints, width=settings.critic_width, around=settings.critic_around,
+                                 slow=settings.critic_slow, **reach)  # fmt: skip
+        self.averaged = deepcopy(self.refiner).requires_grad_(False)
         self.given = settings.window + self.refiner.before + config.lookahead
         self.captured = window_starts(corpus.lengths, settings.window)
         self.sampled = window_starts(raw.lengths, self.given)
@@ -151,6 +171,7 @@ class AdversarialTrainer:
         """Everything a bit-exact continuation needs, flat."""
         tensors = {"generator": self.generator.get_state(), "history": self.history.windows,
                    "counts": torch.tensor([self.round, self.updates])}  # fmt: skip
+        tensors |= {f"averaged.{name}": value for name, value in self.averaged.state_dict().items()}
         for kind, model, optimiser in self._sides():
             tensors |= {f"{kind}.{name}": value for name, value in model.state_dict().items()}
             tensors |= run_files.optimiser_tensors(optimiser, f"{kind}-optimiser")
@@ -161,6 +182,7 @@ class AdversarialTrainer:
         self.generator.set_state(tensors["generator"])
         self.history = History(tensors["history"])
         self.round, self.updates = tensors["counts"].tolist()
+        self.averaged.load_state_dict(_below("averaged.", tensors))
         for kind, model, optimiser in self._sides():
             model.load_state_dict(_below(f"{kind}.", tensors))
             optimiser.load_state_dict(run_files.optimiser_state(optimiser, f"{kind}-optimiser", tensors))
@@ -169,14 +191,21 @@ class AdversarialTrainer:
         return [("refiner", self.refiner, self.optimisers[0]), ("critic", self.critic, self.optimisers[1])]
 
     def _refine(self) -> float:
-        """One update of the refiner (Eq. 13)."""
+        """One update of the refiner (Eq. 13), and of its running mean."""
         raw = self._raw()
         with self._precision():
             refined, _ = self.refiner(raw)
             odds = self.critic(refined.float())
+        refined = refined.float()
         loss = cross_entropy(odds.float(), torch.ones(odds.shape))
-        total = loss + self.settings.root * _root_distance(raw[:, self.refiner.before :], refined.float())
+        total = loss + self.settings.root * _root_distance(raw[:, self.refiner.before :], refined)
+        if self.settings.moments > 0:
+            captured = self._windows(self.corpus, self.captured, self.settings.window)
+            total = total + self.settings.moments * compare(refined, captured, MOMENTS)
         self._step(self.optimisers[0], self.refiner, total)
+        with torch.no_grad():
+            for mean, latest in zip(self.averaged.parameters(), self.refiner.parameters(), strict=True):
+                mean.lerp_(latest, 1 - self.settings.average)
         return loss.item()
 
     def _criticise(self) -> tuple[float, float]:

@@ -18,7 +18,8 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import Place, decode
 from mapctl.formats.atomic import check_folder
 from mapctl.metrics import measure
-from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows, realism_of_windows
+from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows
+from mapctl.metrics.realism.classifier import held_out_accuracy
 from priors import checkpoints, density
 from priors.density import LstmGmmDensity
 from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
@@ -132,7 +133,6 @@ class Judge:
         """Contact speed and jitter as ratios to mocap's, and the share told apart."""
         refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
         refined = refiner.refine(self.raw)
-        network.train()
         means = _means(list(refined))
         row = {f"{name}_ratio": means[name] / self.mocap[name]
                for name in ("contact_speed_cm_s", "jitter_m_s3") if self.mocap[name] > 0}  # fmt: skip
@@ -140,9 +140,9 @@ class Judge:
             made = [clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
                     for clip in refined]  # fmt: skip
             seeded = torch.Generator().manual_seed(0)
-            row["told_apart"] = realism_of_windows(
-                made, self.windows, generator=seeded, settings=self.settings
-            ).accuracy
+            row["told_apart"] = held_out_accuracy(
+                made, self.windows, generator=seeded, settings=self.settings.classifier
+            )
         return row
 
 
@@ -170,7 +170,7 @@ class _Run:
         self.request, self.trainer, self.judge, self.data, self.progress = request, trainer, judge, data, progress
         self.curve: list[Row] = []
         self.losses: list[Losses] = []  # since the last line of news
-        self.best = {name: value.clone() for name, value in trainer.refiner.state_dict().items()}
+        self.best = {name: value.clone() for name, value in trainer.averaged.state_dict().items()}
         if request.resume:
             self._load()
             progress(f"resumed at round {trainer.round}")
@@ -227,9 +227,9 @@ class _Run:
         return None
 
     def _judge(self) -> None:
-        row = self.judge(self.trainer.refiner)
+        row = self.judge(self.trainer.averaged)
         if not self.curve or score(row) < min(score(before) for before in self.curve):
-            self.best = {name: value.clone() for name, value in self.trainer.refiner.state_dict().items()}
+            self.best = {name: value.clone() for name, value in self.trainer.averaged.state_dict().items()}
         row |= {"round": self.trainer.round, "score": score(row)}
         row |= {f"{kind}_loss": self._mean(kind) for kind in ("refiner", "critic") if self.losses}
         self.curve.append({name: value if math.isfinite(value) else None for name, value in row.items()})
