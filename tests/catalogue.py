@@ -6,7 +6,7 @@ from helpers import generator, tiny_model, walk
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import encode
-from mapctl.terms import Closeness, Footing, Likelihood, Noise, Path, Seam, Term
+from mapctl.terms import Closeness, Footing, Likelihood, Noise, Path, Seam, Term, Travel
 from priors.lstm_gmm import LstmGmm
 
 FRAMES = 12
@@ -15,6 +15,8 @@ FRAMES = 12
 _ARCS = 0.3 + 0.04 * torch.arange(FRAMES, dtype=torch.float64)
 _RISING = torch.linspace(0, 3, 400, dtype=torch.float64)
 _IN_SPACE = curves.from_points(torch.stack([0.1 * torch.sin(_RISING), 0.1 + 0.2 * _RISING, _RISING], -1))
+
+_VELOCITIES = torch.stack([torch.linspace(0, 0.4, FRAMES), torch.linspace(0, 1.2, FRAMES)], -1).double()
 
 TERMS: dict[str, Term] = {
     "likelihood": Likelihood(temperature=2.0),
@@ -25,6 +27,8 @@ TERMS: dict[str, Term] = {
     "footing": Footing(),
     "seam": Seam(sigma=300.0),
     "closeness": Closeness(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_turn=0.3),
+    "travel": Travel(_VELOCITIES, _VELOCITIES[:9] - 0.2),
+    "travel, facing": Travel(_VELOCITIES, _VELOCITIES[:3], facing=4 * torch.arange(FRAMES).double()),
 }
 """Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
 

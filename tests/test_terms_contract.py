@@ -150,8 +150,13 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
     before = here.before.clone()
     before[..., ::2] = rotate_ground(before[..., ::2], angle.expand(before.shape[:-1])) + torch.tensor(shift).double()
     there = replace(here, start=place, before=before)
-    if "curve" in {field.name for field in fields(term)}:
+    names = {field.name for field in fields(term)}
+    if "curve" in names:
         term = replace(term, curve=moved_curve(term.curve, turn, shift))
+    if "velocities" in names:
+        turned = {name: rotate_ground(getattr(term, name), angle.expand(len(getattr(term, name))))
+                  for name in ("velocities", "velocities_before")}  # fmt: skip
+        term = replace(term, facing=None if term.facing is None else term.facing + turn, **turned)
     torch.testing.assert_close(term(there), TERMS[name](here), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(term.residual(there), TERMS[name].residual(here), rtol=1e-6, atol=1e-6)
 

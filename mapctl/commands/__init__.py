@@ -15,6 +15,7 @@ from mapctl.commands.info import Info
 from mapctl.commands.measure import Measure
 from mapctl.commands.render import Render
 from mapctl.commands.run import RunScene
+from mapctl.commands.steer import Steer
 from mapctl.commands.train import Train
 
 
@@ -32,6 +33,7 @@ COMMANDS: dict[str, type[Command]] = {
     "follow": FollowCurve,
     "run": RunScene,
     "generate": Generate,
+    "steer": Steer,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

@@ -60,6 +60,8 @@ class Committed:
     """Of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
     """Cost of each window."""
+    forecast: Float[Tensor, "ahead joints 3"] | None = None
+    """World joint positions of the frames that the last window found beyond, metres."""
 
     def finite(self, count: int) -> bool:
         """Whether the last `count` frames and their energies are numbers."""
@@ -128,7 +130,7 @@ class WindowSolver:
         return Committed(
             state=state, place=Place(ground[-1], heading[-1]), features=torch.cat([done.features, features]),
             joints_world=joints, tail=window.carry[count:], ledger=done.ledger.join(window.ledger.slice(count)),
-            windows=(*done.windows, record),
+            windows=(*done.windows, record), forecast=window.trial.joints_world[0, count:],
         )  # fmt: skip
 
 

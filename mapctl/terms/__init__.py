@@ -7,7 +7,8 @@ from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.noise import Noise
 from mapctl.terms.path import Path
 from mapctl.terms.seam import Seam
+from mapctl.terms.travel import Travel
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Travel)
 
-__all__ = ["ALL", "Closeness", "Footing", "Likelihood", "Noise", "Path", "Seam", "Term"]
+__all__ = ["ALL", "Closeness", "Footing", "Likelihood", "Noise", "Path", "Seam", "Term", "Travel"]

@@ -1,0 +1,209 @@
+"""Steer a character (rnn paper, section 5.3): a few frames at a time, a second ahead, from the last solution's tail.
+
+`step` is pure: a state and a command go in, the next state and its frames come out, and the same bits for the same
+evaluations. It knows no clock; who has a deadline gives the seconds that are left, and gets the best found by then.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.solver.methods import LatentMethod, Method, SolvedWindow
+from mapctl.solver.result import Ledger, Outcome
+from mapctl.solver.variables import Context
+from mapctl.solver.window import Committed, WindowSettings, WindowSolver
+from mapctl.steering import Command, Limits, Wish
+from mapctl.terms import Footing, Noise, Term, Travel
+
+_OWED = 60  # wishes of the past that are kept: more than the travel term looks back on
+_RECENT = 15  # frames of the half second whose wishes must not be missed by far
+_NEAREST = 6  # starts nearest to the wanted speed, of which one is drawn
+
+
+@dataclass(frozen=True)
+class SteerSettings:
+    """Sigmas, lengths and effort."""
+
+    horizon: int = 30
+    """Frames of a window: what a command changes is found this far ahead."""
+    commit: int = 3
+    """Frames that a step delivers."""
+    evaluations: int = 10
+    """Of energy and gradient in a step, at most: what one core does in the time that three frames last."""
+    limits: Limits = field(default_factory=Limits)
+    """How fast a wish may change."""
+    sigma_speed: float = Travel.sigma_speed
+    """Along the wanted velocity, m/s."""
+    sigma_direction: float = Travel.sigma_direction
+    """Across it, radians."""
+    sigma_facing: float = Travel.sigma_facing
+    """Of the hips' heading, radians."""
+    stuck: float = 0.4
+    """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
+    footing: Footing = field(default_factory=Footing)
+    """Planted feet."""
+    noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
+    """The prior, as in following a curve."""
+
+    def __post_init__(self):
+        if not 1 <= self.commit < self.horizon or self.evaluations < 1:
+            raise RequestError(f"steering needs 1 <= commit < horizon and evaluations >= 1, got {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class SteerState:
+    """Everything that the next step depends on; of a fixed size."""
+
+    prior: Any
+    """The density."""
+    settings: SteerSettings
+    """The same in every step."""
+    skeleton: Skeleton
+    """Bones of the character."""
+    committed: Committed
+    """The end of what was delivered."""
+    wish: Wish
+    """Of the last delivered frame."""
+    owed: Float[Tensor, "past 2"]
+    """Wanted velocities of the last delivered frames, oldest first, m/s."""
+    frames: int = 1
+    """Delivered so far, the first pose among them."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteerFrames:
+    """What a step delivers."""
+
+    motion: Motion
+    """The new frames, at PRIOR_FPS, where they are in the world."""
+    contacts: Float[Tensor, "frames 2"]
+    """Left and right toe planted, 1 or 0."""
+    wishes: tuple[Wish, ...]
+    """Of those frames."""
+    forecast: Float[Tensor, "ahead joints 3"]
+    """World joint positions of the frames that would come next, metres; what the next command changes."""
+    ledger: Ledger
+    """By term, of the new frames."""
+    evaluations: int = 0
+    """Spent."""
+    seconds: float = 0.0
+    """Of processor and waiting, by the wall."""
+    note: str = ""
+    """Why less was searched than the settings allow, if so."""
+
+
+def begin(
+    prior: Any, command: Command, *, generator: torch.Generator, settings: SteerSettings | None = None,
+    skeleton: Skeleton = CANONICAL,
+) -> tuple[SteerState, SteerFrames]:  # fmt: skip
+    """A character at the origin that faces along the command, and its first pose.
+
+    It is one of the prior's starts near the wanted speed, drawn by the generator: the data's slowest for a command to
+    stand.
+    """
+    near = (prior.starts.speed - command.speed).abs().argsort()[:_NEAREST]
+    pick = int(near[torch.randint(len(near), (1,), generator=generator)])
+    state = prior.starts.state.pick(torch.tensor([pick]))
+    first, place = state.previous, Place(torch.zeros(2), torch.tensor(command.heading))
+    before = place.before(
+        LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
+    )
+    motion = decode(first, before, skeleton=skeleton)
+    joints = motion.joint_positions().to(first.dtype)
+    committed = Committed(state, place, first, joints, first.new_zeros(0, LAYOUT.continuous))
+    wish = Wish(float(ground_speed(first)[0]), command.heading, command.heading)
+    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), (wish,), joints[:0], Ledger())
+    chosen = settings or SteerSettings()
+    return SteerState(prior, chosen, skeleton, committed, wish, torch.tensor([wish.velocity])), frames
+
+
+def step(
+    state: SteerState, command: Command, *, seconds: float | None = None
+) -> tuple[SteerState, SteerFrames]:  # fmt: skip
+    """The next frames under a command. With `seconds`, the best found by then, and a note that says so."""
+    began = time.perf_counter()
+    settings = state.settings
+    wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
+    done, outcome = _solve(state, _terms(state, wishes), seconds)
+    if outcome is not Outcome.DONE:
+        afresh = replace(state, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
+        done, _ = _solve(afresh, _terms(state, wishes), seconds=0.0)  # the prior's own continuation: never nothing
+    new = done.features[-settings.commit :]
+    motion = decode(new, state.committed.place, skeleton=state.skeleton)
+    record, own = done.windows[-1], tuple(wishes[: settings.commit])
+    short = record.outcome == "out of budget" and record.evaluations < settings.evaluations
+    note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations" if short else ""
+    forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
+    frames = SteerFrames(motion, LAYOUT.pick(new, "contacts"), own, forecast, done.ledger, record.evaluations,
+                         time.perf_counter() - began, note)  # fmt: skip
+    owed = torch.cat([state.owed, torch.tensor([wish.velocity for wish in own])])[-_OWED:]
+    kept = replace(done, features=new, ledger=Ledger(), windows=())
+    following = replace(state, committed=kept, wish=own[-1], owed=owed, frames=state.frames + len(new))
+    return following, frames
+
+
+def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None) -> tuple[Committed, Outcome]:
+    settings = state.settings
+    budget = Budget(evaluations=settings.evaluations, seconds=seconds)
+    method: Method = LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=settings.evaluations), budget=budget)
+    if _behind(state) > settings.stuck:
+        half = replace(method, budget=replace(budget, evaluations=settings.evaluations // 2))
+        method = _StepFirst(half, [term for term in terms if term.name != settings.footing.name])
+    window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
+    solver = WindowSolver(state.prior, window, state.skeleton, method=method)
+    frames = len(state.committed.features) + settings.commit
+    return solver.solve(state.committed, lambda first, count: terms, frames, generator=torch.Generator())
+
+
+@dataclass(frozen=True)
+class _StepFirst:
+    """A Method that spends half on the wishes without footing, and half on all.
+
+    Who stands has both feet planted, by contact bits that stay while a window is solved: footing then holds what the
+    wish would move. The search without it finds a step, and along that step the prior says anew which feet stand.
+    """
+
+    half: LatentMethod
+    loose: Sequence[Term]
+
+    def __call__(
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:  # fmt: skip
+        began = time.perf_counter()
+        first = self.half(context, self.loose, tail, generator, seconds=seconds / 2)
+        left = max(0.0, seconds - (time.perf_counter() - began))
+        second = self.half(context, terms, first.carry, generator, seconds=left)
+        return replace(second, evaluations=first.evaluations + second.evaluations)
+
+
+def _behind(state: SteerState) -> float:
+    """How far the mean velocity of the last half second missed its wishes, m/s."""
+    past = state.committed.joints_world[-_RECENT - 1 :, 0, ::2]
+    count = min(len(past) - 1, len(state.owed))
+    if count < _RECENT:
+        return 0.0
+    travelled = (past[-1] - past[-1 - count]) * PRIOR_FPS / count
+    return float((travelled - state.owed[-count:].mean(0)).norm())
+
+
+def _terms(state: SteerState, wishes: Sequence[Wish]) -> Sequence[Term]:
+    settings = state.settings
+    travel = Travel(
+        torch.tensor([wish.velocity for wish in wishes]), state.owed,
+        facing=torch.tensor([wish.facing for wish in wishes]), sigma_speed=settings.sigma_speed,
+        sigma_direction=settings.sigma_direction, sigma_facing=settings.sigma_facing,
+    )  # fmt: skip
+    return settings.noise, travel, settings.footing

@@ -1,0 +1,157 @@
+"""`mapctl steer`: a script of commands is replayed, as live steering would answer it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.commands.walks import INTERRUPTED
+from mapctl.errors import RequestError
+from mapctl.progress import bar
+
+if TYPE_CHECKING:
+    from controllers.loop import Recorder, StepRecord
+    from mapctl.motion import Motion
+    from mapctl.steering import CommandTrack
+
+_NOT_ALL_HOLDS = 3
+_LAST_HELD = 3.0  # seconds for which a script of a single command is played
+
+
+@dataclass(frozen=True)
+class Steer:
+    """A character obeys a script of speeds and directions, answered as live steering would."""
+
+    commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
+    """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X), and facing_deg for strafing; the last
+    line's time is the end."""
+    out: options.OutFile
+    """Where the motion goes: .bvh or .npz."""
+    realtime: bool = False
+    """Play against the wall clock: every step has a deadline and brings the best found by then."""
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+    seed: options.Count = 0
+    """Of the pose that it begins with."""
+    report: options.MaybeFile = None
+    """JSON with each command's response, timing, ledger and measures."""
+    plot: options.MaybeFile = None
+    """PNG of wanted and got speed and direction over time."""
+    strict: bool = False
+    """Exit with status 3 where a speed was lowered to what the prior can do, or a frame was late."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, steer, write, tell. Ctrl-C ends the script early; what was steered is written."""
+        compute_on_one()
+        self._check()
+        import priors
+        from mapctl.command_files import read_commands
+        from mapctl.steering import fastest_of
+
+        track = read_commands(self.commands)
+        prior = priors.load(self.prior)
+        track, lowered = track.clamped(fastest_of(prior.abilities))
+        recorder, records, frames = self._steered(prior, track)
+        motion = recorder.motion(frames)
+        motion.save(self.out)
+        report = self._report(motion, recorder, records, track, lowered, prior)
+        if self.report is not None:
+            from mapctl import report as reports
+
+            reports.write(report, self.report)
+        if self.plot is not None:
+            from scenes.steering_plot import plot
+
+            plot(motion, track, self.plot)
+        if not self.quiet:
+            print("\n".join(_summary(report, options.given(self.out, self.report, self.plot))))
+        if motion.num_frames < frames:
+            return INTERRUPTED
+        return _NOT_ALL_HOLDS if self.strict and (lowered or report["timing"]["late_frames"]) else 0
+
+    def _check(self) -> None:
+        from mapctl import formats
+
+        options.check_seed(self.seed)
+        formats.check_ending(self.out)
+        outputs.check_files(options.given(self.out, self.report, self.plot))
+        if self.plot is not None:
+            if self.plot.suffix.lower() != ".png":
+                raise RequestError(f"--plot writes .png, not {self.plot.suffix or 'a file without ending'}")
+            outputs.require_render("matplotlib")
+
+    def _steered(self, prior: Any, track: "CommandTrack") -> tuple["Recorder", list["StepRecord"], int]:
+        import torch
+
+        from controllers import steer
+        from controllers.loop import LoopSettings, Recorder, StreamClock, WallClock, drive
+
+        first, recorder = track.commands[0], Recorder()
+        frames = options.frames_of(track.times[-1] if len(track.times) > 1 else track.times[0] + _LAST_HELD)
+        state, pose = steer.begin(prior, first, generator=torch.Generator().manual_seed(self.seed))
+        recorder.show(pose, 0.0)
+        for _ in range(2):  # what the machine compiles or loads on first use must not cost the first frames
+            steer.step(state, first)
+        clock = WallClock() if self.realtime else StreamClock()
+        with bar("steering", quiet=self.quiet) as progress:
+            displays = [recorder] if progress is None else [recorder, _Progress(progress, frames)]
+            _, records = drive(state, track, displays, frames=frames, clock=clock,
+                               settings=LoopSettings(realtime=self.realtime))  # fmt: skip
+        return recorder, records, frames
+
+    def _report(
+        self, motion: "Motion", recorder: "Recorder", records: Sequence["StepRecord"], track: "CommandTrack",
+        lowered: Sequence[str], prior: Any,
+    ) -> dict[str, Any]:  # fmt: skip
+        from controllers.loop import timing
+        from mapctl import metrics, report
+        from mapctl.metrics.travel import by_command
+
+        cost = timing(records, [time for time in track.times[1:] if time < motion.seconds])
+        return {
+            "request": options.as_request("steer", self), "seed": self.seed, "versions": report.versions(),
+            "prior": {"name": prior.name, "licence": prior.card.licence}, "motion": report.outline(motion),
+            "status": {"text": "; ".join(lowered) or "done", "ok": not lowered, "notes": list(lowered)},
+            "commands": by_command(motion, track), "ledger": recorder.ledger.summary(),
+            "measures": metrics.measure(motion), "mocap": report.mocap_values(prior.card.quality),
+            "timing": cost | {"peak_memory_mb": report.peak_memory_mb()},
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Progress:
+    """A Display that moves a progress bar."""
+
+    progress: Any
+    frames: int
+
+    def show(self, frames: Any, due: float) -> None:
+        from mapctl.features import PRIOR_FPS
+
+        self.progress(min(self.frames, round(due * PRIOR_FPS) + frames.motion.num_frames), self.frames)
+
+
+def _summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
+    lines = []
+    for row in report["commands"][:-1]:
+        reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
+        steady = "" if row["steady_speed_mps"] is None else f", then {row['steady_speed_mps']:.2f} m/s"
+        off = row["steady_heading_error_deg"]
+        turned = "" if off is None else f", {off:+.1f} degrees off"
+        asked = f"{row['speed_mps']:.2f} m/s to {row['heading_deg']:.0f} degrees"
+        lines.append(f"{row['time_s']:6.1f} s  {asked}: {reached}{steady}{turned}")
+    cost, latency = report["timing"], report["timing"]["command_latency_s"]
+    waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
+    return [
+        *lines,
+        f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+        f"{cost['late_frames']} late, {cost['evaluations_per_frame']:.1f} evaluations a frame{waited}",
+        f"status    {report['status']['text']}",
+        f"wrote     {', '.join(map(str, files))}",
+    ]

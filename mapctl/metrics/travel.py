@@ -1,0 +1,88 @@
+"""How well a steered character did what it was told: speed and direction of its slow velocity against the commands."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter1d
+
+from mapctl.motion import Motion
+from mapctl.steering import CommandTrack
+
+_SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
+_STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
+_HELD = 0.4  # seconds for which a wish must hold to count as reached
+_NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
+
+
+@dataclass(frozen=True, eq=False)
+class Travelled:
+    """Slow velocity of the hips, frame by frame."""
+
+    seconds: Float[ndarray, " frames"]
+    """Time of each frame."""
+    speed: Float[ndarray, " frames"]
+    """m/s."""
+    direction: Float[ndarray, " frames"]
+    """Radians about +Y; of no meaning where the speed is near 0."""
+
+
+def travelled(motion: Motion) -> Travelled:
+    """Slow velocity of a motion's root over the ground (Gaussian of 0.25 s)."""
+    fps = float(motion.fps)
+    ground = motion.joint_positions()[:, 0, ::2].numpy()
+    velocity = gaussian_filter1d(np.gradient(ground, axis=0) * fps, _SLOW_SECONDS * fps, axis=0, mode="nearest")
+    seconds = np.arange(len(ground)) / fps
+    return Travelled(seconds, np.linalg.norm(velocity, axis=-1), np.arctan2(velocity[:, 0], velocity[:, 1]))
+
+
+def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
+    """A row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
+
+    Keys: time_s, speed_mps, heading_deg (wanted), reached_s (None if it never was), steady_speed_mps (net way over
+    time), steady_heading_error_deg (None where standing is wanted, and where there is no steady part).
+    """
+    way, rows = travelled(motion), []
+    ground = motion.joint_positions()[:, 0, ::2].numpy()
+    ends = [*track.times[1:], float(way.seconds[-1])]
+    for began, until, command in zip(track.times, ends, track.commands, strict=True):
+        part = (way.seconds >= began) & (way.seconds <= until)
+        row: dict[str, float | None] = {"time_s": began, "speed_mps": command.speed,
+                                        "heading_deg": math.degrees(command.heading)}  # fmt: skip
+        row["reached_s"] = _reached(way, part, began, command.speed, command.heading, float(motion.fps))
+        steady = np.flatnonzero(part & (way.seconds >= began + _STEADY_AFTER))
+        row |= _steady(ground, steady, command.speed, command.heading, float(motion.fps))
+        rows.append(row)
+    return rows
+
+
+def _reached(way: Travelled, part: ndarray, began: float, speed: float, heading: float, fps: float) -> float | None:
+    near = np.abs(way.speed - speed) < max(_NEAR_SPEED * speed, _NEAR_STILL)
+    if speed > 0:
+        near &= np.abs(_wrapped(way.direction - heading)) < _NEAR_ANGLE
+    at = np.flatnonzero(part)
+    for first in at:
+        if near[first : min(first + round(_HELD * fps), at[-1] + 1)].all():
+            return float(way.seconds[first] - began)
+    return None
+
+
+def _steady(ground: ndarray, frames: ndarray, speed: float, heading: float, fps: float) -> dict[str, float | None]:
+    if len(frames) < fps / 2:
+        return {"steady_speed_mps": None, "steady_heading_error_deg": None}
+    step = (ground[frames[-1]] - ground[frames[0]]) * fps / (len(frames) - 1)
+    off = math.degrees(float(_wrapped(math.atan2(step[0], step[1]) - heading)))
+    return {"steady_speed_mps": float(np.linalg.norm(step)), "steady_heading_error_deg": off if speed > 0 else None}
+
+
+def _wrapped(angle):
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def wanted(track: CommandTrack, seconds: Sequence[float]) -> tuple[list[float], list[float]]:
+    """The commanded speed (m/s) and heading (radians) at each time."""
+    commands = [track.at(time) for time in seconds]
+    return [command.speed for command in commands], [command.heading for command in commands]

@@ -1,0 +1,134 @@
+"""What a driver asks for: commands over time, and how fast a wish may change (rnn paper, section 5.3)."""
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from mapctl.errors import RequestError
+from mapctl.protocols import Abilities
+
+
+@dataclass(frozen=True)
+class Command:
+    """One wish, held until the next one."""
+
+    speed: float
+    """Over the ground, m/s; 0 is to stand."""
+    heading: float
+    """Direction of travel, radians about +Y: 0 is +Z, pi/2 is +X. Where the speed is 0, where to face."""
+    facing: float | None = None
+    """Where the hips face, radians; None is the direction of travel."""
+
+    def __post_init__(self):
+        if not (math.isfinite(self.speed) and self.speed >= 0):
+            raise RequestError(f"a command's speed must be a number of m/s, 0 or more, got {self.speed:g}")
+        for name in ("heading", "facing"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
+
+
+@dataclass(frozen=True)
+class CommandTrack:
+    """Commands at rising times; before the first time the first command holds."""
+
+    times: tuple[float, ...]
+    """Seconds."""
+    commands: tuple[Command, ...]
+    """From those times on."""
+
+    def __post_init__(self):
+        if not self.times or len(self.times) != len(self.commands):
+            raise RequestError("a track needs a time for each of its commands, and at least one")
+        for before, after in pairwise(self.times):
+            if not before < after:
+                raise RequestError(f"the times of commands must rise, got {after:g} s after {before:g} s")
+
+    def at(self, seconds: float) -> Command:
+        """The command that holds at a time."""
+        return self.commands[max(0, bisect_right(self.times, seconds + 1e-9) - 1)]
+
+    def arrivals(self, before: float, upto: float) -> list[float]:
+        """Times in (before, upto] at which a command came."""
+        return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
+
+    def clamped(self, fastest: float) -> tuple["CommandTrack", list[str]]:
+        """The track with speeds of at most `fastest` m/s, and a sentence for each command that was lowered."""
+        said = []
+        for time, command in zip(self.times, self.commands, strict=True):
+            if command.speed > fastest:
+                said.append(f"the speed of {command.speed:g} m/s at {time:g} s was lowered to {fastest:.2f} m/s, "
+                            "the prior's fastest")  # fmt: skip
+        lowered = [Command(min(c.speed, fastest), c.heading, c.facing) for c in self.commands]
+        return CommandTrack(self.times, tuple(lowered)), said
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How fast a wish may change; a jump in the command becomes the fastest change that these allow."""
+
+    acceleration: float = 2.0
+    """Of the speed, m/s^2, rising."""
+    braking: float = 2.0
+    """Of the speed, m/s^2, falling."""
+    turn_rate: float = 2.5
+    """Of the direction, radians/s. Clips of the data turn by 1.15 a second at most; a reversal has to be faster."""
+
+    def __post_init__(self):
+        for name in ("acceleration", "braking", "turn_rate"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise RequestError(f"{name} must be positive, got {getattr(self, name):g}")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is wanted in one frame: a command that has come as far as the limits allow."""
+
+    speed: float
+    """m/s."""
+    heading: float
+    """Radians, not wrapped."""
+    facing: float
+    """Radians, not wrapped."""
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """x and z over the ground, m/s."""
+        return self.speed * math.sin(self.heading), self.speed * math.cos(self.heading)
+
+    def toward(self, command: Command, limits: Limits, seconds: float) -> "Wish":
+        """The wish after so many seconds, as near the command as the limits allow."""
+        rise = min(limits.acceleration * seconds, max(-limits.braking * seconds, command.speed - self.speed))
+        turn = _toward(self.heading, command.heading, limits.turn_rate * seconds)
+        facing = turn if command.facing is None else command.facing
+        return Wish(self.speed + rise, turn, _toward(self.facing, facing, limits.turn_rate * seconds))
+
+    def ahead(self, command: Command, limits: Limits, *, frames: int, fps: float) -> "list[Wish]":
+        """The wishes of the next frames if nothing else is asked."""
+        wishes, wish = [], self
+        for _ in range(frames):
+            wish = wish.toward(command, limits, 1 / fps)
+            wishes.append(wish)
+        return wishes
+
+
+def fastest_of(abilities: Abilities) -> float:
+    """Highest speed that is asked of a prior, m/s: a tenth beyond what its data show."""
+    return 1.1 * abilities.fastest
+
+
+def as_track(rows: Sequence[tuple[float, ...]]) -> CommandTrack:
+    """Rows of time (s), speed (m/s), heading (degrees) and, if there is one, facing (degrees; nan is none)."""
+    commands = []
+    for _, speed, heading, *facing in rows:
+        held = math.radians(facing[0]) if facing and not math.isnan(facing[0]) else None
+        commands.append(Command(speed, math.radians(heading), held))
+    return CommandTrack(tuple(row[0] for row in rows), tuple(commands))
+
+
+def _toward(angle: float, wanted: float, most: float) -> float:
+    """The angle turned toward another by at most so much, the short way."""
+    apart = math.remainder(wanted - angle, 2 * math.pi)
+    return angle + min(most, max(-most, apart))

@@ -1,0 +1,184 @@
+"""Steering with an untrained density: the contract of a step and of the loop, not the quality of the walk."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator, tiny_density
+
+from controllers import steer
+from controllers.loop import LoopSettings, Recorder, StepRecord, StreamClock, WallClock, drive, timing
+from controllers.steer import SteerSettings
+from mapctl.errors import RequestError
+from mapctl.steering import Command, CommandTrack
+
+DENSITY = tiny_density()
+QUICK = SteerSettings(horizon=8, commit=3, evaluations=4)
+AHEAD = Command(1.2, 0.0)
+
+
+def begun(command=AHEAD, *, seed=0, settings=QUICK):
+    return steer.begin(DENSITY, command, generator=generator(seed), settings=settings)
+
+
+def steered(steps, command=AHEAD, **how):
+    state, first = begun(command, **how)
+    pieces = [first]
+    for _ in range(steps):
+        state, piece = steer.step(state, command)
+        pieces.append(piece)
+    return state, pieces
+
+
+def test_it_begins_at_the_origin_facing_along_the_command():
+    _, first = begun(Command(1.0, math.pi / 2))
+    assert first.motion.num_frames == 1
+    torch.testing.assert_close(first.motion.root_position[0, ::2].float(), torch.zeros(2), atol=1e-6, rtol=0)
+
+
+def test_a_step_is_pure_and_the_same_to_the_bit():
+    state, _ = begun()
+    before = state.committed.features.clone()
+    (after, one), (_, two) = steer.step(state, AHEAD), steer.step(state, AHEAD)
+    assert torch.equal(one.motion.local_quat_xyzw, two.motion.local_quat_xyzw)
+    assert torch.equal(one.motion.root_position, two.motion.root_position)
+    assert torch.equal(state.committed.features, before)
+    assert state.frames == 1
+    assert after.frames == 4
+
+
+def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
+    _, pieces = steered(3)
+    for piece in pieces[1:]:
+        assert piece.motion.num_frames == len(piece.wishes) == len(piece.contacts) == 3
+        assert piece.forecast.shape == (5, 21, 3)
+        assert 1 <= piece.evaluations <= 4
+        assert {entry.name for entry in piece.ledger.entries} == {"noise", "travel", "footing"}
+    roots = torch.cat([piece.motion.root_position for piece in pieces])
+    assert float(roots.diff(dim=0).norm(dim=-1).max()) < 0.3
+    ahead = pieces[1].forecast[0, 0] - pieces[1].motion.root_position[-1].float()
+    assert float(ahead.norm()) < 0.3
+
+
+def test_the_state_does_not_grow():
+    sizes = []
+    for steps in (25, 40):
+        committed = (state := steered(steps)[0]).committed
+        sizes.append((committed.features.shape, committed.joints_world.shape, state.owed.shape, len(committed.windows)))
+    assert sizes[0] == sizes[1]
+
+
+def test_without_time_it_still_delivers_and_says_so():
+    state, _ = begun()
+    _, piece = steer.step(state, AHEAD, seconds=0.0)
+    assert piece.motion.num_frames == 3
+    assert piece.evaluations == 0
+    assert piece.note == "the deadline came after 0 of 4 evaluations"
+    assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
+
+
+def test_who_is_stuck_is_searched_without_footing_first():
+    """Both searches count, and together they are no more than were allowed."""
+    state, _ = steered(8)
+    stuck = replace(state, settings=replace(QUICK, stuck=-1.0))
+    (_, plain), (_, freed) = steer.step(state, AHEAD), steer.step(stuck, AHEAD)
+    assert 1 <= freed.evaluations <= 4
+    assert not torch.equal(plain.motion.local_quat_xyzw, freed.motion.local_quat_xyzw)
+
+
+def test_motion_that_is_not_finite_is_replaced_by_the_priors_own():
+    state, _ = steered(2)
+    broken = replace(state, committed=replace(state.committed, tail=state.committed.tail * math.nan))
+    _, piece = steer.step(broken, AHEAD)
+    assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
+    assert bool(torch.isfinite(piece.motion.root_position).all())
+
+
+@pytest.mark.parametrize("wrong", [{"commit": 0}, {"commit": 8}, {"evaluations": 0}])
+def test_settings_that_cannot_be_are_refused(wrong):
+    with pytest.raises(RequestError, match="1 <= commit < horizon"):
+        replace(QUICK, **wrong)
+
+
+class Heard:
+    """A source that writes down when it was asked."""
+
+    def __init__(self):
+        self.times = []
+
+    def at(self, seconds):
+        self.times.append(seconds)
+        return AHEAD
+
+
+def test_the_loop_asks_a_step_before_frames_are_due_and_shows_them_all():
+    state, first = begun()
+    source, recorder = Heard(), Recorder()
+    recorder.show(first, 0.0)
+    state, records = drive(state, source, [recorder], frames=20, clock=StreamClock())
+    assert state.frames == 22
+    assert recorder.motion(20).num_frames == 20
+    assert len(recorder.wishes) == 22
+    assert source.times == pytest.approx([k / 10 + 1 / 30 - 0.1 for k in range(7)])
+    assert [record.due for record in records] == pytest.approx([k / 10 + 1 / 30 for k in range(7)])
+    assert all(len(entry.energy) == 21 for entry in recorder.ledger.entries)
+
+
+def test_in_stream_time_nothing_is_late_and_the_result_is_always_the_same():
+    motions = []
+    for _ in range(2):
+        state, recorder = begun()[0], Recorder()
+        _, records = drive(state, CommandTrack((0.0, 0.5), (AHEAD, Command(0.5, 1.0))), [recorder], frames=30,
+                           settings=LoopSettings(realtime=False))  # fmt: skip
+        assert timing(records)["late_frames"] == 0
+        motions.append(recorder.motion().local_quat_xyzw)
+    assert torch.equal(*motions)
+
+
+class Slow(StreamClock):
+    """Half a second passes whenever the time is asked."""
+
+    def now(self):
+        self._now += 0.5
+        return self._now
+
+
+def test_what_comes_too_late_is_counted_and_the_search_is_given_up():
+    state, _ = begun()
+    _, records = drive(state, Heard(), [], frames=7, clock=Slow())
+    cost = timing(records)
+    assert cost["late_frames"] == 6
+    assert cost["steps_cut_short"] == 2
+
+
+def test_against_the_wall_clock_it_takes_as_long_as_it_shows():
+    clock = WallClock()
+    drive(begun()[0], Heard(), [], frames=16, clock=clock)
+    assert clock.now() >= 0.4
+
+
+def test_it_stops_when_told():
+    shown = Recorder()
+    drive(begun()[0], Heard(), [shown], frames=300, stop=lambda: len(shown.pieces) == 2)
+    assert len(shown.pieces) == 2
+
+
+def test_ctrl_c_keeps_what_was_shown():
+    class Interrupting(Heard):
+        def at(self, seconds):
+            if len(self.times) == 2:
+                raise KeyboardInterrupt
+            return super().at(seconds)
+
+    state, records = drive(begun()[0], Interrupting(), [], frames=300)
+    assert (state.frames, len(records)) == (7, 2)
+
+
+def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
+    records = [StepRecord(3, k / 10, k / 10 + 0.1, k / 10 + 0.05, 0.06, 4, "") for k in range(5)]
+    assert timing(records, [0.1])["command_latency_s"] == pytest.approx(0.1)
+    assert timing(records, [0.11, 0.3])["command_latency_s"] == pytest.approx(0.19)
+    assert timing(records)["command_latency_s"] == pytest.approx(0.2)
+    assert timing(records)["frame_ms_p50"] == pytest.approx(20)
+    assert timing(records)["evaluations_per_frame"] == pytest.approx(4 / 3)

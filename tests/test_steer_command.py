@@ -1,0 +1,110 @@
+"""`mapctl steer` as a user types it, and the measures that its report is made of."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import walk
+from tiny_prior import save_tiny_prior
+
+import mapctl
+from mapctl import cli
+from mapctl.metrics.travel import by_command, travelled
+from mapctl.steering import Command, CommandTrack
+
+SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> str:
+    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
+
+
+@pytest.fixture
+def steer(prior, tmp_path):
+    """Runs a script in an empty folder; returns the exit status."""
+
+    def run(script: str, *words: object) -> int:
+        (tmp_path / "c.csv").write_text(script)
+        return cli.main(["steer", str(tmp_path / "c.csv"), "-o", str(tmp_path / "a.bvh"), "--prior", prior,
+                         *map(str, words)])  # fmt: skip
+
+    return run
+
+
+def test_a_script_gives_motion_report_and_plot(steer, tmp_path, capsys):
+    report, plot = tmp_path / "r.json", tmp_path / "p.png"
+    assert steer(SCRIPT, "--report", report, "--plot", plot, "--seed", 3) == 0
+    assert mapctl.load(tmp_path / "a.bvh").num_frames == 45
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    told = json.loads(report.read_text())
+    assert [row["heading_deg"] for row in told["commands"]] == pytest.approx([0, 40, 40])
+    timing = told["timing"]
+    assert timing["late_frames"] == 0
+    assert timing["command_latency_s"] <= 0.2
+    assert {"frame_ms_p50", "frame_ms_p99", "evaluations_per_frame", "threads"} <= set(timing)
+    assert {"travel", "footing", "noise"} == set(told["ledger"])
+    out = capsys.readouterr().out
+    assert "1.00 m/s to 40 degrees" in out
+    assert str(plot) in out
+
+
+def test_the_same_seed_gives_the_same_bytes(steer, tmp_path):
+    found = set()
+    for _ in range(2):
+        assert steer(SCRIPT, "--quiet") == 0
+        found.add((tmp_path / "a.bvh").read_bytes())
+    assert len(found) == 1
+
+
+def test_a_script_is_played_against_the_clock(steer, tmp_path):
+    assert steer(SCRIPT, "--realtime", "--quiet") == 0
+    assert mapctl.load(tmp_path / "a.bvh").num_frames == 45
+
+
+def test_speeds_that_nobody_runs_are_lowered_and_said(steer, capsys):
+    fast = "time_s,speed_mps,heading_deg\n0,50,0\n0.5,50,0\n"
+    assert steer(fast) == 0
+    assert "the speed of 50 m/s at 0 s was lowered to 2.20 m/s" in capsys.readouterr().out
+    assert steer(fast, "--strict") == 3
+
+
+@pytest.mark.parametrize(("script", "message"), [
+    ("time_s,speed_mps\n0,1\n", "line 1: has no column heading_deg"),
+    ("time_s,speed_mps,heading_deg\n0,1,0\n0,1,0\n", "line 3: time_s must rise"),
+    ("time_s,speed_mps,heading_deg\n0,nan,0\n", "line 2: speed_mps must be a number"),
+])  # fmt: skip
+def test_bad_scripts_are_named_and_nothing_is_written(steer, tmp_path, capsys, script, message):
+    assert steer(script) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
+
+
+def test_slow_velocity_is_that_of_the_walk():
+    motion = walk(120)
+    way = travelled(motion)
+    net = (motion.root_position[-1] - motion.root_position[0])[::2].norm() / (119 / 30)
+    assert np.abs(way.speed[20:-20] - float(net)).max() < 0.05
+    assert np.abs(way.direction[20:-20]).max() < 0.1
+
+
+def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
+    motion = walk(150)
+    speed = float((motion.root_position[-1] - motion.root_position[0])[::2].norm()) / (149 / 30)
+    way = float(torch.atan2(*(motion.root_position[-1] - motion.root_position[0])[[0, 2]]))
+    obeyed, not_obeyed = (
+        by_command(motion, CommandTrack((0.0,), (Command(speed, way + off),)))[0] for off in (2 * math.pi, 1.0)
+    )
+    assert obeyed["reached_s"] == 0
+    assert obeyed["steady_speed_mps"] == pytest.approx(speed, rel=0.03)
+    assert obeyed["steady_heading_error_deg"] == pytest.approx(0, abs=2)
+    assert not_obeyed["reached_s"] is None
+    assert not_obeyed["steady_heading_error_deg"] == pytest.approx(-math.degrees(1.0), abs=2)
+
+
+def test_a_short_command_has_no_steady_part():
+    rows = by_command(walk(100), CommandTrack((0.0, 2.0), (Command(1, 0), Command(0, 0))))
+    assert rows[0]["steady_speed_mps"] is None
+    assert rows[1]["steady_heading_error_deg"] is None

@@ -1,0 +1,105 @@
+"""Commands, tracks and the ramp between them; and the files that hold them."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapctl.command_files import read_commands
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.steering import Command, CommandTrack, Limits, Wish
+
+ANGLES = st.floats(-20, 20)
+SPEEDS = st.floats(0, 5)
+
+
+@given(ANGLES, ANGLES, SPEEDS, SPEEDS)
+def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(heading, wanted, speed, asked):
+    limits, command = Limits(acceleration=2, braking=3, turn_rate=2.5), Command(asked, wanted)
+    wish = Wish(speed, heading, heading)
+    wishes = [wish, *wish.ahead(command, limits, frames=90, fps=30)]
+    for before, after in pairwise(wishes):
+        assert -3 / 30 - 1e-9 <= after.speed - before.speed <= 2 / 30 + 1e-9
+        assert abs(after.heading - before.heading) <= 2.5 / 30 + 1e-9
+        assert after.speed >= 0
+    assert wishes[-1].speed == pytest.approx(asked)
+    assert math.remainder(wishes[-1].heading - wanted, 2 * math.pi) == pytest.approx(0, abs=1e-6)
+    assert abs(wishes[-1].heading - heading) <= math.pi + 1e-6
+
+
+def test_facing_goes_with_travel_unless_it_is_held():
+    wish = Wish(1.0, 0.0, 0.0)
+    walked, strafed = (wish.ahead(Command(1.0, 1.0, facing), Limits(), frames=60, fps=30)[-1] for facing in (None, 0.0))
+    assert (walked.facing, strafed.facing) == pytest.approx((1.0, 0.0))
+    assert strafed.heading == pytest.approx(1.0)
+
+
+def test_a_track_holds_each_command_until_the_next():
+    track = CommandTrack((1.0, 2.0), (Command(1, 0), Command(2, 0)))
+    assert [track.at(t).speed for t in (0, 1, 1.99, 2, 9)] == [1, 1, 1, 2, 2]
+    assert track.arrivals(0, 1.5) == [1.0]
+    assert track.arrivals(1.0, 2.0) == [2.0]
+
+
+def test_speeds_beyond_the_priors_are_lowered_and_said():
+    track, said = CommandTrack((0.0, 1.0), (Command(50, 0), Command(1, 0))).clamped(3.0)
+    assert [command.speed for command in track.commands] == [3.0, 1.0]
+    assert said == ["the speed of 50 m/s at 0 s was lowered to 3.00 m/s, the prior's fastest"]
+
+
+@pytest.mark.parametrize(("wrong", "message"), [
+    (lambda: Command(-1, 0), "speed must be"),
+    (lambda: Command(math.nan, 0), "speed must be"),
+    (lambda: Command(1, math.inf), "heading must be"),
+    (lambda: Command(1, 0, math.nan), "facing must be"),
+    (lambda: CommandTrack((), ()), "at least one"),
+    (lambda: CommandTrack((1.0, 1.0), (Command(1, 0),) * 2), "must rise, got 1 s after 1 s"),
+    (lambda: Limits(turn_rate=0), "turn_rate must be positive"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(wrong, message):
+    with pytest.raises(RequestError, match=message):
+        wrong()
+
+
+@pytest.fixture
+def read(tmp_path):
+    def written(text: str, encoding: str = "utf-8"):
+        (tmp_path / "commands.csv").write_bytes(text.encode(encoding))
+        return read_commands(tmp_path / "commands.csv")
+
+    return written
+
+
+def test_columns_in_any_order_with_a_facing_that_may_be_empty(read):
+    track = read("\ufeffheading_deg, time_s,speed_mps,facing_deg\r\n90,0,1.2,\r\n\r\n0,2.5,0,-90\r\n")
+    assert track.times == (0, 2.5)
+    assert [(c.speed, c.heading, c.facing) for c in track.commands] == [
+        (1.2, pytest.approx(math.pi / 2), None), (0, 0, pytest.approx(-math.pi / 2))]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "line", "message"), [
+    ("", None, "the file is empty"),
+    ("\n\n", 1, "has no column time_s, speed_mps, heading_deg"),
+    ("time_s,heading_deg\n0,1\n", 1, "has no column speed_mps"),
+    ("time_s,speed_mps,heading_deg,gait\n0,1,0,run\n", 1, "found the columns"),
+    ("time_s,speed_mps,heading_deg,time_s\n0,1,0,1\n", 1, "each once"),
+    ("time_s,speed_mps,heading_deg\n", None, "holds no commands"),
+    ("time_s,speed_mps,heading_deg\n0,1\n", 2, "found 2 values where 3 belong"),
+    ("time_s,speed_mps,heading_deg\n0,nan,0\n", 2, "speed_mps must be a number, got"),
+    ("time_s,speed_mps,heading_deg\n0,1,inf\n", 2, "heading_deg must be a number"),
+    ("time_s,speed_mps,heading_deg\n0,fast,0\n", 2, "speed_mps must be a number, got"),
+    ("time_s,speed_mps,heading_deg\n0,-1,0\n", 2, "between 0 and 1000"),
+    ("time_s,speed_mps,heading_deg\n2,1,0\n1,1,0\n", 3, "time_s must rise, got 1 after 2"),
+    ("time_s,speed_mps,heading_deg\n-1,1,0\n", 2, "time_s must lie"),
+])  # fmt: skip
+def test_bad_files_are_named_with_their_line(read, text, line, message):
+    with pytest.raises(FileFormatError, match=message) as told:
+        read(text)
+    assert told.value.line == line
+
+
+def test_a_binary_file_is_no_script(read):
+    with pytest.raises(FileFormatError, match="not a text file"):
+        read("time_s\xff", encoding="latin-1")
