@@ -29,6 +29,7 @@ from mapctl.terms import Footing, Noise, Term, Travel
 
 _OWED = 60  # wishes of the past that are kept: more than the travel term looks back on
 _RECENT = 15  # frames of the half second whose wishes must not be missed by far
+_MOVING = 0.3  # m/s below which a direction of travel means nothing
 _NEAREST = 6  # starts nearest to the wanted speed, of which one is drawn
 
 
@@ -135,11 +136,14 @@ def step(
     """The next frames under a command. With `seconds`, the best found by then, and a note that says so."""
     began = time.perf_counter()
     settings = state.settings
+    stuck = _behind(state) > settings.stuck
+    if stuck:
+        state = _from_here(state)
     wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
-    done, outcome = _solve(state, _terms(state, wishes), seconds)
+    done, outcome = _solve(state, _terms(state, wishes), seconds, free=stuck)
     if outcome is not Outcome.DONE:
         afresh = replace(state, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
-        done, _ = _solve(afresh, _terms(state, wishes), seconds=0.0)  # the prior's own continuation: never nothing
+        done, _ = _solve(afresh, _terms(state, wishes), 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
     motion = decode(new, state.committed.place, skeleton=state.skeleton)
     record, own = done.windows[-1], tuple(wishes[: settings.commit])
@@ -154,12 +158,12 @@ def step(
     return following, frames
 
 
-def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None) -> tuple[Committed, Outcome]:
+def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool) -> tuple[Committed, Outcome]:
     settings = state.settings
     budget = Budget(evaluations=settings.evaluations, seconds=seconds)
     method: Method = LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=settings.evaluations), budget=budget)
-    if _behind(state) > settings.stuck:
-        half = replace(method, budget=replace(budget, evaluations=settings.evaluations // 2))
+    if free:
+        half = replace(method, budget=Budget(max(1, settings.evaluations // 2), seconds and seconds / 2))
         method = _StepFirst(half, [term for term in terms if term.name != settings.footing.name])
     window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = WindowSolver(state.prior, window, state.skeleton, method=method)
@@ -182,10 +186,8 @@ class _StepFirst:
         self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
         seconds: float = math.inf,
     ) -> SolvedWindow:  # fmt: skip
-        began = time.perf_counter()
         first = self.half(context, self.loose, tail, generator, seconds=seconds / 2)
-        left = max(0.0, seconds - (time.perf_counter() - began))
-        second = self.half(context, terms, first.carry, generator, seconds=left)
+        second = self.half(context, terms, first.carry, generator, seconds=seconds / 2)
         return replace(second, evaluations=first.evaluations + second.evaluations)
 
 
@@ -197,6 +199,19 @@ def _behind(state: SteerState) -> float:
         return 0.0
     travelled = (past[-1] - past[-1 - count]) * PRIOR_FPS / count
     return float((travelled - state.owed[-count:].mean(0)).norm())
+
+
+def _from_here(state: SteerState) -> SteerState:
+    """The state with a wish that begins anew from how the character moves and faces, and nothing owed.
+
+    A wish that ran ahead (a walk off to the side of who stands and faces elsewhere) leads no search there.
+    """
+    past, facing = state.committed.joints_world[-_RECENT - 1 :, 0, ::2], float(state.committed.place.heading)
+    velocity = (past[-1] - past[0]) * PRIOR_FPS / _RECENT
+    speed = float(velocity.norm())
+    heading = math.atan2(*velocity.tolist()) if speed > _MOVING else facing
+    wish = Wish(speed, heading, facing)
+    return replace(state, wish=wish, owed=torch.tensor([wish.velocity]).expand(_RECENT, 2))
 
 
 def _terms(state: SteerState, wishes: Sequence[Wish]) -> Sequence[Term]:

@@ -8,6 +8,7 @@ import torch
 from helpers import generator, tiny_density
 
 from controllers import steer
+from controllers.bench_steer import SteeringSettings, steering
 from controllers.loop import LoopSettings, Recorder, StepRecord, StreamClock, WallClock, drive, timing
 from controllers.steer import SteerSettings
 from mapctl.errors import RequestError
@@ -182,3 +183,12 @@ def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
     assert timing(records)["command_latency_s"] == pytest.approx(0.2)
     assert timing(records)["frame_ms_p50"] == pytest.approx(20)
     assert timing(records)["evaluations_per_frame"] == pytest.approx(4 / 3)
+
+
+def test_the_bench_sorts_changes_by_kind_and_counts_them_all():
+    rows = steering(DENSITY, SteeringSettings(commands=6, shortest=0.2, longest=0.3, seed=2))
+    *kinds, whole = rows
+    assert whole["change"] == "all"
+    assert sum(row["commands"] for row in kinds) == whole["commands"] == 6
+    assert all(0 <= row["reached"] <= row["commands"] for row in rows)
+    assert whole["frame_ms_p50"] > 0

@@ -17,18 +17,19 @@ class Bench:
 
     what: Positional[
         Annotated[
-            Literal["speed", "ablation", "free-run", "generation"], arg(metavar="speed|ablation|free-run|generation")
+            Literal["speed", "ablation", "free-run", "generation", "steer"],
+            arg(metavar="speed|ablation|free-run|generation|steer"),
         ]
     ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
     `free-run`: 8 random motions of 10,000 frames beside the training data; `generation`: raw, refined and finished
-    motion beside mocap that training did not see."""
+    motion beside mocap that training did not see; `steer`: random commands, which are reached and how soon."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     data: options.MaybeFile = None
     """For `generation`: the folder that the prior was trained on; its held-out clips are looked up there."""
     count: options.Count = 48
-    """For `generation`: clips of 10 s to draw."""
+    """For `generation`: clips of 10 s to draw; for `steer`: commands to give."""
     refiner: options.Name = "auto"
     """For `generation`: a bundled refiner, or the file or run folder of a trained one; auto is the prior's own."""
     json: bool = False
@@ -44,6 +45,10 @@ class Bench:
         prior = priors.load(self.prior)
         if self.what == "generation":
             rows = self._generation(prior)
+        elif self.what == "steer":
+            from controllers.bench_steer import SteeringSettings, steering
+
+            rows = steering(prior, SteeringSettings(commands=self.count))
         else:
             rows = {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what](prior)
         if self.json:

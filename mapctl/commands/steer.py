@@ -93,7 +93,7 @@ class Steer:
         from controllers.loop import LoopSettings, Recorder, StreamClock, WallClock, drive
 
         first, recorder = track.commands[0], Recorder()
-        frames = options.frames_of(track.times[-1] if len(track.times) > 1 else track.times[0] + _LAST_HELD)
+        frames = options.frames_of(track.times[-1] + (_LAST_HELD if len(track.times) == 1 else 0.0))
         state, pose = steer.begin(prior, first, generator=torch.Generator().manual_seed(self.seed))
         recorder.show(pose, 0.0)
         for _ in range(2):  # what the machine compiles or loads on first use must not cost the first frames
