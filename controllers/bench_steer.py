@@ -10,6 +10,8 @@ import torch
 
 from controllers import steer
 from controllers.loop import LoopSettings, Recorder, drive, timing
+from controllers.pursuit import Pursuit
+from mapctl import curves
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics import measure
 from mapctl.metrics.travel import by_command
@@ -54,6 +56,23 @@ def steering(prior: Any, settings: SteeringSettings | None = None) -> list[Row]:
              "contact_speed_cm_s": feet["contact_speed_cm_s"], "jitter_m_s3": feet["jitter_m_s3"]}  # fmt: skip
     return [*({"change": kind, **_summary(some)} for kind, some in sorted(kinds.items())),
             {"change": "all", **_summary(rows[1:]), **whole}]  # fmt: skip
+
+
+def pursued(prior: Any, seed: int = 0) -> list[Row]:
+    """Curves walked live at 1 m/s by looking half a metre ahead."""
+    rows = []
+    for name, seconds in (("circle:2", 13.0), ("wave:1x8", 8.5)):
+        curve = curves.read(name)
+        pursuit, recorder = Pursuit(curve, speed=1.0), Recorder()
+        x, z = curve.point(0.0)[[0, -1]].tolist()
+        state, first = steer.begin(prior, pursuit.first, generator=torch.Generator().manual_seed(seed), at=(x, z))
+        recorder.show(first, 0.0)
+        drive(state, pursuit, [recorder, pursuit], frames=round(seconds * PRIOR_FPS),
+              settings=LoopSettings(realtime=False))  # fmt: skip
+        found = measure(recorder.motion(), curve)
+        rows.append({"change": f"live along {name}", **{key: found[key] for key in
+                     ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")}})  # fmt: skip
+    return rows
 
 
 def _random_track(settings: SteeringSettings, generator: torch.Generator) -> CommandTrack:

@@ -106,10 +106,10 @@ class SteerFrames:
 
 
 def begin(
-    prior: Any, command: Command, *, generator: torch.Generator, settings: SteerSettings | None = None,
-    skeleton: Skeleton = CANONICAL,
+    prior: Any, command: Command, *, generator: torch.Generator, at: tuple[float, float] = (0.0, 0.0),
+    settings: SteerSettings | None = None, skeleton: Skeleton = CANONICAL,
 ) -> tuple[SteerState, SteerFrames]:  # fmt: skip
-    """A character at the origin that faces along the command, and its first pose.
+    """A character at x and z (metres) that faces along the command, and its first pose.
 
     It is one of the prior's starts near the wanted speed, drawn by the generator: the data's slowest for a command to
     stand.
@@ -117,7 +117,7 @@ def begin(
     near = (prior.starts.speed - command.speed).abs().argsort()[:_NEAREST]
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
     state = prior.starts.state.pick(torch.tensor([pick]))
-    first, place = state.previous, Place(torch.zeros(2), torch.tensor(command.heading))
+    first, place = state.previous, Place(torch.tensor(at), torch.tensor(command.heading))
     before = place.before(
         LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
     )

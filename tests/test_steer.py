@@ -10,7 +10,9 @@ from helpers import generator, tiny_density
 from controllers import steer
 from controllers.bench_steer import SteeringSettings, steering
 from controllers.loop import LoopSettings, Recorder, StepRecord, StreamClock, WallClock, drive, timing
+from controllers.pursuit import Pursuit
 from controllers.steer import SteerSettings
+from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.steering import Command, CommandTrack
 
@@ -192,3 +194,21 @@ def test_the_bench_sorts_changes_by_kind_and_counts_them_all():
     assert sum(row["commands"] for row in kinds) == whole["commands"] == 6
     assert all(0 <= row["reached"] <= row["commands"] for row in rows)
     assert whole["frame_ms_p50"] > 0
+
+
+def test_pursuit_heads_for_the_curve_ahead_of_the_character():
+    curve = curves.line(length=10)
+    pursuit = Pursuit(curve, speed=1.0, look_ahead=0.5)
+    assert pursuit.at(0).heading == pytest.approx(curve.start_heading)
+    x, z = curve.point(0.3)[[0, -1]].tolist()
+    _, first = steer.begin(DENSITY, AHEAD, generator=generator(), at=(x + 0.5, z))
+    pursuit.show(first, 0.0)
+    assert pursuit.at(0.1).heading == pytest.approx(-math.pi / 4, abs=0.02)
+    assert pursuit.arc == pytest.approx(0.3, abs=0.01)
+
+
+def test_pursuit_is_both_ends_of_a_loop():
+    pursuit = Pursuit(curves.circle(radius=2), speed=1.0)
+    state, _ = begun(pursuit.first)
+    _, records = drive(state, pursuit, [pursuit], frames=10)
+    assert len(records) == 3

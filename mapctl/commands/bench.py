@@ -46,9 +46,9 @@ class Bench:
         if self.what == "generation":
             rows = self._generation(prior)
         elif self.what == "steer":
-            from controllers.bench_steer import SteeringSettings, steering
+            from controllers.bench_steer import SteeringSettings, pursued, steering
 
-            rows = steering(prior, SteeringSettings(commands=self.count))
+            rows = [*steering(prior, SteeringSettings(commands=self.count)), *pursued(prior)]
         else:
             rows = {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what](prior)
         if self.json:
