@@ -64,7 +64,7 @@ def choose_start(
     best = (0.1 * energy + _oddness(features, wanted, fps)).argsort()[:_AMONG_BEST]
     pick = int(best[torch.randint(len(best), (1,), generator=generator)])
     place = Place(places.position_xz[pick], places.heading[pick])
-    return _standing(state.pick(torch.tensor([pick])), place, skeleton)
+    return standing(state.pick(torch.tensor([pick])), place, skeleton)
 
 
 def _oddness(features: Float[Tensor, "starts frames size"], wanted: float, fps: float) -> Float[Tensor, " starts"]:
@@ -87,7 +87,8 @@ def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Te
     return sideways[:, edge:-edge].square().mean(-1).sqrt()
 
 
-def _standing(state: Any, place: Place, skeleton: Skeleton) -> Start:
+def standing(state: Any, place: Place, skeleton: Skeleton) -> Start:
+    """A density's state (batch of one) as the beginning of a motion whose first frame stands at a place."""
     first = state.previous
     before = place.before(
         LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]

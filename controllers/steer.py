@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.starting import standing
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
 from mapctl.motion import Motion
@@ -117,17 +118,13 @@ def begin(
     near = (prior.starts.speed - command.speed).abs().argsort()[:_NEAREST]
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
     state = prior.starts.state.pick(torch.tensor([pick]))
-    first, place = state.previous, Place(torch.tensor(at), torch.tensor(command.heading))
-    before = place.before(
-        LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
-    )
-    motion = decode(first, before, skeleton=skeleton)
-    joints = motion.joint_positions().to(first.dtype)
-    committed = Committed(state, place, first, joints, first.new_zeros(0, LAYOUT.continuous))
+    start = standing(state, Place(torch.tensor(at), torch.tensor(command.heading)), skeleton)
+    first = start.committed.features
+    motion = decode(first, start.before_first, skeleton=skeleton)
     wish = Wish(float(ground_speed(first)[0]), command.heading, command.heading)
-    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), (wish,), joints[:0], Ledger())
+    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), (wish,), start.committed.joints_world[:0], Ledger())
     chosen = settings or SteerSettings()
-    return SteerState(prior, chosen, skeleton, committed, wish, torch.tensor([wish.velocity])), frames
+    return SteerState(prior, chosen, skeleton, start.committed, wish, torch.tensor([wish.velocity])), frames
 
 
 def step(
