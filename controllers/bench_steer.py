@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from controllers import steer
-from controllers.loop import LoopSettings, Recorder, drive, timing
+from controllers.loop import Recorder, drive, timing
 from controllers.pursuit import Pursuit
 from mapctl import curves
 from mapctl.features import PRIOR_FPS
@@ -45,7 +45,7 @@ def steering(prior: Any, settings: SteeringSettings | None = None) -> list[Row]:
     recorder = Recorder()
     recorder.show(first, 0.0)
     frames = round(track.times[-1] * PRIOR_FPS)
-    _, records = drive(state, track, [recorder], frames=frames, settings=LoopSettings(realtime=False))
+    _, records = drive(state, track, [recorder], frames=frames)
     motion = recorder.motion(frames)
     rows = by_command(motion, track)[:-1]
     kinds: dict[str, list[Row]] = {}
@@ -67,8 +67,7 @@ def pursued(prior: Any, seed: int = 0) -> list[Row]:
         x, z = curve.point(0.0)[[0, -1]].tolist()
         state, first = steer.begin(prior, pursuit.first, generator=torch.Generator().manual_seed(seed), at=(x, z))
         recorder.show(first, 0.0)
-        drive(state, pursuit, [recorder, pursuit], frames=round(seconds * PRIOR_FPS),
-              settings=LoopSettings(realtime=False))  # fmt: skip
+        drive(state, pursuit, [recorder, pursuit], frames=round(seconds * PRIOR_FPS))
         found = measure(recorder.motion(), curve)
         rows.append({"change": f"live along {name}", **{key: found[key] for key in
                      ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")}})  # fmt: skip

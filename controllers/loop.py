@@ -44,6 +44,9 @@ class Display(Protocol):
 class Clock(Protocol):
     """Seconds of the stream."""
 
+    real: bool
+    """Whether time passes by itself, so that a step has a deadline."""
+
     def now(self) -> float:
         """The time."""
         ...
@@ -55,6 +58,8 @@ class Clock(Protocol):
 
 class WallClock:
     """Real time, from the making on."""
+
+    real = True
 
     def __init__(self):
         self._began = time.perf_counter()
@@ -71,6 +76,8 @@ class WallClock:
 
 class StreamClock:
     """Time that passes only by waiting: as fast as the machine can, and nothing is ever late."""
+
+    real = False
 
     def __init__(self):
         self._now = -1.0
@@ -90,8 +97,6 @@ class LoopSettings:
 
     margin: float = 0.022
     """Seconds before frames are due at which the search for them ends: what is left to do then takes that long."""
-    realtime: bool = True
-    """Whether steps have a deadline at all."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ def drive(
             due = state.frames / PRIOR_FPS
             clock.wait_until(begun + due - lead)
             asked = clock.now() - begun
-            left = due - asked - settings.margin if settings.realtime else None
+            left = due - asked - settings.margin if clock.real else None
             state, new = step(state, source.at(asked), seconds=None if left is None else max(0.0, left))
             for display in displays:
                 display.show(new, due)

@@ -20,7 +20,7 @@ from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
-from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.solver.methods import LatentMethod, Method, SolvedWindow
 from mapctl.solver.result import Ledger, Outcome
 from mapctl.solver.variables import Context
@@ -144,7 +144,7 @@ def step(
     new = done.features[-settings.commit :]
     motion = decode(new, state.committed.place, skeleton=state.skeleton)
     record, own = done.windows[-1], tuple(wishes[: settings.commit])
-    short = record.outcome == "out of budget" and record.evaluations < settings.evaluations
+    short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations" if short else ""
     forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
     frames = SteerFrames(motion, LAYOUT.pick(new, "contacts"), own, forecast, done.ledger, record.evaluations,
@@ -190,12 +190,15 @@ class _StepFirst:
 
 def _behind(state: SteerState) -> float:
     """How far the mean velocity of the last half second missed its wishes, m/s."""
-    past = state.committed.joints_world[-_RECENT - 1 :, 0, ::2]
-    count = min(len(past) - 1, len(state.owed))
-    if count < _RECENT:
+    if min(len(state.committed.joints_world) - 1, len(state.owed)) < _RECENT:
         return 0.0
-    travelled = (past[-1] - past[-1 - count]) * PRIOR_FPS / count
-    return float((travelled - state.owed[-count:].mean(0)).norm())
+    return float((_recent_velocity(state) - state.owed[-_RECENT:].mean(0)).norm())
+
+
+def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
+    """Of the hips over the ground, mean of the last half second, m/s."""
+    past = state.committed.joints_world[-_RECENT - 1 :, 0, ::2]
+    return (past[-1] - past[0]) * PRIOR_FPS / _RECENT
 
 
 def _from_here(state: SteerState) -> SteerState:
@@ -203,8 +206,7 @@ def _from_here(state: SteerState) -> SteerState:
 
     A wish that ran ahead (a walk off to the side of who stands and faces elsewhere) leads no search there.
     """
-    past, facing = state.committed.joints_world[-_RECENT - 1 :, 0, ::2], float(state.committed.place.heading)
-    velocity = (past[-1] - past[0]) * PRIOR_FPS / _RECENT
+    velocity, facing = _recent_velocity(state), float(state.committed.place.heading)
     speed = float(velocity.norm())
     heading = math.atan2(*velocity.tolist()) if speed > _MOVING else facing
     wish = Wish(speed, heading, facing)

@@ -11,7 +11,7 @@ from mapctl.steering import CommandTrack, as_track
 
 _NEEDED = ("time_s", "speed_mps", "heading_deg")
 _ALLOWED = (*_NEEDED, "facing_deg")
-_MOST_SPEED, _MOST_ANGLE, _MOST_TIME = 1000.0, 1e6, 1e6
+_MOST_SPEED, _MOST_TIME, _MOST = 1000.0, 1e6, 1e6
 
 
 def read_commands(path: str | PathLike[str]) -> CommandTrack:
@@ -42,7 +42,9 @@ def read_commands(path: str | PathLike[str]) -> CommandTrack:
     return as_track(rows)
 
 
-def _row(path: str | PathLike[str], number: int, words: list[str], names: list[str], order: list[int]):
+def _row(
+    path: str | PathLike[str], number: int, words: list[str], names: list[str], order: list[int]
+) -> tuple[float, ...]:
     """Values of a line, in the order of _ALLOWED."""
     if len(words) != len(names):
         raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
@@ -61,6 +63,6 @@ def _number(path: str | PathLike[str], line: int, name: str, word: str) -> float
         value = float(word)
     except ValueError:
         value = math.nan
-    if not abs(value) <= max(_MOST_SPEED, _MOST_ANGLE):
+    if not abs(value) <= _MOST:
         raise FileFormatError(path, f"{name} must be a number, got {shorten(word)}", line)
     return value

@@ -74,7 +74,8 @@ class Limits:
     braking: float = 2.0
     """Of the speed, m/s^2, falling."""
     turn_rate: float = 2.5
-    """Of the direction, radians/s. Clips of the data turn by 1.15 a second at most; a reversal has to be faster."""
+    """Of the direction, radians/s. More than the one-second means of a walk's data show
+    (`Abilities.turn_rate`): a reversal has to be faster."""
 
     def __post_init__(self):
         for name in ("acceleration", "braking", "turn_rate"):

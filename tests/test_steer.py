@@ -9,7 +9,7 @@ from helpers import generator, tiny_density
 
 from controllers import steer
 from controllers.bench_steer import SteeringSettings, steering
-from controllers.loop import LoopSettings, Recorder, StepRecord, StreamClock, WallClock, drive, timing
+from controllers.loop import Recorder, StepRecord, StreamClock, WallClock, drive, timing
 from controllers.pursuit import Pursuit
 from controllers.steer import SteerSettings
 from mapctl import curves
@@ -132,8 +132,7 @@ def test_in_stream_time_nothing_is_late_and_the_result_is_always_the_same():
     motions = []
     for _ in range(2):
         state, recorder = begun()[0], Recorder()
-        _, records = drive(state, CommandTrack((0.0, 0.5), (AHEAD, Command(0.5, 1.0))), [recorder], frames=30,
-                           settings=LoopSettings(realtime=False))  # fmt: skip
+        _, records = drive(state, CommandTrack((0.0, 0.5), (AHEAD, Command(0.5, 1.0))), [recorder], frames=30)
         assert timing(records)["late_frames"] == 0
         motions.append(recorder.motion().local_quat_xyzw)
     assert torch.equal(*motions)
@@ -141,6 +140,8 @@ def test_in_stream_time_nothing_is_late_and_the_result_is_always_the_same():
 
 class Slow(StreamClock):
     """Half a second passes whenever the time is asked."""
+
+    real = True
 
     def now(self):
         self._now += 0.5

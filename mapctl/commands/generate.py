@@ -46,7 +46,7 @@ class Generate:
     """A bundled refiner, or the file or run folder of a trained one, to go before the footing pass. auto: the prior's
     own where there is no footing pass, and none before one, which measures better alone."""
     no_footing: bool = False
-    """Leave out the pass that makes planted feet stand: forty times faster, with the refiner's feet."""
+    """Leave out the pass that makes planted feet stand: many times faster, with the refiner's feet."""
     no_refine: bool = False
     """Leave the draws as they are: no refiner, and no pass that makes planted feet stand."""
     quiet: bool = False

@@ -90,7 +90,7 @@ class Steer:
         import torch
 
         from controllers import steer
-        from controllers.loop import LoopSettings, Recorder, StreamClock, WallClock, drive
+        from controllers.loop import Recorder, StreamClock, WallClock, drive
 
         first, recorder = track.commands[0], Recorder()
         frames = options.frames_of(track.times[-1] + (_LAST_HELD if len(track.times) == 1 else 0.0))
@@ -101,8 +101,7 @@ class Steer:
         clock = WallClock() if self.realtime else StreamClock()
         with bar("steering", quiet=self.quiet) as progress:
             displays = [recorder] if progress is None else [recorder, _Progress(progress, frames)]
-            _, records = drive(state, track, displays, frames=frames, clock=clock,
-                               settings=LoopSettings(realtime=self.realtime))  # fmt: skip
+            _, records = drive(state, track, displays, frames=frames, clock=clock)
         return recorder, records, frames
 
     def _report(
