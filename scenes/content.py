@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from scenes import colours
-from scenes.body import Body
+from mapctl.body import colours
+from mapctl.body.mannequin import Body
+from mapctl.body.shapes import Array, Surface
 from scenes.cameras import View
-from scenes.shapes import Array, Surface
 
 
 @dataclass(frozen=True, eq=False)

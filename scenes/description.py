@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from mapctl import curves
+from mapctl.body import colours
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, MapctlError, RequestError
-from scenes import colours
 from scenes.cameras import CameraSettings
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -43,7 +43,7 @@ class Actor:
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Of everything random about this actor."""
     colour: str | None = None
-    """Of the torso: a name from `scenes.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
+    """Of the torso: a name from `mapctl.body.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
     offset: tuple[Place, Place] = (0.0, 0.0)
     """Where the curve's origin goes, x and z, metres."""
     turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from mapctl.body.shapes import Array
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
 from scenes.cameras import CameraSettings
 from scenes.content import Painter
 from scenes.painters import RendererName, painter
-from scenes.shapes import Array
 from scenes.sheet import contact_sheet
 from scenes.stage import Shot, Stage
 from scenes.writers import gif_writer, mp4_writer, save_png

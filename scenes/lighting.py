@@ -6,8 +6,8 @@ bright rim that lifts a figure off the ground. All in linear light; sRGB in and 
 
 import numpy as np
 
+from mapctl.body.shapes import Array, Surface, unit
 from scenes.overlays import LIGHT
-from scenes.shapes import Array, Surface, unit
 
 _KEY, _WRAP = 0.78, 0.25
 _SKY, _FLOOR = np.array([0.40, 0.42, 0.46]), np.array([0.20, 0.19, 0.18])

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from mapctl.body import colours
+from mapctl.body.shapes import Array, Surface, merge
 from mapctl.errors import MapctlError
-from scenes import colours
 from scenes.cameras import View
 from scenes.content import Content
 from scenes.lighting import shade
 from scenes.overlays import shadow
-from scenes.shapes import Array, Surface, merge
 
 _NEAR, _FAR = 0.3, 400.0
 

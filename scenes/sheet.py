@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes import colours
+from mapctl.body import colours
+from mapctl.body.shapes import Array
 from scenes.cameras import CameraSettings
 from scenes.content import Painter
-from scenes.shapes import Array
 from scenes.stage import Stage
 
 _GAP = 0.008

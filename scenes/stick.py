@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from scenes import colours
+from mapctl.body import colours
+from mapctl.body.shapes import Array, Surface
 from scenes.cameras import View
 from scenes.content import Content, Figure
 from scenes.overlays import LIGHT
-from scenes.shapes import Array, Surface
 
 _NEAR = 0.1
 """Nothing closer to the camera than this is drawn, metres."""

@@ -118,7 +118,7 @@ def test_wrong_imports_are_seen(file, source):
         ("mapctl/cli.py", "import priors, controllers, scenes"),
         ("mapctl/commands/follow.py", "import priors\nfrom mapctl.commands import walks"),
         ("mapctl/terms/path.py", "from ..curves import Curve\nfrom . import noise"),
-        ("scenes/film.py", "import scenes.body\nfrom mapctl.motion import Motion\nimport numpy"),
+        ("scenes/film.py", "import scenes.cameras\nfrom mapctl.motion import Motion\nimport numpy"),
     ],
 )
 def test_right_imports_pass(file, source):

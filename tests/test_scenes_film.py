@@ -9,8 +9,9 @@ import pytest
 from scenes_walks import moved, walk
 
 from mapctl import curves
+from mapctl.body import colours
 from mapctl.errors import RequestError
-from scenes import colours, offscreen, painters
+from scenes import offscreen, painters
 from scenes.cameras import CameraSettings
 from scenes.content import Painter
 from scenes.film import film

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapctl.body import colours
 from mapctl.errors import RequestError
-from scenes import colours, overlays
+from scenes import overlays
 
 
 def area(surface) -> float:

@@ -3,8 +3,8 @@
 import pytest
 from scenes_walks import walk
 
+from mapctl.body.parts import Part, Role, Side, role, roles
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
-from scenes.parts import Part, Role, Side, role, roles
 
 NAMES = {
     (

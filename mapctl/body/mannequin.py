@@ -5,11 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
+from mapctl.body import colours
+from mapctl.body.anatomy import Anatomy, Foot
+from mapctl.body.parts import Part, Side
+from mapctl.body.shapes import Array, RoundedBoxes, Surface, frame_along
 from mapctl.motion import Motion
-from scenes import colours
-from scenes.anatomy import Anatomy, Foot
-from scenes.parts import Part, Side
-from scenes.shapes import Array, RoundedBoxes, Surface, frame_along
 
 # Radii at a bone's start and end in metres, for a leg of 80 cm; a bone belongs to the part it starts at.
 _RADII = {

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes_walks import moved, renamed, scaled, walk
 
+from mapctl.body import colours
+from mapctl.body.anatomy import Anatomy
+from mapctl.body.mannequin import Body
+from mapctl.body.parts import Part, Side
+from mapctl.body.shapes import RoundedBoxes, Surface, ball, frame_along, merge
 from mapctl.skeleton import CANONICAL, Skeleton
-from scenes import colours
-from scenes.anatomy import Anatomy
-from scenes.body import Body
 from scenes.lighting import shade
-from scenes.parts import Part, Side
-from scenes.shapes import RoundedBoxes, Surface, ball, frame_along, merge
 
 GREY = colours.rgb("slate")
 LIMBS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")

@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 
 from mapctl import rotations
+from mapctl.body.parts import Part, Role, Side, roles
+from mapctl.body.shapes import Array, frame_along, unit
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.roles import find_hips
-from scenes.parts import Part, Role, Side, roles
-from scenes.shapes import Array, frame_along, unit
 
 _LEG = 0.80
 """Hip to ankle of the person whose measures this package is written for, metres."""
