@@ -72,6 +72,13 @@ class Body:
         skull = [] if head is None else [_skull(self.anatomy, head, frame, self.colour)]
         return [self._capsules(frame), *skull, *feet]
 
+    def joints(self) -> list[Array]:
+        """For each of `boxes`, the joint that carries each of its parts."""
+        anatomy = self.anatomy
+        head = anatomy.find(Part.HEAD)
+        skull = [] if head is None else [np.array([head, head])]
+        return [self.bones.ends[:, 0], *skull, *(np.array(_carriers(anatomy, foot)) for foot in anatomy.feet)]
+
     def surface(self, frame: int) -> Surface:
         """The whole body in one frame."""
         boxes = self.boxes(frame)
@@ -239,6 +246,11 @@ def _sole(joint: Array, turn: Array, floor: float, along: tuple[float, float], t
     middle = np.array([0.0, floor + thick * scale / 2, sum(along) / 2])
     half = np.array([0.045 * scale, thick * scale / 2, (along[1] - along[0]) / 2])
     return joint + turn @ middle, turn, np.maximum(half - _EDGE * scale, 0.0)
+
+
+def _carriers(anatomy: Anatomy, foot: Foot) -> list[int]:
+    """The joints that carry the boxes of a shoe: ankle, and the toes if the rig has them."""
+    return [foot.ankle] if foot.tip is None else [foot.ankle, foot.ball if foot.ball < anatomy.joints else foot.ankle]
 
 
 def _bones_of(foot: Foot) -> list[tuple[int, int]]:

@@ -22,7 +22,7 @@ class Convert:
     source: options.InFile
     """.bvh or .npz."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
-    """.bvh or .npz."""
+    """.bvh, .npz, or .glb with a skinned body."""
     rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted."""
     fps: Annotated[str | None, arg(metavar="F")] = None

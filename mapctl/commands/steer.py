@@ -30,7 +30,7 @@ class Steer:
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X), and facing_deg for strafing; the last
     line's time is the end."""
     out: options.OutFile
-    """Where the motion goes: .bvh or .npz."""
+    """Where the motion goes: .bvh, .npz or .glb."""
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then."""
     prior: options.Name = "locomotion"

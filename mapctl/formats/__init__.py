@@ -8,8 +8,17 @@ from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import bvh, npz
 from mapctl.motion import Motion
 
+
+def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
+    from mapctl.formats import glb  # late: it draws a body, which the other formats need not load
+
+    glb.save(motion, path)
+
+
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load}
-WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {".bvh": bvh.save, ".npz": npz.save}
+WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
+    ".bvh": bvh.save, ".npz": npz.save, ".glb": _save_glb,
+}  # fmt: skip
 
 
 def load(path: str | PathLike[str]) -> Motion:
@@ -21,7 +30,7 @@ def load(path: str | PathLike[str]) -> Motion:
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
-    """Write a motion as .bvh or .npz, whole or not at all. RequestError if it cannot be written there."""
+    """Write a motion as .bvh, .npz or .glb, whole or not at all. RequestError if it cannot be written there."""
     check_ending(path)
     WRITERS[PurePath(path).suffix.lower()](motion, path)
 

@@ -1,0 +1,125 @@
+"""glTF 2.0 binary out: the skeleton, its animation, and the mannequin as a skinned mesh.
+
+Metres, Y up, as glTF wants. Joints are nodes with their file's names; a joint that travels, the root among them, has a
+translation track, every joint a rotation track at the motion's own frames.
+"""
+
+from os import PathLike
+
+import numpy as np
+import pygltflib as gltf
+
+from mapctl import __version__
+from mapctl.body.skin import Skin, skin
+from mapctl.errors import RequestError
+from mapctl.formats.atomic import write_bytes
+from mapctl.motion import Motion
+from mapctl.rotations import sign_continuous
+
+_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_COMPONENT = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
+
+
+class _Buffer:
+    """The one binary buffer of a file, filled array by array."""
+
+    def __init__(self, document: gltf.GLTF2):
+        self.document, self.blob = document, bytearray()
+
+    def add(self, values: np.ndarray, target: int | None = None) -> int:
+        """Index of a new accessor over the values, (n,) or (n, width); with smallest and largest."""
+        table = np.ascontiguousarray(values).reshape(len(values), -1)
+        view = gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=table.nbytes, target=target)
+        self.blob += table.tobytes()
+        self.blob += bytes(-len(self.blob) % 4)
+        self.document.bufferViews.append(view)
+        self.document.accessors.append(gltf.Accessor(
+            bufferView=len(self.document.bufferViews) - 1, componentType=_COMPONENT[table.dtype.name], count=len(table),
+            type=_KINDS[table.shape[1]], min=table.min(0).tolist(), max=table.max(0).tolist(),
+        ))  # fmt: skip
+        return len(self.document.accessors) - 1
+
+
+def save(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write the motion with its skinned mannequin. Same motion, same bytes. RequestError where it holds a NaN."""
+    write_bytes(path, to_bytes(motion, path=path))
+
+
+def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> bytes:
+    """The whole file; `path` is what an error names."""
+    if not (motion.root_position.isfinite().all() and motion.local_quat_xyzw.isfinite().all()):
+        raise RequestError(f"cannot write {path}: the motion is not finite")
+    document = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator=f"mapctl {__version__}"))
+    buffer = _Buffer(document)
+    joints = motion.num_joints
+    document.nodes = _nodes(motion)
+    document.meshes = [_mesh(motion, skin(motion), buffer)]
+    rest = _rest_world(motion)
+    inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
+    inverse[:, 3, :3] = -rest  # column-major: the translation is the last row here
+    document.skins = [gltf.Skin(joints=list(range(joints)), skeleton=0,
+                                inverseBindMatrices=buffer.add(inverse.reshape(joints, 16)))]  # fmt: skip
+    document.nodes.append(gltf.Node(name="mannequin", mesh=0, skin=0))
+    document.scenes = [gltf.Scene(nodes=[0, len(document.nodes) - 1])]
+    document.scene = 0
+    document.animations = [_animation(motion, buffer)]
+    document.materials = [gltf.Material(name="mannequin", pbrMetallicRoughness=gltf.PbrMetallicRoughness(
+        baseColorFactor=[1.0, 1.0, 1.0, 1.0], metallicFactor=0.0, roughnessFactor=0.8))]  # fmt: skip
+    document.buffers = [gltf.Buffer(byteLength=len(buffer.blob))]
+    document.set_binary_blob(bytes(buffer.blob))
+    return b"".join(document.save_to_bytes())
+
+
+def _nodes(motion: Motion) -> list[gltf.Node]:
+    """A node a joint, in file order, then one for each End Site."""
+    skeleton, offsets = motion.skeleton, motion.skeleton.offsets.clone()
+    offsets[0] = motion.root_position[0]
+    for joint, track in motion.moving_offsets.items():
+        offsets[joint] = track[0]
+    below = [skeleton.children(joint) for joint in range(motion.num_joints)]
+    for number, name in enumerate(skeleton.end_offsets):
+        below[skeleton.index(name)].append(motion.num_joints + number)
+    joints = [gltf.Node(name=name, children=children, translation=offset.tolist())
+              for name, children, offset in zip(skeleton.names, below, offsets, strict=True)]  # fmt: skip
+    ends = [gltf.Node(name=f"{name}_end", translation=list(at)) for name, at in skeleton.end_offsets.items()]
+    return [*joints, *ends]
+
+
+def _rest_world(motion: Motion) -> np.ndarray:
+    """(joints, 3) joints with all rotations zero and the root at the origin, metres."""
+    offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
+    for joint, parent in enumerate(motion.skeleton.parents):
+        rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
+    return rest
+
+
+def _mesh(motion: Motion, body: Skin, buffer: _Buffer) -> gltf.Mesh:
+    vertices = body.vertices + _rest_world(motion)[body.joint]  # in the rest pose joint frames are not turned
+    carrier = np.zeros((len(body.joint), 4), np.uint16)
+    carrier[:, 0] = body.joint
+    weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(carrier), 1))
+    linear = np.where(body.rgb <= 0.04045, body.rgb / 12.92, ((body.rgb + 0.055) / 1.055) ** 2.4)  # glTF's colours
+    attributes = gltf.Attributes(
+        POSITION=buffer.add(vertices.astype(np.float32), gltf.ARRAY_BUFFER),
+        NORMAL=buffer.add(body.normals.astype(np.float32), gltf.ARRAY_BUFFER),
+        COLOR_0=buffer.add(linear.astype(np.float32), gltf.ARRAY_BUFFER),
+        JOINTS_0=buffer.add(carrier, gltf.ARRAY_BUFFER),
+        WEIGHTS_0=buffer.add(weight, gltf.ARRAY_BUFFER),
+    )
+    faces = buffer.add(body.faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
+    return gltf.Mesh(name="mannequin", primitives=[gltf.Primitive(attributes=attributes, indices=faces, material=0)])
+
+
+def _animation(motion: Motion, buffer: _Buffer) -> gltf.Animation:
+    times = buffer.add((np.arange(motion.num_frames) / float(motion.fps)).astype(np.float32))
+    animation = gltf.Animation(name="motion", channels=[], samplers=[])
+    travelling = {0: motion.root_position, **motion.moving_offsets}
+    quats = sign_continuous(motion.local_quat_xyzw)
+    tracks = [(joint, "translation", values) for joint, values in travelling.items()]
+    tracks += [(joint, "rotation", quats[:, joint]) for joint in range(motion.num_joints)]
+    for joint, path, values in tracks:
+        output = buffer.add(values.numpy().astype(np.float32))
+        animation.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
+        target = gltf.AnimationChannelTarget(node=joint, path=path)
+        animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+    return animation
