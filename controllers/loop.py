@@ -5,7 +5,7 @@ shown, so a command waits for two steps at most: 0.2 s at three frames a step.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
@@ -157,30 +157,40 @@ class Recorder:
         return ledger
 
 
+def steps(
+    state: SteerState, source: Source, displays: Sequence[Display], *, clock: Clock,
+    settings: LoopSettings | None = None,
+) -> Iterator[tuple[SteerState, StepRecord]]:  # fmt: skip
+    """Steer without end, a step at a time; the first pose counts as delivered.
+
+    Frame k is due at second k / PRIOR_FPS. The clock starts a step before that.
+    """
+    settings = settings or LoopSettings()
+    lead = state.settings.commit / PRIOR_FPS
+    begun = clock.now() - state.frames / PRIOR_FPS + lead
+    while True:
+        due = state.frames / PRIOR_FPS
+        clock.wait_until(begun + due - lead)
+        asked = clock.now() - begun
+        left = due - asked - settings.margin if clock.real else None
+        state, new = step(state, source.at(asked), seconds=None if left is None else max(0.0, left))
+        for display in displays:
+            display.show(new, due)
+        delivered = clock.now() - begun
+        yield state, StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, new.note)
+
+
 def drive(
     state: SteerState, source: Source, displays: Sequence[Display], *, frames: int, clock: Clock | None = None,
     settings: LoopSettings | None = None, stop: Callable[[], bool] = lambda: False,
 ) -> tuple[SteerState, list[StepRecord]]:  # fmt: skip
-    """Steer until `frames` have been delivered, or `stop()` says so, or Ctrl-C; the first pose counts as delivered.
-
-    Frame k is due at second k / PRIOR_FPS. The clock starts a step before that.
-    """
-    clock, settings = clock or StreamClock(), settings or LoopSettings()
+    """Steer until `frames` have been delivered, or `stop()` says so, or Ctrl-C."""
     records: list[StepRecord] = []
-    lead = state.settings.commit / PRIOR_FPS
-    begun = clock.now() - state.frames / PRIOR_FPS + lead
+    stream = steps(state, source, displays, clock=clock or StreamClock(), settings=settings)
     try:
         while state.frames < frames and not stop():
-            due = state.frames / PRIOR_FPS
-            clock.wait_until(begun + due - lead)
-            asked = clock.now() - begun
-            left = due - asked - settings.margin if clock.real else None
-            state, new = step(state, source.at(asked), seconds=None if left is None else max(0.0, left))
-            for display in displays:
-                display.show(new, due)
-            delivered = clock.now() - begun
-            records.append(StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations,
-                                      new.note))  # fmt: skip
+            state, record = next(stream)
+            records.append(record)
     except KeyboardInterrupt:
         if not records:
             raise

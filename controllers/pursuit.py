@@ -28,6 +28,11 @@ class Pursuit:
         """What to begin with, at the curve's first point."""
         return Command(self.speed, self.curve.start_heading)
 
+    @property
+    def left(self) -> float | None:
+        """Metres to the end of an open curve from where the character was last nearest to; None on a closed one."""
+        return None if self.curve.closed else self.curve.length - self.arc
+
     def show(self, frames: SteerFrames, due: float) -> None:
         """See Display."""
         self.place = frames.motion.root_position[-1, ::2]

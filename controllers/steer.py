@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -112,12 +113,13 @@ def begin(
 ) -> tuple[SteerState, SteerFrames]:  # fmt: skip
     """A character at x and z (metres) that faces along the command, and its first pose.
 
-    It is one of the prior's starts near the wanted speed, drawn by the generator: the data's slowest for a command to
-    stand.
+    It is one of the prior's starts near the wanted speed and of the labels it is told, drawn by the generator: the
+    data's slowest for a command to stand.
     """
-    near = (prior.starts.speed - command.speed).abs().argsort()[:_NEAREST]
+    starts = (_told(prior, command.told) if command.told else prior).starts
+    near = (starts.speed - command.speed).abs().argsort()[:_NEAREST]
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
-    state = prior.starts.state.pick(torch.tensor([pick]))
+    state = starts.state.pick(torch.tensor([pick]))
     start = standing(state, Place(torch.tensor(at), torch.tensor(command.heading)), skeleton)
     first = start.committed.features
     motion = decode(first, start.before_first, skeleton=skeleton)
@@ -130,16 +132,20 @@ def begin(
 def step(
     state: SteerState, command: Command, *, seconds: float | None = None
 ) -> tuple[SteerState, SteerFrames]:  # fmt: skip
-    """The next frames under a command. With `seconds`, the best found by then, and a note that says so."""
+    """The next frames under a command. With `seconds`, the best found by then, and a note that says so.
+
+    RequestError where the command tells the prior what it does not know. The first step under new labels takes longer.
+    """
     began = time.perf_counter()
     settings = state.settings
     stuck = _behind(state) > settings.stuck
     if stuck:
         state = _from_here(state)
     wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
-    done, outcome = _solve(state, _terms(state, wishes), seconds, free=stuck)
+    told = replace(state, prior=_told(state.prior, command.told)) if command.told else state
+    done, outcome = _solve(told, _terms(state, wishes), seconds, free=stuck)
     if outcome is not Outcome.DONE:
-        afresh = replace(state, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
+        afresh = replace(told, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
         done, _ = _solve(afresh, _terms(state, wishes), 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
     motion = decode(new, state.committed.place, skeleton=state.skeleton)
@@ -153,6 +159,12 @@ def step(
     kept = replace(done, features=new, ledger=Ledger(), windows=())
     following = replace(state, committed=kept, wish=own[-1], owed=owed, frames=state.frames + len(new))
     return following, frames
+
+
+@lru_cache(maxsize=64)
+def _told(prior: Any, labels: tuple[str, ...]) -> Any:
+    """The prior that has been told; kept, since it takes as long to make as a step may last."""
+    return prior.told(labels)
 
 
 def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool) -> tuple[Committed, Outcome]:

@@ -1,16 +1,21 @@
-"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, if wanted, facing_deg."""
+"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, if wanted, facing_deg, turn_deg_s, gait and style.
+
+A line that leaves one of the wanted ones empty faces where it goes, goes straight, and tells the prior nothing.
+"""
 
 import csv
 import io
 import math
+from dataclasses import dataclass
 from os import PathLike
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.reading import read_bytes, shorten
-from mapctl.steering import CommandTrack, as_track
+from mapctl.steering import Command, CommandTrack
 
 _NEEDED = ("time_s", "speed_mps", "heading_deg")
-_ALLOWED = (*_NEEDED, "facing_deg")
+_LABELS = ("gait", "style")
+_ALLOWED = (*_NEEDED, "facing_deg", "turn_deg_s", *_LABELS)
 _MOST_SPEED, _MOST_TIME, _MOST = 1000.0, 1e6, 1e6
 
 
@@ -32,37 +37,49 @@ def read_commands(path: str | PathLike[str]) -> CommandTrack:
         raise FileFormatError(path, f"found the columns {found}, expected {','.join(_ALLOWED)}, each once", 1)
     if len(lines) < 2:
         raise FileFormatError(path, "holds no commands")
-    order = [names.index(name) for name in _ALLOWED if name in names]
-    rows: list[tuple[float, ...]] = []
+    times: list[float] = []
+    commands: list[Command] = []
     for number, words in lines[1:]:
-        row = _row(path, number, words, names, order)
-        if rows and row[0] <= rows[-1][0]:
-            raise FileFormatError(path, f"time_s must rise, got {row[0]:g} after {rows[-1][0]:g}", number)
-        rows.append(row)
-    return as_track(rows)
+        if len(words) != len(names):
+            raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
+        line = _Line(path, number, dict(zip(names, (word.strip() for word in words), strict=True)))
+        time = line.within("time_s", 0, _MOST_TIME)
+        if times and time <= times[-1]:
+            raise FileFormatError(path, f"time_s must rise, got {time:g} after {times[-1]:g}", number)
+        times.append(time)
+        commands.append(line.command())
+    return CommandTrack(tuple(times), tuple(commands))
 
 
-def _row(
-    path: str | PathLike[str], number: int, words: list[str], names: list[str], order: list[int]
-) -> tuple[float, ...]:
-    """Values of a line, in the order of _ALLOWED."""
-    if len(words) != len(names):
-        raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
-    values = tuple(_number(path, number, names[at], words[at].strip()) for at in order)
-    if not 0 <= values[0] <= _MOST_TIME:
-        raise FileFormatError(path, f"time_s must lie between 0 and {_MOST_TIME:g}, got {values[0]:g}", number)
-    if not 0 <= values[1] <= _MOST_SPEED:
-        raise FileFormatError(path, f"speed_mps must lie between 0 and {_MOST_SPEED:g}, got {values[1]:g}", number)
-    return values
+@dataclass(frozen=True)
+class _Line:
+    """One line of a script."""
 
+    path: str | PathLike[str]
+    number: int
+    words: dict[str, str]
 
-def _number(path: str | PathLike[str], line: int, name: str, word: str) -> float:
-    if name == "facing_deg" and not word:
-        return math.nan  # as the direction of travel
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= _MOST:
-        raise FileFormatError(path, f"{name} must be a number, got {shorten(word)}", line)
-    return value
+    def command(self) -> Command:
+        told = tuple(self.words[name] for name in _LABELS if self.words.get(name))
+        speed = self.within("speed_mps", 0, _MOST_SPEED)
+        return Command(speed, math.radians(self.value("heading_deg")), self.angle("facing_deg"),
+                       self.angle("turn_deg_s"), told)  # fmt: skip
+
+    def angle(self, name: str) -> float | None:
+        """Radians; None where the line leaves it open."""
+        return math.radians(self.value(name)) if self.words.get(name) else None
+
+    def within(self, name: str, low: float, high: float) -> float:
+        if not low <= (value := self.value(name)) <= high:
+            raise FileFormatError(self.path, f"{name} must lie between {low:g} and {high:g}, got {value:g}",
+                                  self.number)  # fmt: skip
+        return value
+
+    def value(self, name: str) -> float:
+        try:
+            value = float(self.words[name])
+        except ValueError:
+            value = math.nan
+        if not abs(value) <= _MOST:
+            raise FileFormatError(self.path, f"{name} must be a number, got {shorten(self.words[name])}", self.number)
+        return value

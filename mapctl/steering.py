@@ -2,8 +2,7 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from mapctl.errors import RequestError
@@ -20,11 +19,16 @@ class Command:
     """Direction of travel, radians about +Y: 0 is +Z, pi/2 is +X. Where the speed is 0, where to face."""
     facing: float | None = None
     """Where the hips face, radians; None is the direction of travel."""
+    turning: float | None = None
+    """Radians/s by which the direction of travel turns on and on, to the left where positive; `heading` then says
+    nothing but where to begin."""
+    told: tuple[str, ...] = ()
+    """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the wishes."""
 
     def __post_init__(self):
         if not (math.isfinite(self.speed) and self.speed >= 0):
             raise RequestError(f"a command's speed must be a number of m/s, 0 or more, got {self.speed:g}")
-        for name in ("heading", "facing"):
+        for name in ("heading", "facing", "turning"):
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):
                 raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
@@ -61,7 +65,7 @@ class CommandTrack:
             if command.speed > fastest:
                 said.append(f"the speed of {command.speed:g} m/s at {time:g} s was lowered to {fastest:.2f} m/s, "
                             "the prior's fastest")  # fmt: skip
-        lowered = [Command(min(c.speed, fastest), c.heading, c.facing) for c in self.commands]
+        lowered = [replace(command, speed=min(command.speed, fastest)) for command in self.commands]
         return CommandTrack(self.times, tuple(lowered)), said
 
 
@@ -102,9 +106,13 @@ class Wish:
     def toward(self, command: Command, limits: Limits, seconds: float) -> "Wish":
         """The wish after so many seconds, as near the command as the limits allow."""
         rise = min(limits.acceleration * seconds, max(-limits.braking * seconds, command.speed - self.speed))
-        turn = _toward(self.heading, command.heading, limits.turn_rate * seconds)
+        most = limits.turn_rate * seconds
+        if command.turning is None:
+            turn = _toward(self.heading, command.heading, most)
+        else:
+            turn = self.heading + min(most, max(-most, command.turning * seconds))
         facing = turn if command.facing is None else command.facing
-        return Wish(self.speed + rise, turn, _toward(self.facing, facing, limits.turn_rate * seconds))
+        return Wish(self.speed + rise, turn, _toward(self.facing, facing, most))
 
     def ahead(self, command: Command, limits: Limits, *, frames: int, fps: float) -> "list[Wish]":
         """The wishes of the next frames if nothing else is asked."""
@@ -118,15 +126,6 @@ class Wish:
 def fastest_of(abilities: Abilities) -> float:
     """Highest speed that is asked of a prior, m/s: a tenth beyond what its data show."""
     return 1.1 * abilities.fastest
-
-
-def as_track(rows: Sequence[tuple[float, ...]]) -> CommandTrack:
-    """Rows of time (s), speed (m/s), heading (degrees) and, if there is one, facing (degrees; nan is none)."""
-    commands = []
-    for _, speed, heading, *facing in rows:
-        held = math.radians(facing[0]) if facing and not math.isnan(facing[0]) else None
-        commands.append(Command(speed, math.radians(heading), held))
-    return CommandTrack(tuple(row[0] for row in rows), tuple(commands))
 
 
 def _toward(angle: float, wanted: float, most: float) -> float:

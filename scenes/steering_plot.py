@@ -30,7 +30,7 @@ def plot(motion: Motion, track: CommandTrack, path: str | PathLike[str]) -> None
     above.legend(loc="upper right", frameon=False)
     moving = way.speed > 0.2
     got = np.where(moving, np.degrees(way.direction), np.nan)
-    centred = [math.remainder(math.degrees(angle), 360) for angle in heading]
+    centred = [math.remainder(math.degrees(angle), 360) if math.isfinite(angle) else angle for angle in heading]
     below.plot(way.seconds, centred, color="#999999", drawstyle="steps-post")
     below.plot(way.seconds, got, ".", color="#f58518", markersize=2)
     below.set(ylabel="direction, degrees", xlabel="seconds", ylim=(-185, 185), yticks=range(-180, 181, 90))

@@ -27,8 +27,8 @@ class Steer:
     """A character obeys a script of speeds and directions, answered as live steering would."""
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
-    """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X), and facing_deg for strafing; the last
-    line's time is the end."""
+    """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
+    strafing, turn_deg_s to turn on and on, gait and style as the prior knows them. The last line's time is the end."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz or .glb."""
     realtime: bool = False
@@ -57,6 +57,8 @@ class Steer:
         track = read_commands(self.commands)
         prior = priors.load(self.prior)
         track, lowered = track.clamped(fastest_of(prior.abilities))
+        for labels in {command.told for command in track.commands if command.told}:
+            prior.told(labels)  # what it does not know is said now
         recorder, records, frames = self._steered(prior, track)
         motion = recorder.motion(frames)
         motion.save(self.out)
@@ -96,8 +98,8 @@ class Steer:
         frames = options.frames_of(track.times[-1] + (_LAST_HELD if len(track.times) == 1 else 0.0))
         state, pose = steer.begin(prior, first, generator=torch.Generator().manual_seed(self.seed))
         recorder.show(pose, 0.0)
-        for _ in range(2):  # what the machine compiles or loads on first use must not cost the first frames
-            steer.step(state, first)
+        for command in (first, *{command.told: command for command in track.commands}.values()):
+            steer.step(state, command)  # what is compiled, loaded or told on first use must not cost frames
         clock = WallClock() if self.realtime else StreamClock()
         with bar("steering", quiet=self.quiet) as progress:
             displays = [recorder] if progress is None else [recorder, _Progress(progress, frames)]
@@ -141,9 +143,12 @@ def _summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
     for row in report["commands"][:-1]:
         reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
         steady = "" if row["steady_speed_mps"] is None else f", then {row['steady_speed_mps']:.2f} m/s"
-        off = row["steady_heading_error_deg"]
+        off, rate = row["steady_heading_error_deg"], row["steady_turn_deg_s"]
         turned = "" if off is None else f", {off:+.1f} degrees off"
-        asked = f"{row['speed_mps']:.2f} m/s to {row['heading_deg']:.0f} degrees"
+        turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
+        way = f"to {row['heading_deg']:.0f} degrees" if row["turn_deg_s"] is None else (
+            f"turning {row['turn_deg_s']:.0f} degrees/s")  # fmt: skip
+        asked = f"{row['speed_mps']:.2f} m/s {way}"
         lines.append(f"{row['time_s']:6.1f} s  {asked}: {reached}{steady}{turned}")
     cost, latency = report["timing"], report["timing"]["command_latency_s"]
     waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"

@@ -10,9 +10,9 @@ from mapctl.motion import Motion
 
 
 def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
-    from mapctl.formats import glb  # late: it draws a body, which the other formats need not load
+    from mapctl.formats import gltf  # late: it draws a body, which the other formats need not load
 
-    glb.save(motion, path)
+    gltf.save(motion, path)
 
 
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load}

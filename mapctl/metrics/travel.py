@@ -10,7 +10,7 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 from mapctl.motion import Motion
-from mapctl.steering import CommandTrack
+from mapctl.steering import Command, CommandTrack
 
 _SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
@@ -42,27 +42,28 @@ def travelled(motion: Motion) -> Travelled:
 def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
     """A row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
 
-    Keys: time_s, speed_mps, heading_deg (wanted), reached_s (None if it never was), steady_speed_mps (net way over
-    time), steady_heading_error_deg (None where standing is wanted, and where there is no steady part).
+    Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
+    it never was), steady_speed_mps (net way over time; the mean speed while turning), steady_heading_error_deg and
+    steady_turn_deg_s (None where the other, standing, or no steady part was wanted).
     """
     way, rows = travelled(motion), []
     ground = motion.joint_positions()[:, 0, ::2].numpy()
     ends = [*track.times[1:], float(way.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
         part = (way.seconds >= began) & (way.seconds <= until)
-        row: dict[str, float | None] = {"time_s": began, "speed_mps": command.speed,
+        turning = None if command.turning is None else math.degrees(command.turning)
+        row: dict[str, float | None] = {"time_s": began, "speed_mps": command.speed, "turn_deg_s": turning,
                                         "heading_deg": math.degrees(command.heading)}  # fmt: skip
-        row["reached_s"] = _reached(way, part, began, command.speed, command.heading, float(motion.fps))
+        row["reached_s"] = _reached(way, part, began, command, float(motion.fps))
         steady = np.flatnonzero(part & (way.seconds >= began + _STEADY_AFTER))
-        row |= _steady(ground, steady, command.speed, command.heading, float(motion.fps))
-        rows.append(row)
+        rows.append(row | _steady(way, ground, steady, command, float(motion.fps)))
     return rows
 
 
-def _reached(way: Travelled, part: ndarray, began: float, speed: float, heading: float, fps: float) -> float | None:
-    near = np.abs(way.speed - speed) < max(_NEAR_SPEED * speed, _NEAR_STILL)
-    if speed > 0:
-        near &= np.abs(_wrapped(way.direction - heading)) < _NEAR_ANGLE
+def _reached(way: Travelled, part: ndarray, began: float, command: Command, fps: float) -> float | None:
+    near = np.abs(way.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
+    if command.speed > 0 and command.turning is None:
+        near &= np.abs(_wrapped(way.direction - command.heading)) < _NEAR_ANGLE
     at = np.flatnonzero(part)
     for first in at:
         if near[first : min(first + round(_HELD * fps), at[-1] + 1)].all():
@@ -70,12 +71,20 @@ def _reached(way: Travelled, part: ndarray, began: float, speed: float, heading:
     return None
 
 
-def _steady(ground: ndarray, frames: ndarray, speed: float, heading: float, fps: float) -> dict[str, float | None]:
+def _steady(way: Travelled, ground: ndarray, frames: ndarray, command: Command, fps: float) -> dict[str, float | None]:
+    found: dict[str, float | None] = dict.fromkeys(
+        ("steady_speed_mps", "steady_heading_error_deg", "steady_turn_deg_s")
+    )
     if len(frames) < fps / 2:
-        return {"steady_speed_mps": None, "steady_heading_error_deg": None}
+        return found
+    if command.turning is not None:
+        turned = np.unwrap(way.direction[frames])
+        rate = math.degrees(float(turned[-1] - turned[0])) * fps / (len(frames) - 1)
+        return found | {"steady_speed_mps": float(way.speed[frames].mean()), "steady_turn_deg_s": rate}
     step = (ground[frames[-1]] - ground[frames[0]]) * fps / (len(frames) - 1)
-    off = math.degrees(float(_wrapped(math.atan2(step[0], step[1]) - heading)))
-    return {"steady_speed_mps": float(np.linalg.norm(step)), "steady_heading_error_deg": off if speed > 0 else None}
+    off = math.degrees(float(_wrapped(math.atan2(step[0], step[1]) - command.heading)))
+    found["steady_speed_mps"] = float(np.linalg.norm(step))
+    return found | {"steady_heading_error_deg": off if command.speed > 0 else None}
 
 
 def _wrapped(angle):
@@ -83,6 +92,8 @@ def _wrapped(angle):
 
 
 def wanted(track: CommandTrack, seconds: Sequence[float]) -> tuple[list[float], list[float]]:
-    """The commanded speed (m/s) and heading (radians) at each time."""
+    """The commanded speed (m/s) and heading (radians; NaN while it is to turn on and on) at each time."""
     commands = [track.at(time) for time in seconds]
-    return [command.speed for command in commands], [command.heading for command in commands]
+    return [command.speed for command in commands], [
+        command.heading if command.turning is None else math.nan for command in commands
+    ]

@@ -11,7 +11,7 @@ from helpers import random_motion
 from mapctl import rotations
 from mapctl.body.skin import at_rest, skin
 from mapctl.errors import RequestError
-from mapctl.formats import glb
+from mapctl.formats import gltf
 from mapctl.skeleton import CANONICAL
 
 _TYPES = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}
@@ -83,7 +83,7 @@ def motion():
 
 
 def test_joints_and_skin_are_where_the_motion_says(motion):
-    viewer = Viewer(glb.to_bytes(motion))
+    viewer = Viewer(gltf.to_bytes(motion))
     body, turns = skin(motion), motion.joint_rotations()
     matrices, places = rotations.to_matrix(turns).numpy(), motion.joint_positions().numpy()
     for frame in (0, 7, 11):
@@ -96,7 +96,7 @@ def test_joints_and_skin_are_where_the_motion_says(motion):
 
 
 def test_quaternions_are_unit_and_do_not_jump_in_sign(motion):
-    viewer = Viewer(glb.to_bytes(motion))
+    viewer = Viewer(gltf.to_bytes(motion))
     animation = viewer.tree["animations"][0]
     times = viewer.array(animation["samplers"][0]["input"])[:, 0]
     np.testing.assert_allclose(times, np.arange(12) / float(motion.fps), atol=1e-6)
@@ -109,7 +109,7 @@ def test_quaternions_are_unit_and_do_not_jump_in_sign(motion):
 
 def test_same_motion_same_bytes(motion, tmp_path):
     motion.save(tmp_path / "a.glb")
-    assert (tmp_path / "a.glb").read_bytes() == glb.to_bytes(motion)
+    assert (tmp_path / "a.glb").read_bytes() == gltf.to_bytes(motion)
 
 
 def test_nan_is_refused(motion, tmp_path):

@@ -7,7 +7,7 @@ translation track, every joint a rotation track at the motion's own frames.
 from os import PathLike
 
 import numpy as np
-import pygltflib as gltf
+import pygltflib
 
 from mapctl import __version__
 from mapctl.body.skin import Skin, skin
@@ -17,23 +17,23 @@ from mapctl.motion import Motion
 from mapctl.rotations import sign_continuous
 
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENT = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
+_COMPONENT = {"float32": pygltflib.FLOAT, "uint16": pygltflib.UNSIGNED_SHORT, "uint32": pygltflib.UNSIGNED_INT}
 
 
 class _Buffer:
     """The one binary buffer of a file, filled array by array."""
 
-    def __init__(self, document: gltf.GLTF2):
+    def __init__(self, document: pygltflib.GLTF2):
         self.document, self.blob = document, bytearray()
 
     def add(self, values: np.ndarray, target: int | None = None) -> int:
         """Index of a new accessor over the values, (n,) or (n, width); with smallest and largest."""
         table = np.ascontiguousarray(values).reshape(len(values), -1)
-        view = gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=table.nbytes, target=target)
+        view = pygltflib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=table.nbytes, target=target)
         self.blob += table.tobytes()
         self.blob += bytes(-len(self.blob) % 4)
         self.document.bufferViews.append(view)
-        self.document.accessors.append(gltf.Accessor(
+        self.document.accessors.append(pygltflib.Accessor(
             bufferView=len(self.document.bufferViews) - 1, componentType=_COMPONENT[table.dtype.name], count=len(table),
             type=_KINDS[table.shape[1]], min=table.min(0).tolist(), max=table.max(0).tolist(),
         ))  # fmt: skip
@@ -49,7 +49,7 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     """The whole file; `path` is what an error names."""
     if not (motion.root_position.isfinite().all() and motion.local_quat_xyzw.isfinite().all()):
         raise RequestError(f"cannot write {path}: the motion is not finite")
-    document = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator=f"mapctl {__version__}"))
+    document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}"))
     buffer = _Buffer(document)
     joints = motion.num_joints
     document.nodes = _nodes(motion)
@@ -57,20 +57,20 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     rest = _rest_world(motion)
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     inverse[:, 3, :3] = -rest  # column-major: the translation is the last row here
-    document.skins = [gltf.Skin(joints=list(range(joints)), skeleton=0,
+    document.skins = [pygltflib.Skin(joints=list(range(joints)), skeleton=0,
                                 inverseBindMatrices=buffer.add(inverse.reshape(joints, 16)))]  # fmt: skip
-    document.nodes.append(gltf.Node(name="mannequin", mesh=0, skin=0))
-    document.scenes = [gltf.Scene(nodes=[0, len(document.nodes) - 1])]
+    document.nodes.append(pygltflib.Node(name="mannequin", mesh=0, skin=0))
+    document.scenes = [pygltflib.Scene(nodes=[0, len(document.nodes) - 1])]
     document.scene = 0
     document.animations = [_animation(motion, buffer)]
-    document.materials = [gltf.Material(name="mannequin", pbrMetallicRoughness=gltf.PbrMetallicRoughness(
+    document.materials = [pygltflib.Material(name="mannequin", pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
         baseColorFactor=[1.0, 1.0, 1.0, 1.0], metallicFactor=0.0, roughnessFactor=0.8))]  # fmt: skip
-    document.buffers = [gltf.Buffer(byteLength=len(buffer.blob))]
+    document.buffers = [pygltflib.Buffer(byteLength=len(buffer.blob))]
     document.set_binary_blob(bytes(buffer.blob))
     return b"".join(document.save_to_bytes())
 
 
-def _nodes(motion: Motion) -> list[gltf.Node]:
+def _nodes(motion: Motion) -> list[pygltflib.Node]:
     """A node a joint, in file order, then one for each End Site."""
     skeleton, offsets = motion.skeleton, motion.skeleton.offsets.clone()
     offsets[0] = motion.root_position[0]
@@ -79,9 +79,9 @@ def _nodes(motion: Motion) -> list[gltf.Node]:
     below = [skeleton.children(joint) for joint in range(motion.num_joints)]
     for number, name in enumerate(skeleton.end_offsets):
         below[skeleton.index(name)].append(motion.num_joints + number)
-    joints = [gltf.Node(name=name, children=children, translation=offset.tolist())
+    joints = [pygltflib.Node(name=name, children=children, translation=offset.tolist())
               for name, children, offset in zip(skeleton.names, below, offsets, strict=True)]  # fmt: skip
-    ends = [gltf.Node(name=f"{name}_end", translation=list(at)) for name, at in skeleton.end_offsets.items()]
+    ends = [pygltflib.Node(name=f"{name}_end", translation=list(at)) for name, at in skeleton.end_offsets.items()]
     return [*joints, *ends]
 
 
@@ -93,33 +93,35 @@ def _rest_world(motion: Motion) -> np.ndarray:
     return rest
 
 
-def _mesh(motion: Motion, body: Skin, buffer: _Buffer) -> gltf.Mesh:
+def _mesh(motion: Motion, body: Skin, buffer: _Buffer) -> pygltflib.Mesh:
     vertices = body.vertices + _rest_world(motion)[body.joint]  # in the rest pose joint frames are not turned
     carrier = np.zeros((len(body.joint), 4), np.uint16)
     carrier[:, 0] = body.joint
     weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(carrier), 1))
     linear = np.where(body.rgb <= 0.04045, body.rgb / 12.92, ((body.rgb + 0.055) / 1.055) ** 2.4)  # glTF's colours
-    attributes = gltf.Attributes(
-        POSITION=buffer.add(vertices.astype(np.float32), gltf.ARRAY_BUFFER),
-        NORMAL=buffer.add(body.normals.astype(np.float32), gltf.ARRAY_BUFFER),
-        COLOR_0=buffer.add(linear.astype(np.float32), gltf.ARRAY_BUFFER),
-        JOINTS_0=buffer.add(carrier, gltf.ARRAY_BUFFER),
-        WEIGHTS_0=buffer.add(weight, gltf.ARRAY_BUFFER),
+    attributes = pygltflib.Attributes(
+        POSITION=buffer.add(vertices.astype(np.float32), pygltflib.ARRAY_BUFFER),
+        NORMAL=buffer.add(body.normals.astype(np.float32), pygltflib.ARRAY_BUFFER),
+        COLOR_0=buffer.add(linear.astype(np.float32), pygltflib.ARRAY_BUFFER),
+        JOINTS_0=buffer.add(carrier, pygltflib.ARRAY_BUFFER),
+        WEIGHTS_0=buffer.add(weight, pygltflib.ARRAY_BUFFER),
     )
-    faces = buffer.add(body.faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
-    return gltf.Mesh(name="mannequin", primitives=[gltf.Primitive(attributes=attributes, indices=faces, material=0)])
+    faces = buffer.add(body.faces.reshape(-1).astype(np.uint32), pygltflib.ELEMENT_ARRAY_BUFFER)
+    return pygltflib.Mesh(
+        name="mannequin", primitives=[pygltflib.Primitive(attributes=attributes, indices=faces, material=0)]
+    )
 
 
-def _animation(motion: Motion, buffer: _Buffer) -> gltf.Animation:
+def _animation(motion: Motion, buffer: _Buffer) -> pygltflib.Animation:
     times = buffer.add((np.arange(motion.num_frames) / float(motion.fps)).astype(np.float32))
-    animation = gltf.Animation(name="motion", channels=[], samplers=[])
+    animation = pygltflib.Animation(name="motion", channels=[], samplers=[])
     travelling = {0: motion.root_position, **motion.moving_offsets}
     quats = sign_continuous(motion.local_quat_xyzw)
     tracks = [(joint, "translation", values) for joint, values in travelling.items()]
     tracks += [(joint, "rotation", quats[:, joint]) for joint in range(motion.num_joints)]
     for joint, path, values in tracks:
         output = buffer.add(values.numpy().astype(np.float32))
-        animation.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
-        target = gltf.AnimationChannelTarget(node=joint, path=path)
-        animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+        animation.samplers.append(pygltflib.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
+        target = pygltflib.AnimationChannelTarget(node=joint, path=path)
+        animation.channels.append(pygltflib.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
     return animation
