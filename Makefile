@@ -1,6 +1,7 @@
 # make demo and make test alone bring a bare machine with Python 3.11+ to a result.
 VENV := .venv/bin
 READY := .venv/.ready
+BROWSER := .venv/.browser
 
 .PHONY: help setup demo test test-all bench check clean
 
@@ -19,6 +20,10 @@ $(READY): pyproject.toml constraints.txt .ci/setup
 	@.ci/setup
 	@touch $@
 
+$(BROWSER): $(READY)
+	@.ci/setup browser
+	@touch $@
+
 demo: $(READY)
 	$(VENV)/mapctl demo -o demo-out
 
@@ -27,10 +32,10 @@ test test-all bench: export OMP_NUM_THREADS = 1
 test test-all bench: export MKL_NUM_THREADS = 1
 test test-all bench: export OPENBLAS_NUM_THREADS = 1
 
-test: $(READY)
+test: $(READY) $(BROWSER)
 	$(VENV)/python -m pytest -m "not slow"
 
-test-all: $(READY)
+test-all: $(READY) $(BROWSER)
 	$(VENV)/python -m pytest
 
 bench: $(READY)

@@ -215,6 +215,6 @@ def _plain(frames: SteerFrames, seconds: float, due: float) -> Delivered:
     energies = {entry.name: float(entry.energy.mean()) for entry in frames.ledger.entries}
     return Delivered(
         due, seconds, frames.motion.root_position.numpy(), frames.motion.local_quat_xyzw.numpy(),
-        frames.contacts.numpy(), frames.forecast.numpy(), frames.wishes[-1].velocity, energies, frames.seconds,
-        frames.evaluations,
+        frames.contacts.numpy(), frames.forecast.numpy(), frames.wishes[-1].velocity, energies,
+        due - time.perf_counter(), frames.seconds, frames.evaluations,
     )  # fmt: skip

@@ -39,11 +39,11 @@ _NEAREST = 6  # starts nearest to the wanted speed, of which one is drawn
 class SteerSettings:
     """Sigmas, lengths and effort."""
 
-    horizon: int = 30
+    horizon: int = 34
     """Frames of a window: what a command changes is found this far ahead."""
     commit: int = 3
     """Frames that a step delivers."""
-    evaluations: int = 10
+    evaluations: int = 14
     """Of energy and gradient in a step, at most: what one core does in the time that three frames last."""
     limits: Limits = field(default_factory=Limits)
     """How fast a wish may change."""

@@ -35,6 +35,8 @@ class Delivered:
     """Wanted velocity of the last frame, x and z, m/s."""
     energies: Mapping[str, float]
     """Mean nats a frame by term, of the new frames."""
+    spare: float
+    """Seconds between delivery and `due`; negative where the first frame came late."""
     compute: float
     """Seconds of the step."""
     evaluations: int

@@ -59,6 +59,15 @@ class LstmGmmDensity:
         """Spread of the training data."""
         return self.reference.std
 
+    @property
+    def labels(self) -> dict[str, list[str]]:
+        """What it can be told, by group (gait, style)."""
+        found: dict[str, list[str]] = {}
+        for name in self.reference.config.labels:
+            group, _, value = name.partition("=")
+            found.setdefault(group, []).append(value)
+        return found
+
     def told(self, wanted: Sequence[str]) -> "LstmGmmDensity":
         """The same density told labels of its data for good (`run`, `active`, `style=active`), with starts to match.
 

@@ -12,6 +12,7 @@ from mapctl.commands.demo import Demo
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.generate import Generate
 from mapctl.commands.info import Info
+from mapctl.commands.live import Live
 from mapctl.commands.measure import Measure
 from mapctl.commands.render import Render
 from mapctl.commands.run import RunScene
@@ -34,6 +35,7 @@ COMMANDS: dict[str, type[Command]] = {
     "run": RunScene,
     "generate": Generate,
     "steer": Steer,
+    "live": Live,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

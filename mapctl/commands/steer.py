@@ -33,7 +33,7 @@ class Steer:
     """Where the motion goes: .bvh, .npz or .glb."""
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then."""
-    prior: options.Name = "locomotion"
+    prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Of the pose that it begins with."""

@@ -1,0 +1,88 @@
+"""`mapctl live`: characters in the browser, steered as they go."""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from mapctl.commands import options
+from mapctl.commands.threads import compute_on_one
+from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from controllers.remote import Remote
+
+_MOST = 16
+_APART = 1.5  # metres between characters where they begin
+
+
+@dataclass(frozen=True)
+class Live:
+    """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
+
+    port: Annotated[int, arg(metavar="P")] = 8080
+    """Where the page is served, on 127.0.0.1 only; the next free port if this one is taken."""
+    characters: options.Count = 1
+    """How many, side by side; each computes on a core of its own as long as there are cores."""
+    prior: options.Name = "locomotion-live"
+    """A bundled prior, or the file or run folder of a trained one."""
+    seed: options.Count = 0
+    """Of the poses that they begin with."""
+
+    def run(self) -> int:
+        """Check, open, serve until Ctrl-C."""
+        compute_on_one()
+        self._check()
+        import priors
+        from mapctl.steering import fastest_of
+        from scenes.live.panel import Orders
+        from scenes.live.show import Show
+
+        prior = priors.load(self.prior)
+        orders = [Orders() for _ in range(self.characters)]
+        characters = self._characters()
+        try:
+            show = Show(characters, orders, port=self.port, fastest=fastest_of(prior.abilities), labels=prior.labels)
+        except BaseException:
+            for character in characters:
+                character.close()
+            raise
+        try:
+            if not show.url.endswith(f":{self.port}"):
+                print(f"port {self.port} is in use")
+            print(f"open {show.url} in a browser; Ctrl-C ends", flush=True)
+            show.run()
+        except KeyboardInterrupt:
+            print()
+        finally:
+            show.close()
+        return 0
+
+    def _check(self) -> None:
+        options.check_seed(self.seed)
+        if not 1 <= self.port <= 65535:
+            raise RequestError(f"the port must be a number from 1 to 65535, got {self.port}")
+        if not 1 <= self.characters <= _MOST:
+            raise RequestError(f"--characters must be 1 to {_MOST}, got {self.characters}")
+        for package in ("viser", "trimesh"):
+            if find_spec(package) is None:
+                raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
+
+    def _characters(self) -> "Sequence[Remote]":
+        import priors
+        from controllers.remote import Remote, RemoteRequest
+        from mapctl.steering import Command
+
+        load, found = functools.partial(priors.load, self.prior), []
+        try:
+            for number in range(self.characters):
+                at = (_APART * (number - (self.characters - 1) / 2), 0.0)
+                found.append(Remote(RemoteRequest(load, Command(1.2, 0.0), self.seed + number, at)))
+        except BaseException:
+            for character in found:
+                character.close()
+            raise
+        return found

@@ -1,0 +1,116 @@
+"""What lies on the ground of the live viewer: grid, drawn path, planted feet, and the forecast of the next second."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+
+from mapctl import curves
+from mapctl.body import colours
+from mapctl.body.shapes import Array
+from mapctl.errors import RequestError
+from mapctl.skeleton import Skeleton
+
+_PATH_HEIGHT, _MARK_HEIGHT = 0.012, 0.008  # metres over the ground, so that neither flickers
+_FIGURES = (0.5, 1.0)  # shares of the forecast at which it is shown as a stick figure
+_SPACING = 0.05  # metres between the points of a path as it is shown
+
+
+def add_grid(scene: viser.SceneApi, name: str) -> None:
+    """Squares of a metre, every fifth line stronger, as far as the eye goes."""
+    scene.add_grid(name, plane="xz", infinite_grid=True, cell_size=1.0, section_size=5.0, cell_thickness=0.8,
+                   section_thickness=1.4, fade_distance=40.0, cell_color=_bytes(colours.GRID),
+                   section_color=_bytes(colours.GRID))  # fmt: skip
+
+
+class Marks:
+    """Planted feet and forecast of one character."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton):
+        self._scene, self._name, self._parents = scene, name, skeleton.parents
+        self._toes = [skeleton.names.index(side) for side in ("leftToes", "rightToes")]
+        vertices, faces = _disc()
+        self._feet = [
+            scene.add_mesh_simple(f"{name}/foot{k}", vertices, faces, color=_bytes(colour), opacity=0.6, visible=False,
+                                  side="double", cast_shadow=False)
+            for k, colour in enumerate((colours.LEFT, colours.RIGHT))
+        ]  # fmt: skip
+
+    def planted(self, joints: Array, contacts: Array) -> None:
+        """A disc below each toe (of joints (joints, 3)) whose contact (2,) is 1."""
+        for foot, toe, contact in zip(self._feet, self._toes, contacts, strict=True):
+            foot.visible = bool(contact > 0.5)
+            if foot.visible:
+                foot.position = (joints[toe, 0], _MARK_HEIGHT, joints[toe, 2])
+
+    def forecast(self, joints: Array) -> None:
+        """The hips' way over the ground and two stick figures of (frames, joints, 3)."""
+        if len(joints) < 2:
+            return
+        way = joints[:, 0] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, _PATH_HEIGHT, 0.0])
+        segments = [np.stack([way[:-1], way[1:]], axis=1)]
+        bones = [(child, parent) for child, parent in enumerate(self._parents) if parent >= 0]
+        segments += [joints[round(share * (len(joints) - 1))][np.array(bones)] for share in _FIGURES]
+        lines = np.concatenate(segments).astype(np.float32)
+        self._scene.add_line_segments(f"{self._name}/forecast", lines, _bytes(colours.TRAIL), thickness=0.012)
+
+
+class DrawnPath:
+    """Points that somebody set on the ground, and the smooth curve through them."""
+
+    def __init__(self, scene: viser.SceneApi, name: str):
+        self._scene, self._name = scene, name
+        self.points: list[tuple[float, float]] = []
+        self._shown: list[viser.SceneNodeHandle] = []
+
+    def add(self, x: float, z: float) -> None:
+        """One more point, metres."""
+        self.points.append((x, z))
+        self._show()
+
+    def clear(self) -> None:
+        """No points."""
+        self.points.clear()
+        self._show()
+
+    def _show(self) -> None:
+        for handle in self._shown:
+            handle.remove()
+        self._shown = [
+            self._scene.add_icosphere(f"{self._name}/point{k}", 0.05, color=_bytes(colours.WISH), position=(x, 0.02, z))
+            for k, (x, z) in enumerate(self.points)
+        ]
+        if (line := _smooth(self.points)) is not None:
+            segments = np.stack([line[:-1], line[1:]], axis=1).astype(np.float32)
+            self._shown.append(self._scene.add_line_segments(f"{self._name}/line", segments, _bytes(colours.WISH),
+                                                             thickness=0.025))  # fmt: skip
+
+
+def on_the_ground(origin: Array, direction: Array) -> tuple[float, float] | None:
+    """x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m."""
+    if direction[1] > -1e-3:
+        return None
+    far = -origin[1] / direction[1]
+    return (float(origin[0] + far * direction[0]), float(origin[2] + far * direction[2])) if 0 < far < 100 else None
+
+
+def _smooth(points: Sequence[tuple[float, float]]) -> Array | None:
+    try:
+        curve = curves.from_points(np.array(points, dtype=np.float64).reshape(-1, 2))
+    except RequestError:
+        return None  # one point, or all in one place: no curve yet
+    arcs = np.linspace(0, curve.length, max(2, round(curve.length / _SPACING)))
+    places = np.array([curve.point(float(arc)).tolist() for arc in arcs])
+    return np.insert(places, 1, _PATH_HEIGHT, axis=1)
+
+
+def _disc(radius: float = 0.085, corners: int = 24) -> tuple[Array, Array]:
+    turn = np.arange(corners) * 2 * np.pi / corners
+    rim = np.stack([radius * np.sin(turn), np.zeros(corners), radius * np.cos(turn)], axis=-1)
+    index = np.arange(1, corners + 1)
+    return np.vstack([np.zeros(3), rim]), np.stack([np.zeros(corners, int), index, np.roll(index, -1)], axis=-1)
+
+
+def _bytes(colour: str) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * float(share)) for share in colours.rgb(colour))
+    return red, green, blue

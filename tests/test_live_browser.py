@@ -1,0 +1,190 @@
+"""The live viewer in a real browser: the page loads, controls move the character, a drawn path is walked, a recording
+comes down as a file that can be read; two browsers, one that goes and comes back, a port that is taken."""
+
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from tiny_prior import save_tiny_prior
+
+import mapctl
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SIZE = {"width": 760, "height": 620}  # small: these machines draw without a graphics card
+SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync"]  # fmt: skip
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium; .ci/setup browser says how to get it")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Live:
+    """`mapctl live` as a user starts it."""
+
+    def __init__(self, *words: object, port: int | None = None):
+        self.port = port or free_port()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "mapctl.cli", "live", "--port", str(self.port), *map(str, words)],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        self.lines: list[str] = []
+        assert self.process.stdout is not None
+        while not any("open http" in line for line in self.lines):
+            line = self.process.stdout.readline()
+            assert line, "".join(self.lines)
+            self.lines.append(line)
+        self.url = re.search(r"http://\S+", self.lines[-1]).group()
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> str:
+    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def live(prior):
+    show = Live("--prior", prior)
+    yield show
+    assert show.end() == 0
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as drivers:
+        opened = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(browser, live):
+    opened = browser.new_page(viewport=SIZE, accept_downloads=True)
+    faults: list[str] = []
+    opened.on("pageerror", lambda error: faults.append(str(error)))
+    opened.goto(live.url)
+    opened.get_by_text("late").wait_for(timeout=60_000)
+    yield opened
+    opened.close()
+    assert faults == []
+
+
+def number(page, label: str):
+    """The field beside a slider."""
+    row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input[@type='text']][1]")
+    return row.locator("input[type='text']").first
+
+
+def put(page, label: str, value: float) -> None:
+    field = number(page, label)
+    field.fill(str(value))
+    field.press("Enter")
+
+
+def shows(page, label: str, value: float) -> bool:
+    """Whether a slider comes to show a value within 5 s."""
+    for _ in range(50):
+        if float(number(page, label).input_value()) == value:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def recorded(page, tmp_path, seconds: float, during=lambda: None) -> mapctl.Motion:
+    page.get_by_role("button", name="Record", exact=True).click()
+    page.get_by_role("button", name="Stop and save").wait_for()
+    during()
+    time.sleep(seconds)
+    with page.expect_download(timeout=60_000) as coming:
+        page.get_by_role("button", name="Stop and save").click()
+    path = tmp_path / coming.value.suggested_filename
+    coming.value.save_as(path)
+    return mapctl.load(path)
+
+
+def speed_of(motion: mapctl.Motion) -> float:
+    way = motion.root_position[:, ::2]
+    return float((way[-1] - way[0]).norm()) * float(motion.fps) / (len(way) - 1)
+
+
+def test_a_slider_and_keys_move_the_character_and_the_recording_shows_it(page, tmp_path):
+    put(page, "Speed, m/s", 0)
+    time.sleep(2)
+    assert speed_of(recorded(page, tmp_path, 1.5)) < 0.35
+    put(page, "Speed, m/s", 1.2)
+    time.sleep(2)
+    walked = recorded(page, tmp_path, 2)
+    assert walked.skeleton.names[0] == "hips"
+    assert walked.num_frames >= 30
+    assert speed_of(walked) > 0.7
+    page.mouse.click(150, 500)  # the scene, so that keys are not typed into a field
+    page.keyboard.press("x")
+    assert shows(page, "Speed, m/s", 0)
+    page.keyboard.press("a")
+    assert shows(page, "Heading, degrees", 15)
+
+
+def test_a_drawn_path_is_walked(page, tmp_path):
+    page.get_by_role("button", name="Reset").click()
+    box = page.get_by_text("Draw by clicking on the ground").locator("xpath=following::input[@type='checkbox'][1]")
+    put(page, "Speed, m/s", 0)
+    page.get_by_role("button", name="Reset").click()
+    box.check()
+    for x, y in ((250, 400), (120, 450), (60, 380)):
+        page.mouse.click(x, y)
+        time.sleep(0.7)
+    walked = recorded(page, tmp_path, 4, during=page.get_by_role("button", name="Walk it").click)
+    way = walked.root_position[:, ::2]
+    assert float((way[-1] - way[0]).norm()) > 0.5
+    box.uncheck()
+    page.get_by_role("button", name="Clear").click()
+
+
+def test_two_browsers_see_the_same_and_one_may_go_and_come_back(page, browser, live):
+    other = browser.new_page(viewport=SIZE)
+    other.goto(live.url)
+    other.get_by_text("late").wait_for(timeout=60_000)
+    put(page, "Speed, m/s", 0.7)
+    assert shows(other, "Speed, m/s", 0.7)
+    other.close()
+    again = browser.new_page(viewport=SIZE)
+    again.goto(live.url)
+    again.get_by_text("late").wait_for(timeout=60_000)
+    assert shows(again, "Speed, m/s", 0.7)
+    again.close()
+
+
+def test_pause_holds_the_frames(page):
+    def shown() -> int:
+        return int(re.search(r"of (\d+) frames", page.inner_text("body")).group(1))
+
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Go on").wait_for()
+    time.sleep(1)
+    before = shown()
+    time.sleep(1)
+    assert shown() == before
+    page.get_by_role("button", name="Go on").click()
+    time.sleep(1.5)
+    assert shown() > before
+
+
+def test_a_port_that_is_taken_is_said_and_another_one_serves(prior, live):
+    second = Live("--prior", prior, port=live.port)
+    assert f"port {live.port} is in use" in second.lines[0]
+    assert second.url != live.url
+    assert second.end() == 0
