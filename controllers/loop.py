@@ -95,7 +95,7 @@ class StreamClock:
 class LoopSettings:
     """How the loop keeps its time."""
 
-    margin: float = 0.022
+    margin: float = 0.026
     """Seconds before frames are due at which the search for them ends: what is left to do then takes that long."""
 
 

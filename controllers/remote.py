@@ -5,13 +5,18 @@ Times cross between processes as values of time.perf_counter, which all processe
 """
 
 import itertools
+import math
 import multiprocessing
+import re
 import signal
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +35,8 @@ from mapctl.streaming import Delivered
 
 _WARM_UP = 3  # steps before the clock starts, in which what is loaded on first use is loaded
 _READY_SECONDS = 120.0
+_MOST_WAITING = 3000  # steps that are kept for somebody who does not look: five minutes
+_GONE = "a character's process ended by itself"
 
 
 @dataclass(frozen=True)
@@ -49,24 +56,29 @@ class RemoteRequest:
 
 
 class Remote:
-    """A LiveCharacter (mapctl.streaming) in a process of its own, walking from the moment this returns."""
+    """A LiveCharacter (mapctl.streaming) in a process of its own."""
 
     skeleton: Skeleton = CANONICAL
 
     def __init__(self, request: RemoteRequest):
-        """RequestError where the prior cannot be loaded, or does not know what the command tells it."""
+        """Start it; several start at once if all are made before the first is waited for."""
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs, request), daemon=True)
         self._process.start()
         theirs.close()
-        try:
-            ready = self._ours.poll(_READY_SECONDS) and self._ours.recv()
-        except EOFError:
-            ready = None
-        if ready != ("ready",):
+        self._delivered: deque[Delivered] = deque(maxlen=_MOST_WAITING)
+        self._ready, self._failed = threading.Event(), ""
+        # A full pipe would hold up the character, so it is emptied whether or not somebody looks.
+        threading.Thread(target=self._receive, daemon=True).start()
+
+    def wait(self) -> None:
+        """Until it walks. RequestError where its prior cannot be loaded, or does not know what it is told."""
+        if not self._ready.wait(_READY_SECONDS):
+            self._failed = self._failed or "a character's process did not start"
+        if self._failed:
             self.close()
-            raise RequestError(ready[1] if ready else "a character's process did not start")
+            raise RequestError(self._failed)
 
     def command(self, command: Command) -> None:
         """See LiveCharacter."""
@@ -88,16 +100,18 @@ class Remote:
 
     def poll(self) -> list[Delivered]:
         """See LiveCharacter."""
+        if self._failed:
+            raise MapctlError(self._failed)
         found: list[Delivered] = []
-        try:
-            while self._ours.poll():
-                word, content = self._ours.recv()
-                if word == "failed":
-                    raise MapctlError(content)
-                found.append(content)
-        except (EOFError, OSError) as error:
-            raise MapctlError("a character's process ended by itself") from error
+        while self._delivered:
+            found.append(self._delivered.popleft())
         return found
+
+    def memory_mb(self) -> float:
+        """Of its process, resident; NaN where the system does not tell."""
+        status = Path(f"/proc/{self._process.pid}/status")
+        found = re.search(r"VmRSS:\s*(\d+) kB", status.read_text()) if status.exists() else None
+        return int(found[1]) / 1024 if found else math.nan
 
     def close(self) -> None:
         """See LiveCharacter."""
@@ -113,7 +127,20 @@ class Remote:
         try:
             self._ours.send(message)
         except OSError as error:
-            raise MapctlError("a character's process ended by itself") from error
+            raise MapctlError(_GONE) from error
+
+    def _receive(self) -> None:
+        try:
+            while True:
+                word, content = self._ours.recv()
+                if word == "frames":
+                    self._delivered.append(content)
+                elif word == "failed":
+                    self._failed = content
+                self._ready.set()
+        except (EOFError, OSError):
+            self._failed = self._failed or _GONE
+            self._ready.set()
 
 
 class _Closed(Exception):
@@ -203,7 +230,7 @@ def _steer(connection: Connection, request: RemoteRequest) -> None:
         if number == 0:
             for _ in range(_WARM_UP):
                 steer.step(state, first)
-            connection.send(("ready",))
+            connection.send(("ready", None))
         desk.begin(state, pose)
         for _ in steps(state, pilot, [desk], clock=desk):
             if desk.again:

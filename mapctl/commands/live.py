@@ -76,11 +76,13 @@ class Live:
         from controllers.remote import Remote, RemoteRequest
         from mapctl.steering import Command
 
-        load, found = functools.partial(priors.load, self.prior), []
+        load = functools.partial(priors.load, self.prior)
+        places = [(_APART * (number - (self.characters - 1) / 2), 0.0) for number in range(self.characters)]
+        found = [Remote(RemoteRequest(load, Command(1.2, 0.0), self.seed + number, at))
+                 for number, at in enumerate(places)]  # fmt: skip
         try:
-            for number in range(self.characters):
-                at = (_APART * (number - (self.characters - 1) / 2), 0.0)
-                found.append(Remote(RemoteRequest(load, Command(1.2, 0.0), self.seed + number, at)))
+            for character in found:
+                character.wait()
         except BaseException:
             for character in found:
                 character.close()
