@@ -64,6 +64,19 @@ def test_a_script_is_played_against_the_clock(steer, tmp_path):
     assert mapctl.load(tmp_path / "a.bvh").num_frames == 45
 
 
+def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused(steer, tmp_path, capsys):
+    script = "time_s,speed_mps,heading_deg,turn_deg_s,style\n0,1.2,0,30,{}\n3,1.2,0,,\n"
+    assert steer(script.format(""), "--report", tmp_path / "r.json") == 0
+    row = json.loads((tmp_path / "r.json").read_text())["commands"][0]
+    assert row["turn_deg_s"] == pytest.approx(30)
+    assert row["steady_heading_error_deg"] is None
+    assert "turning 30 degrees/s" in capsys.readouterr().out
+    (tmp_path / "a.bvh").unlink()
+    assert steer(script.format("swim")) == 2
+    assert "knows no style 'swim'" in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
+
+
 def test_speeds_that_nobody_runs_are_lowered_and_said(steer, capsys):
     fast = "time_s,speed_mps,heading_deg\n0,50,0\n0.5,50,0\n"
     assert steer(fast) == 0
@@ -102,6 +115,13 @@ def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
     assert obeyed["steady_heading_error_deg"] == pytest.approx(0, abs=2)
     assert not_obeyed["reached_s"] is None
     assert not_obeyed["steady_heading_error_deg"] == pytest.approx(-math.degrees(1.0), abs=2)
+
+
+def test_turning_on_is_measured_as_a_rate():
+    motion = walk(180, turn_rate=0.5)
+    row = by_command(motion, CommandTrack((0.0,), (Command(1.2, 0.0, turning=0.5),)))[0]
+    assert row["steady_turn_deg_s"] == pytest.approx(math.degrees(0.5), rel=0.05)
+    assert row["steady_heading_error_deg"] is None
 
 
 def test_a_short_command_has_no_steady_part():

@@ -36,6 +36,14 @@ def test_facing_goes_with_travel_unless_it_is_held():
     assert strafed.heading == pytest.approx(1.0)
 
 
+def test_turning_on_and_on_stays_within_the_limits_and_never_arrives():
+    limits = Limits(turn_rate=2.0)
+    for asked, got in ((0.7, 0.7), (-1.5, -1.5), (9.0, 2.0)):
+        wishes = Wish(1.0, 0.3, 0.3).ahead(Command(1.0, 5.0, turning=asked), limits, frames=90, fps=30)
+        assert wishes[-1].heading - 0.3 == pytest.approx(3 * got)
+        assert wishes[-1].facing == pytest.approx(wishes[-1].heading, abs=2 * math.pi / 30)
+
+
 def test_a_track_holds_each_command_until_the_next():
     track = CommandTrack((1.0, 2.0), (Command(1, 0), Command(2, 0)))
     assert [track.at(t).speed for t in (0, 1, 1.99, 2, 9)] == [1, 1, 1, 2, 2]
@@ -54,6 +62,7 @@ def test_speeds_beyond_the_priors_are_lowered_and_said():
     (lambda: Command(math.nan, 0), "speed must be"),
     (lambda: Command(1, math.inf), "heading must be"),
     (lambda: Command(1, 0, math.nan), "facing must be"),
+    (lambda: Command(1, 0, turning=math.inf), "turning must be"),
     (lambda: CommandTrack((), ()), "at least one"),
     (lambda: CommandTrack((1.0, 1.0), (Command(1, 0),) * 2), "must rise, got 1 s after 1 s"),
     (lambda: Limits(turn_rate=0), "turn_rate must be positive"),
@@ -79,11 +88,21 @@ def test_columns_in_any_order_with_a_facing_that_may_be_empty(read):
         (1.2, pytest.approx(math.pi / 2), None), (0, 0, pytest.approx(-math.pi / 2))]  # fmt: skip
 
 
+def test_turning_gait_and_style_may_be_left_empty(read):
+    track = read("time_s,speed_mps,heading_deg,turn_deg_s,gait,style\n0,1,0,,run,\n1,1,0,-90,, elderly\n2,1,0,,,\n")
+    assert [command.turning for command in track.commands] == [None, pytest.approx(-math.pi / 2), None]
+    assert [command.told for command in track.commands] == [("run",), ("elderly",), ()]
+    lowered, _ = track.clamped(0.5)
+    assert [(c.turning, c.told, c.speed) for c in lowered.commands] == [
+        (c.turning, c.told, 0.5) for c in track.commands]  # fmt: skip
+
+
 @pytest.mark.parametrize(("text", "line", "message"), [
     ("", None, "the file is empty"),
     ("\n\n", 1, "has no column time_s, speed_mps, heading_deg"),
     ("time_s,heading_deg\n0,1\n", 1, "has no column speed_mps"),
-    ("time_s,speed_mps,heading_deg,gait\n0,1,0,run\n", 1, "found the columns"),
+    ("time_s,speed_mps,heading_deg,mood\n0,1,0,run\n", 1, "found the columns"),
+    ("time_s,speed_mps,heading_deg,turn_deg_s\n0,1,0,fast\n", 2, "turn_deg_s must be a number"),
     ("time_s,speed_mps,heading_deg,time_s\n0,1,0,1\n", 1, "each once"),
     ("time_s,speed_mps,heading_deg\n", None, "holds no commands"),
     ("time_s,speed_mps,heading_deg\n0,1\n", 2, "found 2 values where 3 belong"),

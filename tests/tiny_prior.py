@@ -1,6 +1,6 @@
 """A density of a few kilobytes that glides: small enough for tests that need any prior, not a good one."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -15,11 +15,12 @@ CONFIG = LstmGmmConfig(width=16, components=2)
 ABILITIES = Abilities(slowest=0.2, fastest=2.0, turn_rate=1.5)
 
 
-def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8) -> Path:
+def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8, labels: tuple[str, ...] = ()) -> Path:
     """Write the weights and the card; returns the path for --prior."""
     torch.manual_seed(seed)
     mean, std = _statistics()
-    model = LstmGmm(CONFIG, mean=mean, std=std)
+    config = replace(CONFIG, labels=labels)
+    model = LstmGmm(config, mean=mean, std=std)
     tensors = {name: value.detach().clone() for name, value in model.state_dict().items()}
     tensors |= {
         "starts.previous": mean + std * torch.randn(starts, 1),
@@ -30,7 +31,7 @@ def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8) -> Path:
     }
     card = checkpoints.Card(
         kind="lstm-gmm",
-        config=CONFIG.as_card(),
+        config=config.as_card(),
         licence="none, it is made up",
         data={"starts": [f"start {number}" for number in range(starts)]},
         quality={"mocap": {"sway_cm": {"mean": 1.9, "p2": 1.2, "p98": 2.6}}},

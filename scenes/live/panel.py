@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import viser
 
@@ -28,6 +28,7 @@ class Orders:
     """By group of labels (gait, style) the one that is told."""
 
 
+@runtime_checkable
 class Deck(Protocol):
     """What the panel can ask for."""
 

@@ -1,0 +1,188 @@
+"""The live viewer without a browser: what controls do to characters, what is shown, recorded and drawn."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import walk
+
+from mapctl import formats
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL
+from mapctl.steering import Command
+from mapctl.streaming import Delivered, LiveCharacter
+from scenes.live import ground
+from scenes.live.gauges import Gauges
+from scenes.live.panel import Orders
+from scenes.live.recording import Recording, as_file
+from scenes.live.show import Show
+
+
+def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> Delivered:
+    """Some frames of a walk, due now."""
+    motion = walk(90).slice(first, first + count)
+    joints = motion.joint_positions().numpy()
+    return Delivered(time.perf_counter(), first / 30, motion.root_position.numpy(), motion.local_quat_xyzw.numpy(),
+                     np.tile([1.0, 0.0], (count, 1)), joints, (0.0, 1.2), {"noise": 1.0, "travel": 0.5}, spare,
+                     0.05, 12)  # fmt: skip
+
+
+class Actor:
+    """A LiveCharacter that notes what it is told."""
+
+    skeleton = CANONICAL
+
+    def __init__(self):
+        self.heard: list[tuple] = []
+        self.frames = 0
+
+    def command(self, command):
+        self.heard.append(("command", command))
+
+    def walk(self, points, speed):
+        if len(points) < 2:
+            raise RequestError("a curve needs two points")
+        self.heard.append(("walk", points, speed))
+
+    def pause(self, paused):
+        self.heard.append(("pause", paused))
+
+    def reset(self):
+        self.heard.append(("reset",))
+
+    def poll(self):
+        self.frames += 3
+        return [delivered(self.frames - 3)] if self.frames < 80 else []
+
+    def close(self):
+        self.heard.append(("close",))
+
+
+@pytest.fixture
+def actors():
+    return [Actor(), Actor()]
+
+
+@pytest.fixture
+def show(actors):
+    made = Show(
+        actors, [Orders(), Orders()], port=8090, fastest=3.8, labels={"gait": ["run", "walk"], "style": ["old"]}
+    )
+    yield made
+    made.close()
+    assert all(actor.heard[-1] == ("close",) for actor in actors)
+
+
+def run(show, ticks: int = 20) -> None:
+    left = iter(range(ticks))
+    show.run(lambda: next(left, None) is None)
+
+
+def test_it_listens_on_this_machine_only(show):
+    assert show.url.startswith("http://127.0.0.1:")
+    assert show.server.get_host() == "127.0.0.1"
+    assert isinstance(Actor(), LiveCharacter)
+
+
+def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):
+    show.order(speed=2.0, heading=90.0)
+    show.choose(1)
+    show.order(speed=0.5, facing=-90.0, told={"gait": "walk", "style": "old"})
+    run(show)
+    assert actors[0].heard == [("command", Command(2.0, math.pi / 2))]
+    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, told=("walk", "old")))]
+    panel = show._panel
+    assert (panel.speed.value, panel.facing.value, panel.told["gait"].value) == (0.5, -90, "walk")
+    show.choose(0)
+    run(show)
+    assert (panel.speed.value, panel.heading.value, panel.told["gait"].value) == (2.0, 90, "any")
+    assert len(actors[0].heard) == 1, "to show orders is not to give them"
+
+
+def test_pause_and_reset_are_for_everybody(show, actors):
+    show.toggle_pause()
+    run(show, 2)
+    assert show._panel.paused.label == "Go on"
+    show.toggle_pause()
+    show.order(speed=3.0)
+    show.reset()
+    run(show, 2)
+    for actor in actors:
+        assert [word for word, *_ in actor.heard if word != "command"] == ["pause", "pause", "reset"]
+    assert actors[0].heard[-2] == ("command", Command(1.2, 0.0)), "the first orders come back"
+
+
+def test_frames_stand_the_puppet_where_they_say(show, actors):
+    run(show, 30)
+    frame = show._members[0].place
+    assert np.hypot(*frame) > 0.3
+    np.testing.assert_allclose(show._world.position, [-frame[0], 0, -frame[1]], atol=1e-9)
+    show._panel.follow.value = False
+    run(show, 1)
+    np.testing.assert_allclose(show._world.position, 0)
+
+
+def test_a_drawn_path_is_given_to_walk_and_none_is_said(show, actors):
+    show.walk_path()
+    run(show, 1)
+    assert actors[0].heard == []
+    for place in ((0.0, 0.0), (1.0, 1.0), (1.0, 3.0)):
+        show._path.add(*place)
+    show.walk_path()
+    show.clear_path()
+    run(show, 1)
+    assert actors[0].heard == [("walk", [(0.0, 0.0), (1.0, 1.0), (1.0, 3.0)], 1.2)]
+    assert show._path.points == []
+
+
+def test_rays_meet_the_ground():
+    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, -1, 1])) == (0.0, 2.0)
+    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, 0, 1])) is None
+    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, 1, 1])) is None
+    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, -0.01, 1])) is None, "200 m away"
+
+
+@pytest.mark.parametrize("ending", ["bvh", "glb"])
+def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
+    recording = Recording(CANONICAL)
+    with pytest.raises(RequestError, match="nothing was recorded"):
+        recording.motion()
+    for first in range(0, 30, 3):
+        recording.add(delivered(first))
+    motion, whole = recording.motion(), walk(90).slice(0, 30)
+    np.testing.assert_allclose(motion.joint_positions(), whole.joint_positions(), atol=1e-9)
+    path = tmp_path / f"x.{ending}"
+    path.write_bytes(as_file(motion, ending))
+    if ending == "bvh":
+        read = formats.load(path)
+        order = [read.skeleton.index(name) for name in CANONICAL.names]  # a BVH lists joints depth first
+        np.testing.assert_allclose(read.joint_positions()[:, order], whole.joint_positions(), atol=1e-5)
+    else:
+        assert len(trimesh.load(path).geometry) == 1
+
+
+def test_a_recording_begins_and_ends_with_the_button(show, actors):
+    show.toggle_recording(None)
+    run(show, 5)
+    assert show._panel.record.label == "Stop and save"
+    recording = show._members[0].recording
+    assert len(recording.pieces) == 5
+    show.toggle_recording(None)
+    run(show, 2)
+    assert show._panel.record.label == "Record"
+    assert len(recording.pieces) == 5
+    assert show._members[1].recording is None
+
+
+def test_gauges_count_late_frames_and_know_the_speed(show):
+    gauges = Gauges(show.server.gui)
+    for first in range(0, 30, 3):
+        gauges.add(delivered(first, spare=-0.04 if first == 27 else 0.01), 30)
+    gauges.show()
+    assert (gauges.frames, gauges.late) == (30, 2)
+    way = walk(90).root_position[:30, ::2]
+    assert gauges.speed == pytest.approx(float((way[29] - way[14]).norm()) * 2, rel=1e-6)
+    assert "2 of 30 frames late" in gauges._text.content
+    assert [len(plot.data) for plot in gauges._plots] == [3, 3]

@@ -1,0 +1,63 @@
+"""Who drives: the last command, or a drawn path until it ends."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from helpers import walk
+
+from controllers.pilot import Pilot
+from controllers.steer import SteerFrames
+from mapctl import curves
+from mapctl.motion import Motion
+from mapctl.solver.result import Ledger
+from mapctl.steering import Command, Limits
+
+LINE = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 5.0]]))
+
+
+def at_place(pilot: Pilot, x: float, z: float) -> None:
+    """The character was shown there."""
+    pose = walk(2).slice(0, 1)
+    moved = Motion(pose.skeleton, pose.fps, torch.tensor([[x, 0.9, z]], dtype=torch.float64), pose.local_quat_xyzw)
+    pilot.show(SteerFrames(moved, torch.zeros(1, 2), (), torch.zeros(0, 21, 3), Ledger()), 0.0)
+
+
+def test_the_last_command_holds():
+    pilot = Pilot(Command(1.0, 0.5), Limits())
+    assert pilot.at(0.0) == Command(1.0, 0.5)
+    pilot.command(Command(2.0, 1.0, told=("run",)))
+    assert pilot.at(9.0) == Command(2.0, 1.0, told=("run",))
+
+
+def test_a_path_is_walked_braked_for_and_stood_at():
+    pilot = Pilot(Command(1.0, 0.5, told=("elderly",)), Limits(braking=2.0))
+    at_place(pilot, 0.0, 0.0)
+    pilot.walk(LINE, 1.4)
+    speeds = []
+    for step in range(51):
+        at_place(pilot, 0.0, 0.1 * step)
+        speeds.append(pilot.at(0.0).speed)
+        assert pilot.at(0.0).told == ("elderly",), "the path tells what the command told"
+    assert speeds[0] == 1.4
+    assert all(b <= a + 1e-9 for a, b in pairwise(speeds))
+    assert speeds[-1] == 0.0
+    assert pilot.at(0.0).heading == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_command_takes_the_character_off_its_path():
+    pilot = Pilot(Command(1.0, 0.0), Limits())
+    at_place(pilot, 0.0, 0.0)
+    pilot.walk(LINE, 1.4)
+    pilot.command(Command(0.5, math.pi))
+    assert pilot.at(0.0) == Command(0.5, math.pi)
+
+
+def test_a_closed_path_goes_round_and_round():
+    pilot = Pilot(Command(1.0, 0.0), Limits())
+    pilot.walk(curves.read("circle:1"), 1.0)
+    for turn in torch.linspace(0, 12, 200).tolist():
+        x, z = curves.read("circle:1").point(turn).tolist()
+        at_place(pilot, x, z)
+        assert pilot.at(0.0).speed == 1.0
