@@ -1,6 +1,7 @@
 """Who drives a character live: a command that somebody last gave, or a path that somebody drew."""
 
 import math
+from dataclasses import replace
 
 from controllers.pursuit import Pursuit
 from controllers.steer import SteerFrames
@@ -24,7 +25,7 @@ class Pilot:
         self._command, self._pursuit = command, None
 
     def walk(self, curve: Curve, speed: float) -> None:
-        """Go along a curve, told what the last command told; an open one is walked to its end, and stood at."""
+        """Go along a curve, in the steps, gait and style of the last command; to stand at an open one's end."""
         self._pursuit = Pursuit(curve, speed=speed)
         if self._last is not None:
             self._pursuit.show(self._last, 0.0)
@@ -47,4 +48,4 @@ class Pilot:
                 self.command(Command(0.0, wanted.heading, told=self._command.told))
                 return self._command
             wanted = Command(speed, wanted.heading)
-        return Command(wanted.speed, wanted.heading, told=self._command.told)
+        return replace(self._command, speed=wanted.speed, heading=wanted.heading, facing=None, turning=None)

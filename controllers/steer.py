@@ -27,7 +27,7 @@ from mapctl.solver.result import Ledger, Outcome
 from mapctl.solver.variables import Context
 from mapctl.solver.window import Committed, WindowSettings, WindowSolver
 from mapctl.steering import Command, Limits, Wish
-from mapctl.terms import Footing, Noise, Term, Travel
+from mapctl.terms import Footing, Noise, Steps, Term, Travel
 
 _OWED = 60  # wishes of the past that are kept: more than the travel term looks back on
 _RECENT = 15  # frames of the half second whose wishes must not be missed by far
@@ -53,6 +53,8 @@ class SteerSettings:
     """Across it, radians."""
     sigma_facing: float = Travel.sigma_facing
     """Of the hips' heading, radians."""
+    sigma_step: float = Steps.sigma
+    """Of a wanted step length, metres."""
     stuck: float = 0.4
     """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
     footing: Footing = field(default_factory=Footing)
@@ -143,10 +145,11 @@ def step(
         state = _from_here(state)
     wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     told = replace(state, prior=_told(state.prior, command.told)) if command.told else state
-    done, outcome = _solve(told, _terms(state, wishes), seconds, free=stuck)
+    terms = _terms(state, wishes, command.step_length)
+    done, outcome = _solve(told, terms, seconds, free=stuck)
     if outcome is not Outcome.DONE:
         afresh = replace(told, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
-        done, _ = _solve(afresh, _terms(state, wishes), 0.0, free=False)  # the prior's own continuation: never nothing
+        done, _ = _solve(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
     motion = decode(new, state.committed.place, skeleton=state.skeleton)
     record, own = done.windows[-1], tuple(wishes[: settings.commit])
@@ -225,11 +228,12 @@ def _from_here(state: SteerState) -> SteerState:
     return replace(state, wish=wish, owed=torch.tensor([wish.velocity]).expand(_RECENT, 2))
 
 
-def _terms(state: SteerState, wishes: Sequence[Wish]) -> Sequence[Term]:
+def _terms(state: SteerState, wishes: Sequence[Wish], step_length: float | None) -> Sequence[Term]:
     settings = state.settings
     travel = Travel(
         torch.tensor([wish.velocity for wish in wishes]), state.owed,
         facing=torch.tensor([wish.facing for wish in wishes]), sigma_speed=settings.sigma_speed,
         sigma_direction=settings.sigma_direction, sigma_facing=settings.sigma_facing,
     )  # fmt: skip
-    return settings.noise, travel, settings.footing
+    terms = settings.noise, travel, settings.footing
+    return (*terms, Steps(step_length, sigma=settings.sigma_step)) if step_length else terms

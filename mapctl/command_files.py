@@ -1,6 +1,8 @@
-"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, if wanted, facing_deg, turn_deg_s, gait and style.
+"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, if wanted, facing_deg, turn_deg_s, step_m,
+gait and style.
 
-A line that leaves one of the wanted ones empty faces where it goes, goes straight, and tells the prior nothing.
+A line that leaves one of the wanted ones empty faces where it goes, goes straight, steps as it likes,
+and tells the prior nothing.
 """
 
 import csv
@@ -15,7 +17,7 @@ from mapctl.steering import Command, CommandTrack
 
 _NEEDED = ("time_s", "speed_mps", "heading_deg")
 _LABELS = ("gait", "style")
-_ALLOWED = (*_NEEDED, "facing_deg", "turn_deg_s", *_LABELS)
+_ALLOWED = (*_NEEDED, "facing_deg", "turn_deg_s", "step_m", *_LABELS)
 _MOST_SPEED, _MOST_TIME, _MOST = 1000.0, 1e6, 1e6
 
 
@@ -63,7 +65,8 @@ class _Line:
         told = tuple(self.words[name] for name in _LABELS if self.words.get(name))
         speed = self.within("speed_mps", 0, _MOST_SPEED)
         return Command(speed, math.radians(self.value("heading_deg")), self.angle("facing_deg"),
-                       self.angle("turn_deg_s"), told)  # fmt: skip
+                       self.angle("turn_deg_s"),
+                       self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None, told)  # fmt: skip
 
     def angle(self, name: str) -> float | None:
         """Radians; None where the line leaves it open."""

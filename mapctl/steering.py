@@ -22,12 +22,16 @@ class Command:
     turning: float | None = None
     """Radians/s by which the direction of travel turns on and on, to the left where positive; `heading` then says
     nothing but where to begin."""
+    step_length: float | None = None
+    """From one foot's touch-down to the other's, metres; None leaves it to the prior."""
     told: tuple[str, ...] = ()
     """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the wishes."""
 
     def __post_init__(self):
         if not (math.isfinite(self.speed) and self.speed >= 0):
             raise RequestError(f"a command's speed must be a number of m/s, 0 or more, got {self.speed:g}")
+        if self.step_length is not None and not 0 < self.step_length < math.inf:
+            raise RequestError(f"a command's step length must be positive, got {self.step_length:g} m")
         for name in ("heading", "facing", "turning"):
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):

@@ -6,7 +6,7 @@ from helpers import generator, tiny_model, walk
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import encode
-from mapctl.terms import Closeness, Footing, Likelihood, Noise, Path, Seam, Term, Travel
+from mapctl.terms import Closeness, Footing, Likelihood, Noise, Path, Seam, Steps, Term, Travel
 from priors.lstm_gmm import LstmGmm
 
 FRAMES = 12
@@ -25,6 +25,7 @@ TERMS: dict[str, Term] = {
     "path of a hand": Path(curves.circle(radius=3), _ARCS, joint="leftHand"),
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
     "footing": Footing(),
+    "steps": Steps(0.6),
     "seam": Seam(sigma=300.0),
     "closeness": Closeness(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_turn=0.3),
     "travel": Travel(_VELOCITIES, _VELOCITIES[:9] - 0.2),

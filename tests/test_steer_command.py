@@ -128,3 +128,17 @@ def test_a_short_command_has_no_steady_part():
     rows = by_command(walk(100), CommandTrack((0.0, 2.0), (Command(1, 0), Command(0, 0))))
     assert rows[0]["steady_speed_mps"] is None
     assert rows[1]["steady_heading_error_deg"] is None
+
+
+def test_a_wanted_step_length_is_in_the_ledger_and_the_report(steer, tmp_path, capsys):
+    script = "time_s,speed_mps,heading_deg,step_m\n0,1.2,0,\n1,1.2,0,0.6\n3,1.2,0,\n"
+    assert steer(script, "--report", tmp_path / "r.json") == 0
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert [row["step_m"] for row in told["commands"]] == [None, 0.6, None]
+    assert {"travel", "footing", "noise", "steps"} == set(told["ledger"])
+
+
+def test_steps_of_a_walk_are_measured():
+    motion = walk(180)
+    row = by_command(motion, CommandTrack((0.0,), (Command(1.2, 0.0, step_length=0.6),)))[0]
+    assert row["steady_step_m"] == pytest.approx(1.2 / (2 * 0.9), rel=0.15)  # two steps a stride

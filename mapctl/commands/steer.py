@@ -28,7 +28,8 @@ class Steer:
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
-    strafing, turn_deg_s to turn on and on, gait and style as the prior knows them. The last line's time is the end."""
+    strafing, turn_deg_s to turn on and on, step_m for a step length, gait and style as the prior knows them. The last
+    line's time is the end."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz or .glb."""
     realtime: bool = False
@@ -146,6 +147,7 @@ def _summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
         off, rate = row["steady_heading_error_deg"], row["steady_turn_deg_s"]
         turned = "" if off is None else f", {off:+.1f} degrees off"
         turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
+        turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
         way = f"to {row['heading_deg']:.0f} degrees" if row["turn_deg_s"] is None else (
             f"turning {row['turn_deg_s']:.0f} degrees/s")  # fmt: skip
         asked = f"{row['speed_mps']:.2f} m/s {way}"

@@ -9,7 +9,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
+from mapctl import contacts
+from mapctl.metrics.realism.gait import step_lengths
 from mapctl.motion import Motion
+from mapctl.roles import find_feet
 from mapctl.steering import Command, CommandTrack
 
 _SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
@@ -44,9 +47,12 @@ def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | No
 
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
     it never was), steady_speed_mps (net way over time; the mean speed while turning), steady_heading_error_deg and
-    steady_turn_deg_s (None where the other, standing, or no steady part was wanted).
+    steady_turn_deg_s (None where the other, standing, or no steady part was wanted), step_m and steady_step_m (None
+    unless a step length was wanted).
     """
     way, rows = travelled(motion), []
+    asked = any(command.step_length is not None for command in track.commands)
+    steps = _steps(motion) if asked else np.full(len(way.seconds), math.nan)
     ground = motion.joint_positions()[:, 0, ::2].numpy()
     ends = [*track.times[1:], float(way.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
@@ -56,8 +62,16 @@ def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | No
                                         "heading_deg": math.degrees(command.heading)}  # fmt: skip
         row["reached_s"] = _reached(way, part, began, command, float(motion.fps))
         steady = np.flatnonzero(part & (way.seconds >= began + _STEADY_AFTER))
-        rows.append(row | _steady(way, ground, steady, command, float(motion.fps)))
+        row |= _steady(way, ground, steady, command, float(motion.fps))
+        seen = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
+        rows.append(row | {"step_m": command.step_length, "steady_step_m": float(np.mean(seen)) if len(seen) else None})
     return rows
+
+
+def _steps(motion: Motion) -> Float[ndarray, " frames"]:
+    """Length of the step that ends in a frame, metres; NaN where none does."""
+    toes = motion.joint_positions()[:, list(find_feet(motion.skeleton))]
+    return step_lengths(toes[..., ::2], contacts.planted(toes, float(motion.fps)), float(motion.fps)).numpy()
 
 
 def _reached(way: Travelled, part: ndarray, began: float, command: Command, fps: float) -> float | None:

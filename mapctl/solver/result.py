@@ -68,12 +68,11 @@ class Ledger:
     """One for each term."""
 
     def join(self, other: "Ledger") -> "Ledger":
-        """This ledger's frames followed by the other's; both list the same terms."""
+        """This ledger's frames followed by the other's; a term that only one of them lists is 0 in the other's."""
         if not self.entries:
             return other
-        pairs = zip(self.entries, other.entries, strict=True)
-        return Ledger(tuple(LedgerEntry(a.name, a.unit, torch.cat([a.energy, b.energy]),
-                                        torch.cat([a.residual, b.residual])) for a, b in pairs))  # fmt: skip
+        mine, theirs = ({entry.name: entry for entry in ledger.entries} for ledger in (self, other))
+        return Ledger(tuple(_joined(mine.get(name), theirs.get(name), self, other) for name in mine | theirs))
 
     def slice(self, frames: int) -> "Ledger":
         """The first frames."""
@@ -87,6 +86,16 @@ class Ledger:
             "residual_p95": float(torch.quantile(entry.residual.double(), 0.95)),
             "residual_max": float(entry.residual.max()),
         } for entry in self.entries}  # fmt: skip
+
+
+def _joined(before: LedgerEntry | None, after: LedgerEntry | None, first: Ledger, second: Ledger) -> LedgerEntry:
+    """One term of two ledgers, of which one may not have it."""
+    some = before or after
+    assert some is not None, "the term comes from one of them"
+    nothing = [torch.zeros_like(ledger.entries[0].energy) for ledger in (first, second)]
+    sides = zip((before, after), nothing, strict=True)
+    energies, residuals = zip(*((e.energy, e.residual) if e else (zero, zero) for e, zero in sides), strict=True)
+    return LedgerEntry(some.name, some.unit, torch.cat(energies), torch.cat(residuals))
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.noise import Noise
 from mapctl.terms.path import Path
 from mapctl.terms.seam import Seam
+from mapctl.terms.steps import Steps
 from mapctl.terms.travel import Travel
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Travel)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel)
 
-__all__ = ["ALL", "Closeness", "Footing", "Likelihood", "Noise", "Path", "Seam", "Term", "Travel"]
+__all__ = ["ALL", "Closeness", "Footing", "Likelihood", "Noise", "Path", "Seam", "Steps", "Term", "Travel"]

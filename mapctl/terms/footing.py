@@ -9,7 +9,8 @@ from torch import Tensor
 from mapctl.skeleton import TOE_REST_HEIGHT
 from mapctl.trial import Trial
 
-_TOES = ("leftToes", "rightToes")
+TOES = ("leftToes", "rightToes")
+"""The joints that the two contact bits speak of."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Footing:
         return (self._planted(trial) * self._speeds(trial)).amax(-1)
 
     def _toes(self, trial: Trial) -> list[int]:
-        return [trial.skeleton.index(name) for name in _TOES]
+        return [trial.skeleton.index(name) for name in TOES]
 
     def _speeds(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
         steps = torch.stack([trial.step(toe)[..., ::2] for toe in self._toes(trial)], dim=-2)

@@ -24,6 +24,8 @@ class Orders:
     """Degrees; 0 is +Z, 90 is +X."""
     facing: float | None = None
     """Degrees; None faces where it goes."""
+    step_length: float | None = None
+    """Metres; None steps as the prior does."""
     told: dict[str, str] = field(default_factory=dict)
     """By group of labels (gait, style) the one that is told."""
 
@@ -77,6 +79,8 @@ class Panel:
             self.heading = gui.add_slider("Heading, degrees", -180, 180, 1, 0, hint="0 is +Z, 90 is +X")
             self.strafe = gui.add_checkbox("Face a fixed way", False)
             self.facing = gui.add_slider("Facing, degrees", -180, 180, 1, 0, disabled=True)
+            self.measured = gui.add_checkbox("Measured steps", False)
+            self.step_length = gui.add_slider("Step length, m", 0.3, 1.2, 0.05, 0.65, disabled=True)
             self.told = {group: gui.add_dropdown(group.capitalize(), [AS_IT_LIKES, *names])
                          for group, names in labels.items()}  # fmt: skip
         with gui.add_folder("Path"):
@@ -92,7 +96,8 @@ class Panel:
             self.ending = gui.add_dropdown("File", list(FORMATS))
             self.record = gui.add_button("Record", color="red")
             self.record.on_click(lambda event: deck.toggle_recording(event.client))
-        for handle in (self.speed, self.heading, self.strafe, self.facing, *self.told.values()):
+        for handle in (self.speed, self.heading, self.strafe, self.facing, self.measured, self.step_length,
+                       *self.told.values()):  # fmt: skip
             self._on(handle, self._ordered)
         self._keys(gui)
 
@@ -106,13 +111,18 @@ class Panel:
         self.speed.value, self.heading.value = orders.speed, round(orders.heading)
         self.strafe.value, self.facing.disabled = orders.facing is not None, orders.facing is None
         self.facing.value = round(orders.facing or 0.0)
+        steps = orders.step_length
+        self.measured.value, self.step_length.disabled = steps is not None, steps is None
+        self.step_length.value = self.step_length.value if steps is None else steps
         for group, handle in self.told.items():
             handle.value = orders.told.get(group, AS_IT_LIKES)
 
     def _ordered(self) -> None:
         told = {group: handle.value for group, handle in self.told.items() if handle.value != AS_IT_LIKES}
         facing = float(self.facing.value) if self.strafe.value else None
-        self._deck.order(speed=float(self.speed.value), heading=float(self.heading.value), facing=facing, told=told)
+        steps = float(self.step_length.value) if self.measured.value else None
+        self._deck.order(speed=float(self.speed.value), heading=float(self.heading.value), facing=facing,
+                         step_length=steps, told=told)  # fmt: skip
 
     def _keys(self, gui: viser.GuiApi) -> None:
         def speed(by: float) -> Callable[[], None]:

@@ -193,7 +193,7 @@ class Show:
         orders = member.orders
         facing = None if orders.facing is None else math.radians(orders.facing)
         member.character.command(Command(orders.speed, math.radians(orders.heading), facing,
-                                         told=tuple(orders.told.values())))  # fmt: skip
+                                         step_length=orders.step_length, told=tuple(orders.told.values())))  # fmt: skip
 
     def _show_due(self, now: float) -> None:
         for member in self._members:
