@@ -109,3 +109,8 @@ class Abilities:
     """Speed, m/s, 99th percentile of one-second means."""
     turn_rate: float
     """Turning of the travel direction, rad/s, 99.5th percentile of one-second means."""
+
+    @property
+    def fastest_asked(self) -> float:
+        """Highest speed that is asked of the prior while steering, m/s: a tenth beyond what its data show."""
+        return 1.1 * self.fastest

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from mapctl.errors import RequestError
-from mapctl.protocols import Abilities
 
 
 @dataclass(frozen=True)
@@ -125,11 +124,6 @@ class Wish:
             wish = wish.toward(command, limits, 1 / fps)
             wishes.append(wish)
         return wishes
-
-
-def fastest_of(abilities: Abilities) -> float:
-    """Highest speed that is asked of a prior, m/s: a tenth beyond what its data show."""
-    return 1.1 * abilities.fastest
 
 
 def _toward(angle: float, wanted: float, most: float) -> float:

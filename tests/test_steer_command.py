@@ -51,6 +51,12 @@ def test_a_script_gives_motion_report_and_plot(steer, tmp_path, capsys):
     assert str(plot) in out
 
 
+def test_limits_that_cannot_be_are_refused(steer, tmp_path, capsys):
+    assert steer(SCRIPT, "--turn-rate", -3) == 2
+    assert "turn_rate must be positive" in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
+
+
 def test_the_same_seed_gives_the_same_bytes(steer, tmp_path):
     found = set()
     for _ in range(2):

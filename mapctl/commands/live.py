@@ -37,7 +37,6 @@ class Live:
         compute_on_one()
         self._check()
         import priors
-        from mapctl.steering import fastest_of
         from scenes.live.panel import Orders
         from scenes.live.show import Show
 
@@ -45,7 +44,7 @@ class Live:
         orders = [Orders() for _ in range(self.characters)]
         characters = self._characters()
         try:
-            show = Show(characters, orders, port=self.port, fastest=fastest_of(prior.abilities), labels=prior.labels)
+            show = Show(characters, orders, port=self.port, fastest=prior.abilities.fastest_asked, labels=prior.labels)
         except BaseException:
             for character in characters:
                 character.close()

@@ -1,5 +1,6 @@
 """`mapctl steer`: a script of commands is replayed, as live steering would answer it."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from mapctl.commands.threads import compute_on_one
 from mapctl.commands.walks import INTERRUPTED
 from mapctl.errors import RequestError
 from mapctl.progress import bar
+from mapctl.steering import Limits
 
 if TYPE_CHECKING:
     from controllers.loop import Recorder, StepRecord
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from mapctl.steering import CommandTrack
 
 _NOT_ALL_HOLDS = 3
+_TURN_RATE = round(math.degrees(Limits.turn_rate), 1)
 _LAST_HELD = 3.0  # seconds for which a script of a single command is played
 
 
@@ -38,6 +41,12 @@ class Steer:
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Of the pose that it begins with."""
+    acceleration: options.Number = Limits.acceleration
+    """Most that the wanted speed rises by, m/s^2."""
+    braking: options.Number = Limits.braking
+    """Most that it falls by, m/s^2."""
+    turn_rate: options.Number = _TURN_RATE
+    """Most that the wanted direction turns by, degrees/s."""
     report: options.MaybeFile = None
     """JSON with each command's response, timing, ledger and measures."""
     plot: options.MaybeFile = None
@@ -53,11 +62,10 @@ class Steer:
         self._check()
         import priors
         from mapctl.command_files import read_commands
-        from mapctl.steering import fastest_of
 
         track = read_commands(self.commands)
         prior = priors.load(self.prior)
-        track, lowered = track.clamped(fastest_of(prior.abilities))
+        track, lowered = track.clamped(prior.abilities.fastest_asked)
         for labels in {command.told for command in track.commands if command.told}:
             prior.told(labels)  # what it does not know is said now
         recorder, records, frames = self._steered(prior, track)
@@ -82,12 +90,16 @@ class Steer:
         from mapctl import formats
 
         options.check_seed(self.seed)
+        self._limits()
         formats.check_ending(self.out)
         outputs.check_files(options.given(self.out, self.report, self.plot))
         if self.plot is not None:
             if self.plot.suffix.lower() != ".png":
                 raise RequestError(f"--plot writes .png, not {self.plot.suffix or 'a file without ending'}")
             outputs.require_render("matplotlib")
+
+    def _limits(self) -> Limits:
+        return Limits(self.acceleration, self.braking, math.radians(self.turn_rate))
 
     def _steered(self, prior: Any, track: "CommandTrack") -> tuple["Recorder", list["StepRecord"], int]:
         import torch
@@ -97,7 +109,9 @@ class Steer:
 
         first, recorder = track.commands[0], Recorder()
         frames = options.frames_of(track.times[-1] + (_LAST_HELD if len(track.times) == 1 else 0.0))
-        state, pose = steer.begin(prior, first, generator=torch.Generator().manual_seed(self.seed))
+        settings = steer.SteerSettings(limits=self._limits())
+        generator = torch.Generator().manual_seed(self.seed)
+        state, pose = steer.begin(prior, first, generator=generator, settings=settings)
         recorder.show(pose, 0.0)
         for command in (first, *{command.told: command for command in track.commands}.values()):
             steer.step(state, command)  # what is compiled, loaded or told on first use must not cost frames
