@@ -155,6 +155,7 @@ class _Desk:
     def __init__(self, connection: Connection, pilot: Pilot):
         self._connection, self._pilot = connection, pilot
         self.again = False
+        self._began = 0.0  # when the stream's second 0 is
         self._paused_since: float | None = None
         self._shift = 0.0
 
@@ -174,13 +175,13 @@ class _Desk:
     def show(self, frames: SteerFrames, due: float) -> None:
         """See Display."""
         self._pilot.show(frames, due)
-        self._connection.send(("frames", _plain(frames, due, self.began + due + self._shift)))
+        self._connection.send(("frames", _plain(frames, due, self._began + due + self._shift)))
 
     def begin(self, state: steer.SteerState, frames: SteerFrames) -> None:
-        """Show the first pose, and know when the stream's second 0 is."""
+        """Show the first pose, from which on the stream's seconds count."""
         self.again = False
         lead = state.settings.commit / PRIOR_FPS
-        self.began = self.now() - state.frames / PRIOR_FPS + lead  # as controllers.loop.steps has it
+        self._began = self.now() - state.frames / PRIOR_FPS + lead  # as controllers.loop.steps has it
         self.show(frames, 0.0)
 
     def _obey(self) -> None:

@@ -163,6 +163,10 @@ def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
         assert len(trimesh.load(path).geometry) == 1
 
 
+def test_a_recording_can_be_a_film():
+    assert as_file(walk(8), "mp4")[4:8] == b"ftyp"
+
+
 def test_a_recording_begins_and_ends_with_the_button(show, actors):
     show.toggle_recording(None)
     run(show, 5)

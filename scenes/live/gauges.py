@@ -33,7 +33,9 @@ class Gauges:
         """Begin anew: another character, or the same from its start."""
         self._rows.clear()
         self._places.clear()
+        self._last: Delivered | None = None
         self.frames = self.late = 0
+        self.speed = 0.0
 
     def add(self, delivered: Delivered, fps: float) -> None:
         """One more step."""
@@ -57,9 +59,10 @@ class Gauges:
 
     def show(self) -> None:
         """Bring text and plots up to date; a few times a second is enough."""
-        if len(self._rows) < 2:
+        last = self._last
+        if last is None or len(self._rows) < 2:
             return
-        last, count = self._last, max(1, len(self._last.root))
+        count = max(1, len(last.root))
         self._text.content = (
             f"speed {self.speed:.2f} m/s, wanted {self._rows[-1][1]:.2f}\n\n"
             f"{1000 * last.compute / count:.1f} ms a frame, {last.evaluations} evaluations a step\n\n"
