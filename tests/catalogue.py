@@ -6,7 +6,7 @@ from helpers import generator, tiny_model, walk
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import encode
-from mapctl.terms import Closeness, Footing, Likelihood, Noise, Path, Seam, Steps, Term, Travel
+from mapctl.terms import Closeness, Footing, Likelihood, Noise, Observation, Path, Seam, Steps, Term, Travel
 from priors.lstm_gmm import LstmGmm
 
 FRAMES = 12
@@ -18,6 +18,14 @@ _IN_SPACE = curves.from_points(torch.stack([0.1 * torch.sin(_RISING), 0.1 + 0.2 
 
 _VELOCITIES = torch.stack([torch.linspace(0, 0.4, FRAMES), torch.linspace(0, 1.2, FRAMES)], -1).double()
 
+_SEEN = encode(walk(30, cadence=1.2, seed=5))[0][4 : 4 + FRAMES]
+_MASK = torch.arange(FRAMES)[:, None] % (2 + torch.arange(21)) != 1
+_OBSERVED = Observation(
+    torch.tensor([[0.1, 0.9, 0.2]]).double() + 0.04 * torch.arange(FRAMES).double()[:, None],
+    0.2 + 0.3 * torch.arange(FRAMES).double(), _SEEN[:, 4:66], _MASK[:, 3], _MASK, 0.02,
+    torch.linspace(0.05, 0.2, 21), outlier=1.5,
+)  # fmt: skip
+
 TERMS: dict[str, Term] = {
     "likelihood": Likelihood(temperature=2.0),
     "noise": Noise(sigma=0.7),
@@ -26,6 +34,7 @@ TERMS: dict[str, Term] = {
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
     "footing": Footing(),
     "steps": Steps(0.6),
+    "observation": _OBSERVED,
     "seam": Seam(sigma=300.0),
     "closeness": Closeness(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_turn=0.3),
     "travel": Travel(_VELOCITIES, _VELOCITIES[:9] - 0.2),

@@ -157,6 +157,10 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
         turned = {name: rotate_ground(getattr(term, name), angle.expand(len(getattr(term, name))))
                   for name in ("velocities", "velocities_before")}  # fmt: skip
         term = replace(term, facing=None if term.facing is None else term.facing + turn, **turned)
+    if "root" in names:
+        root = term.root.clone()
+        root[:, ::2] = rotate_ground(root[:, ::2], angle.expand(len(root))) + torch.tensor(shift).double()
+        term = replace(term, root=root, heading=term.heading + turn)
     torch.testing.assert_close(term(there), TERMS[name](here), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(term.residual(there), TERMS[name].residual(here), rtol=1e-6, atol=1e-6)
 

@@ -5,11 +5,24 @@ from mapctl.terms.closeness import Closeness
 from mapctl.terms.footing import Footing
 from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.noise import Noise
+from mapctl.terms.observation import Observation
 from mapctl.terms.path import Path
 from mapctl.terms.seam import Seam
 from mapctl.terms.steps import Steps
 from mapctl.terms.travel import Travel
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation)
 
-__all__ = ["ALL", "Closeness", "Footing", "Likelihood", "Noise", "Path", "Seam", "Steps", "Term", "Travel"]
+__all__ = [
+    "ALL",
+    "Closeness",
+    "Footing",
+    "Likelihood",
+    "Noise",
+    "Observation",
+    "Path",
+    "Seam",
+    "Steps",
+    "Term",
+    "Travel",
+]
