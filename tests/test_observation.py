@@ -50,7 +50,7 @@ def test_it_is_half_the_squares_over_the_sigmas():
             apart = own[3 * joint - 1 : 3 * joint + 2] - seen[3 * joint - 1 : 3 * joint + 2]
             if joint == 0:
                 turn = math.remainder(float(heading[frame] - term.heading[frame]), 2 * math.pi)
-                apart = torch.tensor([turn, *(own[:2] - seen[:2]).tolist()]).double()
+                apart = torch.tensor([turn, *(own[:2] - seen[:2]).tolist()], dtype=torch.float64)
             if term.seen[frame, joint]:
                 expected[frame] += 0.5 * float(apart.square().sum()) / float(term.sigma_angle[joint]) ** 2
     torch.testing.assert_close(term(trial)[0], expected, rtol=1e-9, atol=1e-9)
