@@ -23,6 +23,7 @@ from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.solver.methods import LatentMethod, Method, SolvedWindow
+from mapctl.solver.proposals import BestOf, SteeringKnots
 from mapctl.solver.result import Ledger, Outcome
 from mapctl.solver.variables import Context
 from mapctl.solver.window import Committed, WindowSettings, WindowSolver
@@ -32,6 +33,7 @@ from mapctl.terms import Footing, Noise, Steps, Term, Travel
 _OWED = 60  # wishes of the past that are kept: more than the travel term looks back on
 _RECENT = 15  # frames of the half second whose wishes must not be missed by far
 _MOVING = 0.3  # m/s below which a direction of travel means nothing
+_KNOTS, _SPREAD = 7, 0.8  # of draws for who is stuck: noise of every feature, slow enough to make a step of it
 _NEAREST = 6  # starts nearest to the wanted speed, of which one is drawn
 
 
@@ -57,6 +59,8 @@ class SteerSettings:
     """Of a wanted step length, metres."""
     stuck: float = 0.4
     """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
+    draws: int = 32
+    """Random beginnings of which the best is searched from then."""
     footing: Footing = field(default_factory=Footing)
     """Planted feet."""
     noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
@@ -176,21 +180,27 @@ def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, f
     method: Method = LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=settings.evaluations), budget=budget)
     if free:
         half = replace(method, budget=Budget(max(1, settings.evaluations // 2), seconds and seconds / 2))
-        method = _StepFirst(half, [term for term in terms if term.name != settings.footing.name])
+        draws = BestOf(settings.draws, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _SPREAD))
+        few = LbfgsSettings(max_iterations=settings.evaluations // 2)
+        bold = replace(half, proposal=draws, lbfgs=few, budget=replace(half.budget, evaluations=None))
+        method = _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
     window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = WindowSolver(state.prior, window, state.skeleton, method=method)
     frames = len(state.committed.features) + settings.commit
-    return solver.solve(state.committed, lambda first, count: terms, frames, generator=torch.Generator())
+    return solver.solve(
+        state.committed, lambda first, count: terms, frames, generator=torch.Generator().manual_seed(state.frames)
+    )
 
 
 @dataclass(frozen=True)
 class _StepFirst:
-    """A Method that spends half on the wishes without footing, and half on all.
+    """A Method that spends half on the wishes without footing, from the best of some draws, and half on all.
 
     Who stands has both feet planted, by contact bits that stay while a window is solved: footing then holds what the
     wish would move. The search without it finds a step, and along that step the prior says anew which feet stand.
     """
 
+    bold: LatentMethod
     half: LatentMethod
     loose: Sequence[Term]
 
@@ -198,7 +208,7 @@ class _StepFirst:
         self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
         seconds: float = math.inf,
     ) -> SolvedWindow:  # fmt: skip
-        first = self.half(context, self.loose, tail, generator, seconds=seconds / 2)
+        first = self.bold(context, self.loose, tail, generator, seconds=seconds / 2)
         second = self.half(context, terms, first.carry, generator, seconds=seconds / 2)
         return replace(second, evaluations=first.evaluations + second.evaluations)
 
