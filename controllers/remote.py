@@ -87,7 +87,7 @@ class Remote:
     def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
         """See LiveCharacter. RequestError where the points make no curve."""
         places = np.array(points, dtype=np.float64).reshape(-1, 2)
-        curves.from_points(places)  # what is wrong with them is said here, not there
+        curves.through(places)  # what is wrong with them is said here, not there
         self._send("walk", places, speed)
 
     def pause(self, paused: bool) -> None:
@@ -196,7 +196,7 @@ class _Desk:
         elif word == "pause":
             self._pause(*content)
         elif word == "walk":
-            self._pilot.walk(curves.from_points(content[0]), content[1])
+            self._pilot.walk(curves.through(content[0]), content[1])
         else:
             self._pilot.command(*content)
 

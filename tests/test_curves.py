@@ -77,6 +77,21 @@ def test_left_is_plus_x_when_facing_plus_z():
     assert float(circle.signed_offset(inside, circle.nearest(inside))) > 0
 
 
+def test_a_curve_through_points_passes_them_smoothly_and_few_points_are_a_line():
+    points = np.array([[0.0, 0.0], [1.0, 0.2], [1.2, 0.1], [1.2, 0.1], [3.0, 2.0]])
+    curve = curves.through(points)
+    sharp = curves.from_points(points)
+    dense = torch.linspace(0, curve.length, 400).double()
+    for point in points:
+        assert float((curve.point(dense) - torch.tensor(point)).norm(dim=-1).min()) < 0.02
+    turns = [torch.diff(c.tangent(torch.linspace(0.1, c.length - 0.1, 300).double()), dim=0).norm(dim=-1).max()
+             for c in (curve, sharp)]  # fmt: skip
+    assert turns[0] < turns[1] / 2
+    assert curves.through(points[:2]).length == pytest.approx(float(np.hypot(1.0, 0.2)))
+    with pytest.raises(RequestError, match="at least 2"):
+        curves.through(points[2:4])
+
+
 def test_an_open_curve_goes_on_straight():
     curve = curves.s(length=4.0)
     for end, sign in ((0.0, -1.0), (curve.length, 1.0)):

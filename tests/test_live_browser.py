@@ -27,6 +27,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def _hear_ctrl_c() -> None:
+    """Shells let what they start in the background ignore Ctrl-C, and its children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Live:
     """`mapctl live` as a user starts it."""
 
@@ -34,7 +39,7 @@ class Live:
         self.port = port or free_port()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "mapctl.cli", "live", "--port", str(self.port), *map(str, words)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=_hear_ctrl_c,
         )  # fmt: skip
         self.lines: list[str] = []
         assert self.process.stdout is not None
@@ -46,7 +51,10 @@ class Live:
 
     def end(self) -> int:
         self.process.send_signal(signal.SIGINT)
-        return self.process.wait(timeout=20)
+        try:
+            return self.process.wait(timeout=20)
+        finally:
+            self.process.kill()
 
 
 @pytest.fixture(scope="module")

@@ -96,7 +96,7 @@ def on_the_ground(origin: Array, direction: Array) -> tuple[float, float] | None
 
 def _smooth(points: Sequence[tuple[float, float]]) -> Array | None:
     try:
-        curve = curves.from_points(np.array(points, dtype=np.float64).reshape(-1, 2))
+        curve = curves.through(np.array(points, dtype=np.float64).reshape(-1, 2))
     except RequestError:
         return None  # one point, or all in one place: no curve yet
     arcs = np.linspace(0, curve.length, max(2, round(curve.length / _SPACING)))
