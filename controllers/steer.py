@@ -60,7 +60,7 @@ class SteerSettings:
     stuck: float = 0.4
     """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
     draws: int = 32
-    """Random beginnings of which the best is searched from then."""
+    """Random beginnings, tried all at once beside the evaluations, of which the best is searched from then."""
     footing: Footing = field(default_factory=Footing)
     """Planted feet."""
     noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
@@ -181,8 +181,13 @@ def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, f
     if free:
         half = replace(method, budget=Budget(max(1, settings.evaluations // 2), seconds and seconds / 2))
         draws = BestOf(settings.draws, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _SPREAD))
-        few = LbfgsSettings(max_iterations=settings.evaluations // 2)
-        bold = replace(half, proposal=draws, lbfgs=few, budget=replace(half.budget, evaluations=None))
+        few = LbfgsSettings(max_iterations=max(1, settings.evaluations // 2))
+        bold = replace(
+            half,
+            proposal=draws,
+            lbfgs=few,
+            budget=replace(half.budget, evaluations=settings.draws + few.max_iterations),
+        )
         method = _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
     window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = WindowSolver(state.prior, window, state.skeleton, method=method)
