@@ -59,7 +59,7 @@ class SteerSettings:
     """Of a wanted step length, metres."""
     stuck: float = 0.4
     """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
-    draws: int = 32
+    draws: int = 12
     """Random beginnings, tried all at once beside the evaluations, of which the best is searched from then."""
     footing: Footing = field(default_factory=Footing)
     """Planted feet."""
