@@ -91,7 +91,8 @@ def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion |
     """Put the hips where they belong: by the root itself, or by its animated offset below a static root."""
     joint = _hips(rigmap)
     if joint == 0:
-        return replace(on_rig, root_position=hips)
+        moving = original.moving_offsets if original is not None else {}
+        return replace(on_rig, root_position=hips, moving_offsets=moving)
     if original is not None:
         on_rig = replace(on_rig, root_position=original.root_position, moving_offsets=original.moving_offsets)
     parent = on_rig.skeleton.parents[joint]

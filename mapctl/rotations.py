@@ -4,6 +4,8 @@ Built on roma, whose first derivatives are exact at the identity and near pi. Wh
 is here: the split of a rotation into a turn about the vertical and what remains.
 """
 
+from functools import partial
+
 import roma
 import torch
 from jaxtyping import Float
@@ -14,6 +16,7 @@ inverse = roma.quat_conjugation
 rotate = roma.quat_action
 from_rotation_vector = roma.rotvec_to_unitquat
 to_rotation_vector = roma.unitquat_to_rotvec  # the short one, whatever the quaternion's sign
+to_long_rotation_vector = partial(roma.unitquat_to_rotvec, shortest_arc=False)  # as the quaternion's sign says
 to_matrix = roma.unitquat_to_rotmat
 from_matrix = roma.rotmat_to_unitquat
 rotation_vector_to_matrix = roma.rotvec_to_rotmat

@@ -1,0 +1,174 @@
+"""The MAP stage of denoising: as near to the proposal as its doubts ask for, on feet that stand (rnn paper, Eq. 18-19).
+
+Windows of poses about the proposal (see mapctl.solver.poses), solved one after the other by L-BFGS; each looks ahead
+into the next, and the next goes on from where its committed frames end.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.capture import Capture
+from mapctl.contacts import without_short_runs
+from mapctl.features import LAYOUT, Place, local_rotations, root_places
+from mapctl.motion import Motion
+from mapctl.solver.budget import Budget, Meter
+from mapctl.solver.lbfgs import LbfgsSettings, minimise
+from mapctl.solver.objective import Objective
+from mapctl.solver.poses import Guide, Poses
+from mapctl.solver.result import Ledger
+from mapctl.terms import Footing, Likelihood, Noise, Term
+from mapctl.terms.footing import TOES
+
+_SHORTEST = 3  # frames that a contact, or a gap in one, lasts: the rule of mapctl.contacts
+
+
+@dataclass(frozen=True)
+class StandingSettings:
+    """Sigmas and search."""
+
+    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.06))
+    """Planted feet; the rest height is the performer's own. Mocap's own planted toes move by 6 cm/s."""
+    share: float = 0.35
+    """Doubt about a proposal that was seen, as a share of the capture's noise."""
+    unseen_deg: float = 5.0
+    """Doubt about the angles of joints that were not."""
+    unseen_cm: float = 5.0
+    """Doubt about the place of hips that were not."""
+    temperature: float = 1.0
+    """Of the density's likelihood, if there is one; above 1 it is trusted less."""
+    frames: int = 96
+    """Of a window."""
+    ahead: int = 24
+    """Of them that the next window solves again."""
+    past: int = 40
+    """Committed frames that terms may look back on."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
+    """Of one window."""
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=20))
+    """Of one window."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stood:
+    """What the stage makes of a proposal."""
+
+    motion: Motion
+    """At the prior's rate."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted."""
+    ledger: Ledger
+    """By term and frame."""
+    evaluations: int
+    """Spent in all."""
+
+
+def stand(
+    proposal: Motion, contacts: Float[Tensor, "frames 2"], capture: Capture, settings: StandingSettings, *,
+    density: Any = None,
+) -> Stood:  # fmt: skip
+    """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was."""
+    guide = guide_of(proposal, steady(contacts > 0))
+    sigma = _doubt(capture, settings)
+    footing = replace(settings.footing, rest_height=rest_height(proposal, guide.contacts))
+    terms: list[Term] = [Noise(1.0), footing]
+    if density is not None:
+        terms.append(Likelihood(settings.temperature))
+    place = Place(guide.root[0, ::2], guide.heading[0])
+    done = _Done(place, torch.zeros(0, proposal.num_joints, 3), torch.zeros(2, dtype=torch.bool), None)
+    frames, pieces, spent, ledger, first = proposal.num_frames, [], 0, Ledger(), 0
+    while first < frames:
+        stop = min(frames, first + settings.frames)
+        count = stop - first if stop == frames else settings.frames - settings.ahead
+        poses = Poses(guide.slice(first, stop), sigma[first:stop], done.place, done.before, done.contacts,
+                      proposal.skeleton, density=density, state=_state(done, density, guide, first))  # fmt: skip
+        features, used, entries, done = _window(poses, terms, count, settings, density)
+        pieces.append(features)
+        spent, first, ledger = spent + used, first + count, ledger.join(entries)
+    return Stood(_motion(torch.cat(pieces), place, proposal), guide.contacts, ledger, spent)
+
+
+@dataclass(frozen=True, eq=False)
+class _Done:
+    """What a window goes on from."""
+
+    place: Place
+    before: Tensor
+    contacts: Tensor
+    state: Any
+
+
+def _window(
+    poses: Poses, terms: Sequence[Term], count: int, settings: StandingSettings, density: Any
+) -> tuple[Tensor, int, Ledger, _Done]:
+    """The first `count` frames of one window; one without a finite solution is left as it was proposed."""
+    objective, meter = Objective(poses.build, terms), Meter(settings.budget)
+    start = torch.zeros(1, poses.sigma.numel())
+    found = minimise(objective.energy_and_gradient, start, settings=settings.lbfgs, meter=meter)
+    with torch.no_grad():
+        trial = poses.build(found.x if bool(torch.isfinite(found.energy).all()) else start)
+        features = trial.features[:, :count]
+        ground, heading = root_places(features[0], poses.place)
+        joints = torch.cat([poses.before, trial.joints_world[0, :count]])[-settings.past :]
+        state = None if density is None else density.advance(poses.state, features)
+    done = _Done(Place(ground[-1], heading[-1]), joints, poses.guide.contacts[count - 1], state)
+    return features[0], meter.evaluations, objective.ledger_of(trial).slice(count), done
+
+
+def _state(done: _Done, density: Any, guide: Guide, first: int) -> Any:
+    """The density's before the window; before the first one, after some frames of standing as the motion begins."""
+    if density is None or done.state is not None:
+        return done.state
+    still = torch.zeros(1, LAYOUT.size)
+    still[:, LAYOUT.slices["root_height"]] = guide.root[first, 1]
+    still[:, LAYOUT.slices["root_tilt"].start : LAYOUT.continuous] = guide.angles[first]
+    still[:, LAYOUT.continuous :] = guide.contacts[first].float()
+    return density.advance(density.initial_state(still), still[:, None].expand(-1, 5, -1))
+
+
+def guide_of(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Guide:
+    """A canonical motion as a guide, single precision."""
+    heading, tilt = rotations.split_heading(motion.local_quat_xyzw[:, 0])
+    joints = rotations.to_rotation_vector(motion.local_quat_xyzw[:, 1:]).flatten(1)
+    angles = torch.cat([rotations.to_rotation_vector(tilt)[:, ::2], joints], dim=-1)
+    return Guide(motion.root_position.float(), rotations.unwrap_angle(heading).float(), angles.float(), contacts)
+
+
+def steady(contacts: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
+    """Without contacts, and gaps in them, of less than `_SHORTEST` frames."""
+    filled = ~without_short_runs(~contacts, _SHORTEST)
+    return without_short_runs(filled, _SHORTEST)
+
+
+def rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> float:
+    """Of the performer's planted toes, metres; where none is planted, of low ones."""
+    toes = [motion.skeleton.index(name) for name in TOES]
+    heights = motion.joint_positions()[:, toes, 1]
+    planted = heights[contacts]
+    return float(planted.median() if len(planted) else heights.quantile(0.05))
+
+
+def _doubt(capture: Capture, settings: StandingSettings) -> Float[Tensor, "frames width"]:
+    """Sigma of root, heading and angles by frame (see `Guide.packed`)."""
+    unseen = math.radians(settings.unseen_deg)
+    angle = torch.where(capture.seen[0], settings.share * capture.sigma[0], unseen).clamp_min(1e-4)
+    root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], settings.unseen_cm / 100)
+    hips = angle[:, :1]
+    # Feet are put down even in a capture without noise, if only by half a millimetre.
+    root = root.clamp_min(5e-4)[:, None]
+    return torch.cat([root.expand(-1, 3), hips.expand(-1, 3), angle[:, 1:].repeat_interleave(3, dim=-1)], dim=-1)
+
+
+def _motion(features: Float[Tensor, "frames size"], place: Place, proposal: Motion) -> Motion:
+    """Back to a motion in double precision."""
+    features = features.double()
+    ground, heading = root_places(features, Place(place.position_xz.double(), place.heading.double()))
+    root = torch.cat([ground[:, :1], LAYOUT.pick(features, "root_height"), ground[:, 1:]], dim=-1)
+    quats = rotations.sign_continuous(local_rotations(features, heading))
+    return Motion(proposal.skeleton, proposal.fps, root, quats)

@@ -1,0 +1,113 @@
+"""Recordings at other rates than the prior's: what is slower than it can hold, and what is faster.
+
+The slow band is what the prior is shown at its own rate; what it changes is carried back smoothly. The fast band is
+kept as far as it is more than the noise, moment by moment and joint by joint, so that a true kick survives.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfiltfilt
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.features import PRIOR_FPS
+from mapctl.motion import Motion
+
+EDGE_HZ = 10.0
+"""Between the bands: two thirds of what the prior's rate can hold, so that a spline carries the slow one back whole."""
+_ORDER = 6
+_MOMENT = 0.15  # seconds over which the fast band is compared with the noise
+_CERTAIN = 3.0  # times the noise's power that the fast band has before half of it is kept
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """A motion on canonical joints, split."""
+
+    slow: Motion
+    """At the recording's rate, without what is faster than `EDGE_HZ`."""
+    fast_angles: Float[Tensor, "frames joints 3"]
+    """What the slow band's joints turn by to be the recording's: rotation vectors in their own frames."""
+    fast_root: Float[Tensor, "frames 3"]
+    """What the recording's hips lie beside the slow band's, metres."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of the recording is slow: no frame is then mixed with its neighbours."""
+        return _is_slow(float(self.slow.fps))
+
+    def noise_at_prior_rate(self, sigma: Tensor) -> Tensor:
+        """White noise at the prior's rate that is as dense, below the edge, as the recording's of this sigma."""
+        return sigma * min(1.0, PRIOR_FPS / float(self.slow.fps)) ** 0.5
+
+    def at_prior_rate(self) -> Motion:
+        """The slow band at the prior's rate."""
+        return self.slow.resample(PRIOR_FPS)
+
+    def joined(self, shown: Motion, cleaned: Motion, sigma: Float[Tensor, " joints"], sigma_root: float) -> Motion:
+        """The slow band changed as `shown` (see `at_prior_rate`) was to `cleaned`, and what the fast one has of motion.
+
+        Sigmas are the recording's own, at its own rate.
+        """
+        turned = rotations.multiply(rotations.inverse(shown.local_quat_xyzw), cleaned.local_quat_xyzw)
+        angles = self._carried(rotations.to_rotation_vector(turned))
+        moved = self._carried(cleaned.root_position - shown.root_position)
+        frames_a_moment = _MOMENT * float(self.slow.fps)
+        high = 0.0 if self.whole else 1 - EDGE_HZ / (float(self.slow.fps) / 2)  # share of the noise's power
+        fast = _more_than_noise(self.fast_angles, high * sigma.square()[None, :, None], frames_a_moment)
+        root = _more_than_noise(self.fast_root[:, None], torch.tensor(high * sigma_root**2), frames_a_moment)[:, 0]
+        quats = rotations.multiply(self.slow.local_quat_xyzw, rotations.from_rotation_vector(angles))
+        quats = rotations.multiply(quats, rotations.from_rotation_vector(fast))
+        return Motion(self.slow.skeleton, self.slow.fps, self.slow.root_position + moved + root,
+                      rotations.sign_continuous(quats))  # fmt: skip
+
+    def _carried(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
+        """From the prior's rate to the recording's."""
+        times = np.arange(len(change)) / PRIOR_FPS
+        wanted = np.clip(np.arange(self.slow.num_frames) / float(self.slow.fps), 0, times[-1])
+        if len(change) < 2:
+            return change.expand(self.slow.num_frames, *change.shape[1:])
+        return torch.as_tensor(CubicSpline(times, change.double().numpy(), axis=0)(wanted))
+
+
+def split(motion: Motion) -> Bands:
+    """The bands of a motion; at the prior's rate or less all of it is slow."""
+    fps = float(motion.fps)
+    quats = rotations.sign_continuous(motion.local_quat_xyzw)
+    if _is_slow(fps) or motion.num_frames < 3 * _ORDER:
+        slow = Motion(motion.skeleton, motion.fps, motion.root_position, quats)
+        return Bands(slow, torch.zeros(*quats.shape[:2], 3, dtype=quats.dtype), torch.zeros_like(motion.root_position))
+    sections = butter(_ORDER, EDGE_HZ / (fps / 2), output="sos")
+
+    def low(values: Tensor) -> Tensor:
+        return torch.as_tensor(sosfiltfilt(sections, values.numpy(), axis=0, padtype="odd").copy())
+
+    slow = Motion(motion.skeleton, motion.fps, low(motion.root_position),
+                  torch.nn.functional.normalize(low(quats), dim=-1))  # fmt: skip
+    fast = rotations.multiply(rotations.inverse(slow.local_quat_xyzw), quats)
+    return Bands(slow, rotations.to_rotation_vector(fast), motion.root_position - slow.root_position)
+
+
+def _is_slow(fps: float) -> bool:
+    """Whether the prior's rate holds all that is in the recording."""
+    return fps <= 1.05 * PRIOR_FPS
+
+
+def _more_than_noise(values: Float[Tensor, "frames joints 3"], noise: Tensor, moment: float) -> Tensor:
+    """Values by the share of their power, about each frame, that noise of this variance does not explain."""
+    power = values.square().mean(dim=-1, keepdim=True)
+    side = max(1, round(moment / 2))
+    frame = torch.arange(-2 * side, 2 * side + 1, dtype=values.dtype)
+    weight = torch.exp(-0.5 * (frame / side).square())
+    weight = (weight / weight.sum())[None, None]
+    channels = power.flatten(1).T[:, None]
+    near = torch.nn.functional.conv1d(
+        torch.nn.functional.pad(channels, (2 * side, 2 * side), mode="replicate"), weight
+    )[:, 0].T.unflatten(1, power.shape[1:])
+    # Wiener's gain on what exceeds the noise by far: its own power varies within a moment too.
+    excess = (near - _CERTAIN * noise).clamp_min(0)
+    return values * torch.where(near > 0, excess / near.clamp_min(1e-30), 1.0)

@@ -1,0 +1,96 @@
+"""Captures: canonical motion as a recording shows it, with what was not seen and how noisy the rest is."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.motion import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A batch of recordings of one length, at one frame rate, on canonical joints. Joint 0 is the hips."""
+
+    root: Float[Tensor, "batch frames 3"]
+    """Of the hips, world, metres."""
+    hips: Float[Tensor, "batch frames 4"]
+    """Rotation of the hips, world, xyzw."""
+    joints: Float[Tensor, "batch frames others 3"]
+    """Rotation vectors of all other joints in their parents' frames."""
+    seen_root: Bool[Tensor, "batch frames"]
+    """Whether the root's place was seen."""
+    seen: Bool[Tensor, "batch frames joints"]
+    """Whether a joint's rotation was seen."""
+    sigma_root: Float[Tensor, " batch"]
+    """Noise of each coordinate, metres."""
+    sigma: Float[Tensor, "batch joints"]
+    """Noise of each of a joint's three angles, radians."""
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return self.root.shape[1]
+
+    @staticmethod
+    def of_motion(motion: Motion, *, seen: Tensor, seen_root: Tensor, sigma: Tensor, sigma_root: float) -> "Capture":
+        """A batch of one from a motion on canonical joints, single precision; `seen` is (frames, joints)."""
+        joints = _continuous_vectors(motion.local_quat_xyzw[:, 1:])
+        return Capture(
+            motion.root_position.float()[None], motion.local_quat_xyzw[:, 0].float()[None], joints.float()[None],
+            seen_root[None], seen[None], torch.tensor([sigma_root]), sigma.float()[None],
+        )  # fmt: skip
+
+    def slice(self, start: int, stop: int) -> "Capture":
+        """Frames start to stop."""
+        part = slice(start, stop)
+        return Capture(self.root[:, part], self.hips[:, part], self.joints[:, part], self.seen_root[:, part],
+                       self.seen[:, part], self.sigma_root, self.sigma)  # fmt: skip
+
+    @cached_property
+    def heading(self) -> Float[Tensor, "batch frames"]:
+        """Of the hips about +Y, radians, not wrapped; across frames that were not seen it is filled in."""
+        heading = rotations.split_heading(self.hips)[0]
+        # Unseen frames may show anything: whole turns are counted from one seen frame to the next.
+        nearest = last_seen(self.seen[..., 0])
+        wrapped = torch.take_along_dim(heading, nearest, dim=1)
+        return filled(rotations.unwrap_angle(wrapped)[..., None], self.seen[..., 0])[..., 0]
+
+    @cached_property
+    def tilt(self) -> Float[Tensor, "batch frames 2"]:
+        """What remains of the hips' rotation without the heading (rotation vector, x and z), filled in."""
+        vector = rotations.to_rotation_vector(rotations.split_heading(self.hips)[1])
+        return filled(vector[..., ::2], self.seen[..., 0])
+
+
+def _continuous_vectors(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 3"]:
+    """Rotation vectors without the jump at a half turn, short ones in most frames."""
+    quats = rotations.sign_continuous(quats)
+    sign = torch.where(quats[..., 3].mean(dim=0, keepdim=True) < 0, -1.0, 1.0)
+    return rotations.to_long_rotation_vector(quats * sign[..., None])
+
+
+def filled(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
+    """Frames that were not seen, straight between those around them; beyond the first and last seen, as these are."""
+    before, after = last_seen(seen), next_seen(seen)
+    start = torch.take_along_dim(values, before[..., None], dim=1)
+    stop = torch.take_along_dim(values, after[..., None], dim=1)
+    frame = torch.arange(values.shape[1], device=values.device)
+    weight = ((frame - before) / (after - before).clamp_min(1)).clamp(0, 1)
+    return torch.lerp(start, stop, weight[..., None].to(values))
+
+
+def last_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
+    """For each frame the last one at or before it that was seen; before the first of them, that one."""
+    frame = torch.arange(seen.shape[1], device=seen.device)
+    last = torch.where(seen, frame, -1).cummax(dim=1).values
+    first = torch.where(seen.any(dim=1), seen.to(torch.uint8).argmax(dim=1), 0)
+    return torch.where(last < 0, first[:, None], last)
+
+
+def next_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
+    """For each frame the first one at or after it that was seen; after the last of them, that one."""
+    return seen.shape[1] - 1 - last_seen(seen.flip(1)).flip(1)
