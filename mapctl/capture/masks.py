@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -32,7 +33,7 @@ class Mask:
 def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
     """Read a CSV; FileFormatError says which line is wrong."""
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
             names = rows[0].keys() if rows else _COLUMNS
     except (OSError, UnicodeDecodeError, csv.Error) as error:
