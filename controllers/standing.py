@@ -33,8 +33,9 @@ _SHORTEST = 3  # frames that a contact, or a gap in one, lasts: the rule of mapc
 class StandingSettings:
     """Sigmas and search."""
 
-    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.06))
-    """Planted feet; the rest height is the performer's own. Mocap's own planted toes move by 6 cm/s."""
+    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.1, sigma_height=0.03, sigma_below=0.02))
+    """Planted feet; the rest height is the performer's own. Loose, since mocap's own planted toes move by 6 cm/s, and
+    not every floor is level."""
     share: float = 0.35
     """Doubt about a proposal that was seen, as a share of the capture's noise."""
     unseen_deg: float = 5.0

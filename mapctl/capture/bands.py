@@ -84,12 +84,30 @@ def split(motion: Motion) -> Bands:
     sections = butter(_ORDER, EDGE_HZ / (fps / 2), output="sos")
 
     def low(values: Tensor) -> Tensor:
-        return torch.as_tensor(sosfiltfilt(sections, values.numpy(), axis=0, padtype="odd").copy())
+        whole = _with_ends(values.numpy(), round(fps / EDGE_HZ))
+        side = (len(whole) - len(values)) // 2
+        return torch.as_tensor(sosfiltfilt(sections, whole, axis=0, padlen=0)[side:-side].copy())
 
     slow = Motion(motion.skeleton, motion.fps, low(motion.root_position),
                   torch.nn.functional.normalize(low(quats), dim=-1))  # fmt: skip
     fast = rotations.multiply(rotations.inverse(slow.local_quat_xyzw), quats)
     return Bands(slow, rotations.to_rotation_vector(fast), motion.root_position - slow.root_position)
+
+
+def _with_ends(values: np.ndarray, about: int) -> np.ndarray:
+    """Frames put before and after, turned about what the `about` outermost ones say of the ends: a filter that begins
+    at the first frame itself would take its noise for motion.
+    """
+    about = min(about, len(values) - 1)
+    side = min(3 * about, len(values) - 1)
+
+    def reflected(ordered: np.ndarray) -> np.ndarray:
+        flat = ordered[:about].reshape(about, -1)
+        line = np.polynomial.polynomial.polyfit(np.arange(about), flat, min(1, about - 1))
+        end = line[0].reshape(ordered.shape[1:])
+        return 2 * end - ordered[1 : side + 1]
+
+    return np.concatenate([reflected(values)[::-1], values, reflected(values[::-1])])
 
 
 def _is_slow(fps: float) -> bool:
