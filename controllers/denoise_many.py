@@ -1,4 +1,4 @@
-"""Denoise many files: over processes of this machine (joblib) or over a cluster (ray). No file's failure stops another."""
+"""Denoise many files, over processes (joblib) or over a cluster (ray). No file's failure stops another."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

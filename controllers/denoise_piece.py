@@ -52,11 +52,13 @@ class Piece:
         self.repaired = _others_smoothed(examined)
         canonical, self.rigmap = to_canonical(self.repaired)
         seen = _on_canonical(examined.seen, self.rigmap)
+        self.hidden_root = examined.dropouts_root | ~_above_hips(~examined.dropouts, self.rigmap)
+        self.seen_root = examined.seen_root & _above_hips(examined.seen, self.rigmap)
         self.sigma, self.sigma_root = self._noise(canonical, seen)
         self.bands = split(canonical)
         if self.bands.whole:
             # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
-            self.bands = split(to_canonical(examined.motion)[0])
+            self.bands = split(_signed_like(to_canonical(examined.motion)[0], canonical))
         self.shown = self.bands.at_prior_rate()
         self.capture = self._capture(seen)
 
@@ -108,7 +110,7 @@ class Piece:
         """In which frames the root's place leaps."""
         if not self.bands.whole:
             return self.examined.spikes_root[:, None]
-        return (~self.capture.seen_root[0] & ~self.examined.dropouts_root)[:, None]
+        return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
 
     def _noise(self, canonical: Motion, seen: Tensor) -> tuple[Float[Tensor, " joints"], float]:
         """Of the canonical joints' angles (radians) and of the hips' place (metres), at the capture's rate."""
@@ -117,12 +119,12 @@ class Piece:
         if wanted.sigma_deg is not None:
             # Joints that never move have no noise either: they are locked, or the rig has none there.
             sigma = torch.where(sigma > 0, math.radians(wanted.sigma_deg), 0.0).to(sigma)
-        root = place_noise(canonical.root_position, self.examined.seen_root)
+        root = place_noise(canonical.root_position, self.seen_root)
         return sigma, root if wanted.sigma_cm is None else wanted.sigma_cm / 100
 
     def _capture(self, seen: Tensor) -> Capture:
         """What the network is shown, at its own rate."""
-        root = self.examined.seen_root[:, None]
+        root = self.seen_root[:, None]
         sigma = self.bands.noise_at_prior_rate(self.sigma)
         sigma_root = self.bands.noise_at_prior_rate(torch.tensor(self.sigma_root))
         return Capture.of_motion(self.shown, seen=self._resampled(seen), seen_root=self._resampled(root)[:, 0],
@@ -150,10 +152,9 @@ class Piece:
         """Spikes told anew by what is left beside the proposal: fast motion that passed for one is seen again."""
         dropouts = ~_on_canonical(~self.examined.dropouts, self.rigmap)
         spikes = leaps(self._rest(proposal), self.capture.sigma[0].double())
-        hidden = self.examined.dropouts_root
         root = (self.shown.root_position - proposal.root_position)[:, None]
         leap = leaps(root, self.capture.sigma_root.double())[:, 0]
-        return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(hidden | leap)[None])
+        return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
 
     def _given_back(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
         """The proposal with the motion that it left out, and the share of that by frame and joint."""
@@ -169,6 +170,12 @@ class Piece:
         """By which turns the capture differs from the proposal."""
         turned = rotations.multiply(rotations.inverse(proposal.local_quat_xyzw), self.shown.local_quat_xyzw)
         return rotations.to_rotation_vector(turned)
+
+
+def _signed_like(motion: Motion, other: Motion) -> Motion:
+    """The same rotations with signs as the other's: frames that were not seen, and show anything, change none after."""
+    dots = (motion.local_quat_xyzw * other.local_quat_xyzw).sum(dim=-1, keepdim=True)
+    return replace(motion, local_quat_xyzw=torch.where(dots < 0, -1.0, 1.0) * motion.local_quat_xyzw)
 
 
 def _others_smoothed(examined: Examined) -> Motion:
@@ -195,6 +202,14 @@ def _on_canonical(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[T
             joint = parents[joint]
         columns.append(column)
     return torch.stack(columns, dim=1)
+
+
+def _above_hips(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, " frames"]:
+    """Whether all joints above the hips were seen: they carry its place."""
+    column, joint = torch.ones(len(seen), dtype=torch.bool), rigmap.joint_of[0]
+    while joint is not None and (joint := rigmap.rig_skeleton.parents[joint]) >= 0:
+        column = column & seen[:, joint]
+    return column
 
 
 def _leg(offsets: Float[Tensor, "joints 3"]) -> float:

@@ -75,9 +75,8 @@ class Bands:
 
 
 def split(motion: Motion) -> Bands:
-    """The bands of a motion; at the prior's rate or less all of it is slow."""
-    fps = float(motion.fps)
-    quats = rotations.sign_continuous(motion.local_quat_xyzw)
+    """The bands of a motion whose quaternions' signs are continuous; at the prior's rate or less all of it is slow."""
+    fps, quats = float(motion.fps), motion.local_quat_xyzw
     if _is_slow(fps) or motion.num_frames < 3 * _ORDER:
         slow = Motion(motion.skeleton, motion.fps, motion.root_position, quats)
         return Bands(slow, torch.zeros(*quats.shape[:2], 3, dtype=quats.dtype), torch.zeros_like(motion.root_position))

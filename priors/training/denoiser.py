@@ -27,7 +27,7 @@ _WARM_UP = 0.05  # share of the steps in which the learning rate rises
 class DenoiserSettings:
     """The recipe."""
 
-    steps: int = 18_000
+    steps: int = 16_000
     """Updates."""
     batch: int = 48
     """Windows an update."""
