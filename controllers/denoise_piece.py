@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.denoised import Denoised
-from controllers.standing import StandingSettings, Stood, rest_height, stand
+from controllers.standing import StandingSettings, Stood, anchored, rest_height, stand, steady
 from mapctl import retarget, rotations
 from mapctl.capture import Capture, faults
 from mapctl.capture.bands import split
@@ -34,6 +34,8 @@ class DenoiseSettings:
     """Noise of each of a joint's angles; told from the capture, joint by joint, if None."""
     sigma_cm: float | None = None
     """Noise of each coordinate of the hips; told from the capture if None."""
+    anchor: bool = False
+    """Let the body go where its planted feet say, for captures that drift against them."""
     standing: StandingSettings = field(default_factory=StandingSettings)
     """The MAP stage."""
 
@@ -69,6 +71,8 @@ class Piece:
             self.capture = self._look_again(proposal)
             proposal, contacts = self._propose()
         proposal, share = self._given_back(proposal)
+        if self.settings.anchor:
+            proposal = anchored(proposal, steady(contacts > 0))
         stood = stand(proposal, contacts, self.capture, self.settings.standing, density=density)
         joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)

@@ -33,6 +33,9 @@ class Denoise:
     """Noise of every joint's angles, degrees; told from the capture, joint by joint, if not given."""
     sigma_cm: options.MaybeNumber = None
     """Noise of the place of the hips, centimetres; told from the capture if not given."""
+    anchor: bool = False
+    """Let the body go where its planted feet say, for captures in which it drifts against them. The way over the
+    ground changes."""
     causal: bool = False
     """As a live capture would be cleaned: a frame is decided `--delay` after it came."""
     delay: options.Number = 0.2
@@ -125,7 +128,7 @@ class Denoise:
 
         if self.causal and self.prior is not None:
             raise RequestError("--causal has no time for a density; leave --prior out")
-        return DenoiseSettings(sigma_deg=self.sigma_deg, sigma_cm=self.sigma_cm)
+        return DenoiseSettings(sigma_deg=self.sigma_deg, sigma_cm=self.sigma_cm, anchor=self.anchor)
 
     def _masks(self):
         from mapctl.capture.masks import load_masks
