@@ -1,5 +1,6 @@
-"""What every reader needs first: the bytes of an ordinary file, or one clear line why not."""
+"""What every reader needs first: the bytes of an ordinary file, its text and numbers, or one clear line why not."""
 
+from math import isfinite
 from os import PathLike
 from pathlib import Path
 
@@ -7,6 +8,11 @@ from mapctl.errors import FileFormatError
 
 MAX_FILE_BYTES = 512 * 2**20
 """Largest file that is read; an hour of a 60-joint capture at 60 fps is about 350 MB of BVH."""
+MAX_POSES = 2**25
+"""Most frames times joints of one motion: a gigabyte of rotations. Joints without channels cost a file nothing."""
+LARGEST_VALUE = 1e8
+"""No length (file unit) or angle (degrees) of a capture comes near this, and squares stay exact."""
+NUMBER = f"a finite number below {LARGEST_VALUE:g}"
 
 
 def read_bytes(path: str | PathLike[str]) -> bytes:
@@ -33,3 +39,36 @@ def read_bytes(path: str | PathLike[str]) -> bytes:
 def shorten(word: str, limit: int = 40) -> str:
     """A quoted, printable, bounded form of a piece of a file, for error messages."""
     return ascii(word if len(word) <= limit else word[: limit - 3] + "...")
+
+
+def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, str]:
+    """Text with plain line feeds, and its encoding. Names in an old one-byte encoding are kept as latin-1.
+
+    `expected` is what a binary file was taken for, as "BVH text".
+    """
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise FileFormatError(path, "is UTF-16 text; save it as UTF-8", line=1)
+    if b"\0" in raw:
+        line = raw.count(b"\n", 0, raw.index(b"\0")) + 1
+        raise FileFormatError(path, f"is a binary file, expected {expected}", line)
+    try:
+        text, encoding = raw.decode("utf-8-sig"), "utf-8"
+    except UnicodeDecodeError:
+        text, encoding = raw.decode("latin-1"), "latin-1"
+    return text.replace("\r\n", "\n").replace("\r", "\n"), encoding
+
+
+def check_extent(path: str | PathLike[str], frames: int, joints: int) -> None:
+    """FileFormatError where the rotations of so many frames and joints would fill the memory."""
+    if frames * joints > MAX_POSES:
+        raise FileFormatError(path, f"{frames} frames of {joints} joints, allowed are {MAX_POSES} in all")
+
+
+def finite_number(word: str) -> float | None:
+    """The number a word says, or None if it is none, not finite or absurd; `1_000` is none in a file."""
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    plain = word.isascii() and "_" not in word
+    return value if plain and isfinite(value) and abs(value) < LARGEST_VALUE else None
