@@ -1,5 +1,7 @@
 """What every reader needs first: the bytes of an ordinary file, its text and numbers, or one clear line why not."""
 
+import csv
+import io
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -56,6 +58,24 @@ def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, s
     except UnicodeDecodeError:
         text, encoding = raw.decode("latin-1"), "latin-1"
     return text.replace("\r\n", "\n").replace("\r", "\n"), encoding
+
+
+def read_table(path: str | PathLike[str], expected: str) -> list[tuple[int, list[str]]]:
+    """The rows of a CSV that hold anything, each with its line, values without outer blanks.
+
+    `expected` says what the table should be, for messages. FileFormatError for what is no table of text.
+    """
+    text, encoding = decode(path, read_bytes(path), expected)
+    if encoding != "utf-8":
+        raise FileFormatError(path, f"is not a text file in UTF-8, expected {expected}")
+    table, rows = csv.reader(io.StringIO(text), strict=True), []
+    try:
+        for words in table:
+            if any(word.strip() for word in words):
+                rows.append((table.line_num, [word.strip() for word in words]))
+    except csv.Error as error:
+        raise FileFormatError(path, f"is no sound CSV ({error}), expected {expected}", table.line_num or 1) from None
+    return rows
 
 
 def check_extent(path: str | PathLike[str], frames: int, joints: int) -> None:
