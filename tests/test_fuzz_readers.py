@@ -57,6 +57,7 @@ def test_broken_files_are_refused_or_read_as_they_are(samples, folder, seed):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_ten_thousand_broken_files(samples, folder):
     assert 1000 < run_cases(samples, folder, seed=7, cases=10_000) < 9000
 

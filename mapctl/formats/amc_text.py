@@ -25,7 +25,7 @@ _KEYWORDS = (
 )  # fmt: skip
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class AmcText:
     """Everything an AMC file says."""
 
@@ -38,7 +38,7 @@ class AmcText:
 
 
 def read(path: str | PathLike[str], skeleton: AsfSkeleton) -> AmcText:
-    """Read the takes of a skeleton. FileFormatError names the line and what was expected there."""
+    """Read a take of the skeleton. FileFormatError names the line and what was expected there."""
     reader = _Reader(path, skeleton)
     reader.read(rows(decode(path, read_bytes(path), "AMC text")[0]))
     values = np.frombuffer(reader.values).reshape(reader.frames, reader.width)
