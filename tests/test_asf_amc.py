@@ -121,7 +121,11 @@ def test_files_are_read_whatever_their_blanks_case_and_line_ends(tmp_path):
     plain = mapctl.load(path).joint_positions()
     for file in (path, path.with_suffix(".asf")):
         text = file.read_text().replace("begin", "BEGIN").replace("direction ", "direction\t").replace(":root", ":ROOT")
-        text = text.replace("lfemur", "LFemur") if file == path else text.replace(" length 0.45", " length (0.45),")
+        text = (
+            text.replace("lfemur", "LFemur")
+            if file == path
+            else text.replace(" length 0.45", " length (0.45), (a unit)")
+        )
         file.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     np.testing.assert_array_equal(mapctl.load(path).joint_positions(), plain)
 

@@ -132,7 +132,7 @@ class _Reader:
         for line, words in section:
             key, value = words[0].lower(), words[1].lower() if len(words) == 2 else ""
             if key == "length":
-                self.length = self._numbers(words, line, 1)[0]
+                self.length = self._numbers(words[:2], line, 1)[0]  # some add the unit's name
                 if not 1e-3 <= self.length <= 1e3:
                     self.fail(f"expected a length unit from 0.001 to 1000, got {self.length:g}", line)
             elif key == "angle":
