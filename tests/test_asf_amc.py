@@ -175,6 +175,12 @@ class TestFinding:
         with pytest.raises(FileFormatError, match=r"gone\.amc: no such file"):
             mapctl.load(tmp_path / "gone.amc")
 
+    @pytest.mark.parametrize("name", [f"{'x' * 300}.amc", f"{'x' * 300}.asf+x.amc", f"a.asf+{'x' * 300}.amc"])
+    def test_a_name_that_cannot_be_is_said_to_be_so(self, tmp_path, name):
+        (tmp_path / "a.asf").write_text(pair(1).asf())
+        with pytest.raises(FileFormatError, match="name too long"):
+            mapctl.load(tmp_path / name)
+
     def test_a_skeleton_alone_is_no_motion(self, tmp_path):
         with pytest.raises(FileFormatError, match=r"is a skeleton alone: name its motion"):
             mapctl.load(pair(1).write(tmp_path).with_suffix(".asf"))

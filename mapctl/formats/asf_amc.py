@@ -40,7 +40,10 @@ def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> M
     """
     if fps is not None and not SLOWEST <= fps <= FASTEST:
         raise RequestError(f"the frame rate must be {SLOWEST:g} to {FASTEST:g}, got {float(fps):g}")
-    subject, take = paths(path)
+    try:
+        subject, take = paths(path)
+    except OSError as error:  # as a name that is too long, or a folder that may not be listed
+        raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
     asf = asf_skeleton.read(subject)
     text = amc_text.read(take, asf)
     check_extent(take, len(text.values), len(asf.names))
