@@ -1,7 +1,8 @@
 """The jobs: each turns a request into terms, solves, and returns a Solution."""
 
 # Imported at once: a lazy name that is also a module's would be the module or the function by order of import.
+from controllers.denoise import DenoiseSettings, denoise
 from controllers.follow import FollowSettings, follow
 from controllers.generate import GenerateSettings, generate
 
-__all__ = ["FollowSettings", "GenerateSettings", "follow", "generate"]
+__all__ = ["DenoiseSettings", "FollowSettings", "GenerateSettings", "denoise", "follow", "generate"]

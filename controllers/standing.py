@@ -26,6 +26,7 @@ from mapctl.solver.result import Ledger
 from mapctl.terms import Footing, Likelihood, Noise, Term
 from mapctl.terms.footing import TOES
 
+_DRIFT = 3.0  # frames, sigma, over which the travel of planted toes is averaged
 _SHORTEST = 3  # frames that a contact, or a gap in one, lasts: the rule of mapctl.contacts
 
 
@@ -33,8 +34,9 @@ _SHORTEST = 3  # frames that a contact, or a gap in one, lasts: the rule of mapc
 class StandingSettings:
     """Sigmas and search."""
 
-    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.06))
-    """Planted feet; the rest height is the performer's own. Mocap's own planted toes move by 6 cm/s."""
+    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.1, sigma_height=0.03, sigma_below=0.02))
+    """Planted feet; the rest height is the performer's own. Loose, since mocap's own planted toes move by 6 cm/s, and
+    not every floor is level."""
     share: float = 0.35
     """Doubt about a proposal that was seen, as a share of the capture's noise."""
     unseen_deg: float = 5.0
@@ -138,6 +140,25 @@ def guide_of(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Guide:
     joints = rotations.to_rotation_vector(motion.local_quat_xyzw[:, 1:]).flatten(1)
     angles = torch.cat([rotations.to_rotation_vector(tilt)[:, ::2], joints], dim=-1)
     return Guide(motion.root_position.float(), rotations.unwrap_angle(heading).float(), angles.float(), contacts)
+
+
+def anchored(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Motion:
+    """The motion carried over the ground so that its planted toes, on average over a few frames, do not travel.
+
+    For captures whose body drifts against its feet. Feet that roll or turn while they stand are taken to do so.
+    """
+    toes = [motion.skeleton.index(name) for name in TOES]
+    ground = motion.joint_positions()[:, toes][..., ::2]
+    step = torch.diff(ground, dim=0, prepend=ground[:1])
+    planted = (contacts & torch.cat([contacts[:1], contacts[:-1]])).to(step)
+    frame = torch.arange(len(step), dtype=step.dtype)
+    weight = torch.exp(-0.5 * ((frame[:, None] - frame) / _DRIFT).square())
+    drift = torch.einsum("ts,sfc,sf->tc", weight, step, planted)
+    # Nothing is known far from any contact: the drift fades out there.
+    drift = drift / (torch.einsum("ts,sf->t", weight, planted) + 0.5)[:, None]
+    way = torch.cumsum(drift, dim=0)
+    moved = torch.stack([way[:, 0], torch.zeros_like(way[:, 0]), way[:, 1]], dim=-1)
+    return replace(motion, root_position=motion.root_position - moved)
 
 
 def steady(contacts: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:

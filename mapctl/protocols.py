@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mapctl.capture import Capture, Cleaned
+
 State = TypeVar("State")
 
 
@@ -69,6 +71,15 @@ class Inbetweener(Protocol):
         generator: torch.Generator,
     ) -> Float[Tensor, "batch frames size"]:
         """The frames with unknown ones filled in; known ones may move."""
+        ...
+
+
+@runtime_checkable
+class Denoiser(Protocol):
+    """Proposes the motion behind a capture."""
+
+    def clean(self, capture: Capture) -> Cleaned:
+        """The proposal, of the capture's frames."""
         ...
 
 

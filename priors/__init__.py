@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from priors.denoiser import ConvDenoiser
     from priors.density import LstmGmmDensity
     from priors.refiner import LstmRefiner
 
@@ -19,6 +20,13 @@ def load_refiner(name: str) -> "LstmRefiner":
     from priors import refiner
 
     return refiner.load(name)
+
+
+def load_denoiser(name: str = "denoiser") -> "ConvDenoiser":
+    """The bundled denoiser, or a trained one by its file or run folder."""
+    from priors import denoiser
+
+    return denoiser.load(name)
 
 
 def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":

@@ -6,7 +6,6 @@ seen, and the noise's sigmas. Where noise is nil what was seen is returned: the 
 """
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from mapctl import rotations
-from mapctl.capture import Capture, filled
+from mapctl.capture import Capture, Cleaned, filled
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
@@ -55,28 +54,6 @@ class DenoiserConfig:
     def of_card(config: dict[str, Any]) -> "DenoiserConfig":
         """Inverse of `as_card`; KeyError or TypeError for fields that are not these."""
         return DenoiserConfig(**{**config, "dilations": tuple(config["dilations"])})
-
-
-@dataclass(frozen=True, eq=False)
-class Cleaned:
-    """What the network makes of a capture."""
-
-    root: Float[Tensor, "batch frames 3"]
-    """Of the hips, world, metres."""
-    heading: Float[Tensor, "batch frames"]
-    """Of the hips about +Y, radians, not wrapped."""
-    angles: Float[Tensor, "batch frames angles"]
-    """The hips' tilt (2) and the rotation vectors of all other joints, as in the features."""
-    contacts: Float[Tensor, "batch frames 2"]
-    """Log odds of the left and right toe being planted."""
-
-    @cached_property
-    def local_quat_xyzw(self) -> Float[Tensor, "batch frames joints 4"]:
-        """Local rotations of all joints."""
-        tilt = torch.stack([self.angles[..., 0], torch.zeros_like(self.heading), self.angles[..., 1]], dim=-1)
-        hips = rotations.multiply(rotations.about_y(self.heading), rotations.from_rotation_vector(tilt))
-        others = rotations.from_rotation_vector(self.angles[..., 2:].unflatten(-1, (-1, 3)))
-        return torch.cat([hips.unsqueeze(-2), others], dim=-2)
 
 
 class DenoiserNetwork(nn.Module):

@@ -75,21 +75,38 @@ class Bands:
 
 
 def split(motion: Motion) -> Bands:
-    """The bands of a motion; at the prior's rate or less all of it is slow."""
-    fps = float(motion.fps)
-    quats = rotations.sign_continuous(motion.local_quat_xyzw)
+    """The bands of a motion whose quaternions' signs are continuous; at the prior's rate or less all of it is slow."""
+    fps, quats = float(motion.fps), motion.local_quat_xyzw
     if _is_slow(fps) or motion.num_frames < 3 * _ORDER:
         slow = Motion(motion.skeleton, motion.fps, motion.root_position, quats)
         return Bands(slow, torch.zeros(*quats.shape[:2], 3, dtype=quats.dtype), torch.zeros_like(motion.root_position))
     sections = butter(_ORDER, EDGE_HZ / (fps / 2), output="sos")
 
     def low(values: Tensor) -> Tensor:
-        return torch.as_tensor(sosfiltfilt(sections, values.numpy(), axis=0, padtype="odd").copy())
+        whole = _with_ends(values.numpy(), round(fps / EDGE_HZ))
+        side = (len(whole) - len(values)) // 2
+        return torch.as_tensor(sosfiltfilt(sections, whole, axis=0, padlen=0)[side:-side].copy())
 
     slow = Motion(motion.skeleton, motion.fps, low(motion.root_position),
                   torch.nn.functional.normalize(low(quats), dim=-1))  # fmt: skip
     fast = rotations.multiply(rotations.inverse(slow.local_quat_xyzw), quats)
     return Bands(slow, rotations.to_rotation_vector(fast), motion.root_position - slow.root_position)
+
+
+def _with_ends(values: np.ndarray, about: int) -> np.ndarray:
+    """Frames put before and after, turned about what the `about` outermost ones say of the ends: a filter that begins
+    at the first frame itself would take its noise for motion.
+    """
+    about = min(about, len(values) - 1)
+    side = min(3 * about, len(values) - 1)
+
+    def reflected(ordered: np.ndarray) -> np.ndarray:
+        flat = ordered[:about].reshape(about, -1)
+        line = np.polynomial.polynomial.polyfit(np.arange(about), flat, min(1, about - 1))
+        end = line[0].reshape(ordered.shape[1:])
+        return 2 * end - ordered[1 : side + 1]
+
+    return np.concatenate([reflected(values)[::-1], values, reflected(values[::-1])])
 
 
 def _is_slow(fps: float) -> bool:

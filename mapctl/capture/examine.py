@@ -48,6 +48,10 @@ class Examined:
         """What is neither, of the root's place."""
         return ~(self.spikes_root | self.dropouts_root)
 
+    def place(self, motion: Motion) -> Float[Tensor, "frames 3"]:
+        """Of the joint that travels, in a motion of this rig, metres."""
+        return motion.moving_offsets[self.travels] if self.travels else motion.root_position
+
     def slice(self, start: int, stop: int) -> "Examined":
         """Frames start to stop; the noise stays that of the whole."""
         part = slice(start, stop)

@@ -78,6 +78,12 @@ def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     return joints, root
 
 
+def part_of(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
+    """The masks of frames start to stop, counted from there."""
+    clipped = [Mask(m.joint, max(m.start, start) - start, min(m.stop, stop) - start) for m in masks]
+    return tuple(mask for mask in clipped if mask.start < mask.stop)
+
+
 def _index(names: Sequence[str], wanted: str) -> int:
     if wanted in names:
         return names.index(wanted)

@@ -12,26 +12,46 @@ from torch import Tensor
 
 from mapctl import rotations
 
-_ORDER = 4
-_GAIN = math.comb(2 * _ORDER, _ORDER)  # a difference of this order has so many times white noise's variance
+_ORDERS = (4, 3, 2)  # of the differences, the first that enough runs of frames have been seen for
+_ENOUGH = 12  # runs
 _SIGMAS_A_MEDIAN = 1.4826  # of a normal number's size
 
 
 def angle_noise(
     quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
 ) -> Float[Tensor, " joints"]:
-    """White noise of each of a joint's three angles, radians; 0 of a recording too short to tell.
+    """White noise of each of a joint's three angles, radians; 0 of a recording too short to tell. A joint that is never
+    seen for some frames on end is taken to be as noisy as the others.
 
     Between two frames a joint turns by what it moved and by the difference of their noise.
     """
     steps = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
-    return _sigma(_differences(steps, _ORDER - 1), _runs(seen, _ORDER + 1))
+    sigma = _sigma(steps, seen, differenced=1)
+    known = sigma[(sigma > 0) & sigma.isfinite()]
+    usual = known.median() if len(known) else sigma.new_zeros(())
+    return torch.where(sigma.isnan(), usual, sigma)
 
 
 def place_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:
     """White noise of each coordinate, in the places' unit; 0 of a recording too short to tell."""
-    differences = _differences(places, _ORDER)[:, None]
-    return float(_sigma(differences, _runs(seen[:, None], _ORDER + 1)))
+    return float(_sigma(places[:, None], seen[:, None], differenced=0).nan_to_num(0.0))
+
+
+def _sigma(values: Float[Tensor, "some joints 3"], seen: Bool[Tensor, "frames joints"], *, differenced: int) -> Tensor:
+    """By joint, from differences of the highest order that there are enough runs for; NaN where there are not.
+
+    `values` are differences of that order already.
+    """
+    sigma = torch.full((values.shape[1],), math.nan, dtype=values.dtype)
+    for order in _ORDERS:
+        differences, used = _differences(values, order - differenced), _runs(seen, order + 1)
+        if len(differences) == 0:
+            continue
+        # Not of a whole that is shorter, which has nothing better.
+        enough = used.sum(dim=0) >= min(_ENOUGH, len(used))
+        found = _spread(differences, used) / math.sqrt(math.comb(2 * order, order))
+        sigma = torch.where(sigma.isnan() & enough, found, sigma)
+    return sigma if len(values) > _ORDERS[-1] else torch.zeros_like(sigma)
 
 
 def _differences(values: Tensor, order: int) -> Tensor:
@@ -47,10 +67,8 @@ def _runs(seen: Bool[Tensor, "frames joints"], length: int) -> Bool[Tensor, "run
     return seen.unfold(0, length, 1).all(dim=-1)
 
 
-def _sigma(differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "runs joints"]) -> Float[Tensor, " joints"]:
+def _spread(differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "runs joints"]) -> Float[Tensor, " joints"]:
     """From the median along each of a joint's principal axes: a rig near gimbal lock shakes about two of them only."""
-    if len(differences) == 0:
-        return differences.new_zeros(differences.shape[1])
     size = differences.norm(dim=-1)
     size = torch.where(used, size, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
     # Spikes would turn the axes their way.
@@ -59,4 +77,4 @@ def _sigma(differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "runs
     axes = torch.linalg.eigh(torch.einsum("fja,fjb->jab", clipped, clipped)).eigenvectors
     along = torch.einsum("fja,jab->fjb", differences, axes).abs()
     median = torch.where(used[..., None], along, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
-    return torch.sqrt((_SIGMAS_A_MEDIAN * median).square().mean(dim=-1) / _GAIN)
+    return torch.sqrt((_SIGMAS_A_MEDIAN * median).square().mean(dim=-1))

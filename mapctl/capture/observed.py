@@ -37,7 +37,9 @@ class Capture:
 
     @staticmethod
     def of_motion(motion: Motion, *, seen: Tensor, seen_root: Tensor, sigma: Tensor, sigma_root: float) -> "Capture":
-        """A batch of one from a motion on canonical joints, single precision; `seen` is (frames, joints)."""
+        """A batch of one from a motion on canonical joints, single precision; `seen` is (frames, joints). The signs of
+        its quaternions must not jump between frames that were seen.
+        """
         joints = _continuous_vectors(motion.local_quat_xyzw[:, 1:])
         return Capture(
             motion.root_position.float()[None], motion.local_quat_xyzw[:, 0].float()[None], joints.float()[None],
@@ -67,8 +69,7 @@ class Capture:
 
 
 def _continuous_vectors(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 3"]:
-    """Rotation vectors without the jump at a half turn, short ones in most frames."""
-    quats = rotations.sign_continuous(quats)
+    """Rotation vectors without the jump at a half turn, short ones in most frames, if the signs are continuous."""
     sign = torch.where(quats[..., 3].mean(dim=0, keepdim=True) < 0, -1.0, 1.0)
     return rotations.to_long_rotation_vector(quats * sign[..., None])
 

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 from mapctl.commands.bench import Bench
 from mapctl.commands.convert import Convert
 from mapctl.commands.demo import Demo
+from mapctl.commands.denoise import Denoise
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.generate import Generate
 from mapctl.commands.info import Info
@@ -36,6 +37,7 @@ COMMANDS: dict[str, type[Command]] = {
     "generate": Generate,
     "steer": Steer,
     "live": Live,
+    "denoise": Denoise,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

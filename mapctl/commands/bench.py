@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
@@ -19,21 +20,25 @@ class Bench:
 
     what: Positional[
         Annotated[
-            Literal["speed", "ablation", "free-run", "generation", "steer", "live"],
-            arg(metavar="speed|ablation|free-run|generation|steer|live"),
+            Literal["speed", "ablation", "free-run", "generation", "steer", "live", "denoise"],
+            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise"),
         ]
     ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
     `free-run`: 8 random motions of 10,000 frames beside the training data; `generation`: raw, refined and finished
     motion beside mocap that training did not see; `steer`: random commands, which are reached and how soon; `live`: the
-    same against the wall clock, for one, two and four characters at once."""
+    same against the wall clock, for one, two and four characters at once; `denoise`: clips that training did not see,
+    spoilt in several ways, beside filters tuned on the truth."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
     `live`, if not given."""
     data: options.MaybeFile = None
-    """For `generation`: the folder that the prior was trained on; its held-out clips are looked up there."""
+    """For `generation` and `denoise`: the folder that was trained on; its held-out clips are looked up there."""
     count: options.Count = 48
-    """For `generation`: clips of 10 s to draw; for `steer`: commands to give."""
+    """For `generation`: clips of 10 s to draw; for `steer`: commands to give; for `denoise`:
+    clips, spread over the kinds."""
+    denoiser: options.Name = "denoiser"
+    """For `denoise`: the bundled denoiser, or the file or run folder of a trained one."""
     refiner: options.Name = "auto"
     """For `generation`: a bundled refiner, or the file or run folder of a trained one; auto is the prior's own."""
     minutes: options.Number = 0.5
@@ -46,27 +51,59 @@ class Bench:
     def run(self) -> int:
         """Measure and print."""
         compute_on_one()
-        import priors
-        from controllers import bench
         from mapctl import report
 
-        name = self.prior or ("locomotion-live" if self.what in ("steer", "live") else "locomotion")
-        prior = priors.load(name)
-        if self.what == "generation":
-            rows = self._generation(prior, name)
-        elif self.what == "steer":
-            from controllers.bench_steer import SteeringSettings, pursued, steering
-
-            rows = [*steering(prior, SteeringSettings(commands=self.count)), *pursued(prior)]
-        elif self.what == "live":
-            rows = self._live(name)
-        else:
-            rows = {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what](prior)
+        rows = self._denoise() if self.what == "denoise" else self._of_a_prior()
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
         else:
             print_records(rows, title=f"{self.what}, one thread")
         return 0
+
+    def _of_a_prior(self) -> list[dict[str, Any]]:
+        import priors
+        from controllers import bench
+
+        name = self.prior or ("locomotion-live" if self.what in ("steer", "live") else "locomotion")
+        prior = priors.load(name)
+        if self.what == "generation":
+            return self._generation(prior, name)
+        if self.what == "steer":
+            from controllers.bench_steer import SteeringSettings, pursued, steering
+
+            return [*steering(prior, SteeringSettings(commands=self.count)), *pursued(prior)]
+        if self.what == "live":
+            return self._live(name)
+        return {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what](prior)
+
+    def _denoise(self) -> list[dict[str, Any]]:
+        import priors
+        from controllers.bench_denoise import KINDS, Clip, kind_of, shortened, table
+        from controllers.denoise import begins_with_tpose
+        from mapctl import formats
+
+        denoiser = priors.load_denoiser(self.denoiser)
+        paths: dict[str, list[Path]] = {}
+        for path in self._held_out(denoiser.card):
+            paths.setdefault(kind_of(path.relative_to(self.data or "").as_posix()), []).append(path)
+        clips = []
+        for kind in KINDS:
+            for path in paths.get(kind, [])[: max(1, self.count // len(KINDS))]:
+                motion = formats.load(path)
+                clips.append(Clip(kind, shortened(motion, skip_first=begins_with_tpose(motion))))
+        with bar("denoising") as progress:
+            return table(clips, denoiser, progress=progress)
+
+    def _held_out(self, card: Any) -> list[Path]:
+        """The clips that were kept from training; RequestError where they are not all there."""
+        if self.data is None:
+            raise RequestError(f"bench {self.what} compares with mocap: name the training data's folder with --data")
+        held = card.data.get("held_out", {})
+        paths = [self.data / name for part in ("validation", "test") for name in held.get(part, ())]
+        if not paths or not all(path.is_file() for path in paths):
+            lost = next((path for path in paths if not path.is_file()), "no clip at all")
+            raise RequestError(f"{self.data} does not hold the clips kept from training: {lost}")
+        return paths
 
     def _live(self, name: str) -> list[dict[str, Any]]:
         import priors
@@ -93,13 +130,7 @@ class Bench:
         from mapctl import formats, retarget
         from mapctl.features import PRIOR_FPS
 
-        if self.data is None:
-            raise RequestError("bench generation compares with mocap: name the training data's folder with --data")
-        held = prior.card.data.get("held_out", {})
-        paths = [self.data / name for part in ("validation", "test") for name in held.get(part, ())]
-        if not paths or not all(path.is_file() for path in paths):
-            lost = next((path for path in paths if not path.is_file()), "no clip at all")
-            raise RequestError(f"{self.data} does not hold the clips kept from training: {lost}")
+        paths = self._held_out(prior.card)
         mocap = [retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS) for path in paths]
         mocap = [clip for clip in mocap if clip.num_frames > PRIOR_FPS]
         return generation(prior, priors.refiner_of(name, self.refiner), mocap, GenerationSettings(count=self.count))

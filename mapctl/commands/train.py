@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 class Train:
     """Train a prior on a folder of BVH; killed and resumed, a run gives the same weights."""
 
-    model: Positional[Annotated[Literal["lstm-gmm", "refiner"], arg(metavar="lstm-gmm|refiner")]]
-    """What to train: lstm-gmm is the density that follow and generate use; refiner makes its samples look captured."""
+    model: Positional[Annotated[Literal["lstm-gmm", "refiner", "denoiser"], arg(metavar="lstm-gmm|refiner|denoiser")]]
+    """What to train: lstm-gmm is the density that follow and generate use; refiner makes its samples look captured;
+    denoiser is what denoise begins with."""
     data: options.DataFolder
     """Folder of .bvh files, searched with everything below it."""
     out: options.OutFolder
@@ -71,6 +72,10 @@ class Train:
             from mapctl.commands import train_refiner
 
             path, use = train_refiner.run(self, say), "--refiner"
+        elif self.model == "denoiser":
+            from mapctl.commands import train_denoiser
+
+            path, use = train_denoiser.run(self, say), "--denoiser"
         else:
             request = self.request()
             outputs.check_folder(self.out)

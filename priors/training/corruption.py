@@ -29,6 +29,10 @@ class CorruptionSettings:
     """Share of windows whose angles, and share whose hips, have no noise."""
     uneven: float = 0.5
     """Spread (of the logarithm) of the noise among joints, in half of the windows."""
+    markers: float = 0.15
+    """Share of windows whose noise is that of the joints' places: the shorter a bone, the more it turns."""
+    marker_cm: tuple[float, float] = (0.5, 6.0)
+    """That noise, log-uniform."""
     correlated: float = 0.2
     """Share of windows whose noise lasts beyond a frame."""
     spikes: float = 0.02
@@ -96,6 +100,16 @@ def corrupted(clean: Capture, settings: CorruptionSettings, generator: torch.Gen
     )  # fmt: skip
 
 
+_MOST_TURNED = 0.6  # radians of noise; more is no noise but another motion
+
+
+def _bone_lengths() -> Float[Tensor, " joints"]:
+    """From each canonical joint to the next, metres; of the last ones, the bone before."""
+    lengths = CANONICAL.offsets.norm(dim=-1).float()
+    return torch.stack([lengths[below[0]] if (below := CANONICAL.children(joint)) else lengths[joint]
+                        for joint in range(_JOINTS)])  # fmt: skip
+
+
 class _Draw:
     """Random numbers of one generator."""
 
@@ -121,7 +135,10 @@ def _sigmas(batch: int, settings: CorruptionSettings, draw: _Draw) -> tuple[Tens
     angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, batch, 1)) * (draw.uniform(batch, 1) > settings.clean)
     uneven = torch.where(draw.uniform(batch, 1) < 0.5, settings.uneven, 0.0) * draw.normal(batch, _JOINTS)
     root = draw.log_uniform(*settings.root_cm, batch) / 100 * (draw.uniform(batch) > settings.clean)
-    return angle * torch.exp(uneven), root
+    place = draw.log_uniform(*settings.marker_cm, batch, 1) / 100
+    of_places = (place / _bone_lengths()).clamp(max=_MOST_TURNED)
+    marked = draw.uniform(batch, 1) < settings.markers
+    return torch.where(marked, of_places, angle * torch.exp(uneven)), torch.where(marked[:, 0], place[:, 0], root)
 
 
 def _angles(

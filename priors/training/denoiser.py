@@ -5,15 +5,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl import kinematics, rotations
+from mapctl.capture import Cleaned
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
 from mapctl.skeleton import CANONICAL
-from priors.denoiser import Cleaned, DenoiserConfig, DenoiserNetwork
+from priors.denoiser import DenoiserConfig, DenoiserNetwork
 from priors.training import run_files
 from priors.training.corpus import Corpus, window_starts
 from priors.training.corruption import CorruptionSettings, clean_capture, corrupted
@@ -26,7 +27,7 @@ _WARM_UP = 0.05  # share of the steps in which the learning rate rises
 class DenoiserSettings:
     """The recipe."""
 
-    steps: int = 20_000
+    steps: int = 16_000
     """Updates."""
     batch: int = 48
     """Windows an update."""
@@ -42,6 +43,11 @@ class DenoiserSettings:
     """Weight of the error of the angles, radians: what turns about its own bone moves no joint."""
     contacts: float = 0.5
     """Weight of the contacts' cross entropy, nats."""
+    evenness: float = 0.5
+    """Of windows among the data's top folders: 0 draws by their frames, 1 the same number from each."""
+    calibration_deg: float = 5.0
+    """Spread of a rig's joint frames about the canonical ones, in half of the windows: other rigs find theirs in
+    other ways."""
     corruption: CorruptionSettings = field(default_factory=CorruptionSettings)
     """How windows are spoilt."""
     bfloat16: bool = False
@@ -61,9 +67,9 @@ class DenoiserTrainer:
     """Network, optimiser and generator, one step at a time."""
 
     def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
-        self.settings, self.corpus, self.step = settings, corpus, 0
+        self.settings, self.step = settings, 0
         self.generator = torch.Generator().manual_seed(settings.seed)
-        self.starts = window_starts(corpus.lengths, settings.window)
+        self.windows = Windows(corpus, settings)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(settings.seed)
             self.network = DenoiserNetwork(config, bfloat16=settings.bfloat16)
@@ -71,7 +77,7 @@ class DenoiserTrainer:
 
     def train_step(self) -> dict[str, float]:
         """One update; the parts of its loss."""
-        windows = draw_windows(self.corpus, self.starts, self.settings, self.generator)
+        windows = self.windows.draw(self.generator)
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * _rate(self.step, self.settings.steps)
         parts = losses(self.network, windows, self.settings, self.generator)
@@ -97,18 +103,58 @@ class DenoiserTrainer:
         self.step = step
 
 
-def draw_windows(
-    corpus: Corpus, starts: Tensor, settings: DenoiserSettings, generator: torch.Generator
-) -> Float[Tensor, "batch window size"]:
-    """Windows of clean motion, half of them mirrored, of performers a little larger or smaller."""
-    picked = starts[torch.randint(len(starts), (settings.batch,), generator=generator)]
-    windows = corpus.features[picked[:, None] + torch.arange(settings.window)]
-    mirrored = torch.rand(settings.batch, generator=generator) < 0.5
-    windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows).clone()
-    size = torch.exp(settings.corruption.size * torch.randn(settings.batch, 1, 1, generator=generator))
-    for block in ("root_displacement_heading", "root_height"):
-        windows[..., LAYOUT.slices[block]] *= size
-    return windows
+class Windows:
+    """Windows of clean motion, as they are drawn for training."""
+
+    def __init__(self, corpus: Corpus, settings: DenoiserSettings):
+        """RequestError where no clip is as long as a window."""
+        self.corpus, self.settings = corpus, settings
+        starts, folder = window_starts(corpus.lengths, settings.window), _folder_of_frames(corpus)
+        # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
+        self.groups = [starts[folder[starts] == number] for number in folder.unique()]
+        self.groups = [group for group in self.groups if len(group)]
+        self.chances = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - settings.evenness)
+
+    def draw(self, generator: torch.Generator) -> Float[Tensor, "batch window size"]:
+        """Half of them mirrored, of performers a little larger or smaller, on rigs calibrated a little differently."""
+        settings = self.settings
+        groups = torch.multinomial(self.chances, settings.batch, replacement=True, generator=generator)
+        shares = torch.rand(settings.batch, generator=generator)
+        picked = torch.stack([self.groups[group][int(share * len(self.groups[group]))]
+                              for group, share in zip(groups.tolist(), shares.tolist(), strict=True)])  # fmt: skip
+        windows = self.corpus.features[picked[:, None] + torch.arange(settings.window)]
+        mirrored = torch.rand(settings.batch, generator=generator) < 0.5
+        windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows).clone()
+        size = torch.exp(settings.corruption.size * torch.randn(settings.batch, 1, 1, generator=generator))
+        for block in ("root_displacement_heading", "root_height"):
+            windows[..., LAYOUT.slices[block]] *= size
+        windows[..., LAYOUT.slices["joint_rotations"]] = _calibrated(windows, settings.calibration_deg, generator)
+        return windows
+
+
+def _folder_of_frames(corpus: Corpus) -> Int[Tensor, " frames"]:
+    """By frame the number of the top folder that its clip lies in."""
+    folders = [name.split("/")[0] for name in corpus.names]
+    number = {folder: index for index, folder in enumerate(sorted(set(folders)))}
+    return torch.tensor([number[folder] for folder in folders]).repeat_interleave(torch.tensor(corpus.lengths))
+
+
+def _calibrated(
+    windows: Float[Tensor, "batch window size"], spread_deg: float, generator: torch.Generator
+) -> Float[Tensor, "batch window width"]:
+    """Joint rotations (rotation vectors, flat) with every joint's frame turned by a constant; below it nothing turns.
+
+    Bones point a little elsewhere then; what is still stays still.
+    """
+    batch, others = len(windows), CANONICAL.num_joints - 1
+    turns = math.radians(spread_deg) * torch.randn(batch, 1, others, 3, generator=generator)
+    turns = turns * (torch.rand(batch, 1, 1, 1, generator=generator) < 0.5)
+    own = rotations.from_rotation_vector(torch.cat([torch.zeros_like(turns[:, :, :1]), turns], dim=2))
+    above = own[:, :, [max(0, parent) for parent in CANONICAL.parents]]
+    quats = rotations.from_rotation_vector(LAYOUT.pick(windows, "joint_rotations").unflatten(-1, (-1, 3)))
+    own, above = (turn[:, :, 1:].expand(quats.shape) for turn in (own, above))
+    quats = rotations.multiply(rotations.multiply(rotations.inverse(above), quats), own)
+    return rotations.to_rotation_vector(quats).flatten(-2)
 
 
 def losses(
@@ -147,11 +193,11 @@ def joint_positions(cleaned: Cleaned) -> Float[Tensor, "batch frames joints 3"]:
 def validate(network: DenoiserNetwork, corpus: Corpus, settings: DenoiserSettings) -> dict[str, Any]:
     """The errors on 6 batches of unseen windows, spoilt in the same way each time."""
     generator = torch.Generator().manual_seed(0)
-    starts = window_starts(corpus.lengths, settings.window)
+    drawn = Windows(corpus, settings)
     rows = []
     with torch.no_grad():
         for _ in range(6):
-            windows = draw_windows(corpus, starts, settings, generator)
+            windows = drawn.draw(generator)
             rows.append([float(value) for value in losses(network, windows, settings, generator).values()])
     names = ("loss", "error_cm", "feet_cm_frame", "angles_deg", "contacts_nats")
     return dict(zip(names, torch.tensor(rows).mean(dim=0).tolist(), strict=True))

@@ -1,0 +1,120 @@
+"""Denoising as a live capture needs it: each frame is decided a stated delay after it came.
+
+The last seconds are cleaned anew every few frames; of each pass the frames that are due are kept, and fade over from
+what the pass before had foreseen for them, so that two passes never meet with a jump.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from controllers.denoise import denoise
+from controllers.denoise_piece import DenoiseSettings
+from controllers.denoised import Denoised, faded, joined
+from mapctl.capture.masks import Mask, part_of
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.motion import Motion
+from mapctl.protocols import Denoiser
+
+_LONGEST_DELAY = 5.0
+
+
+@dataclass(frozen=True)
+class CausalSettings:
+    """How a stream is cut; seconds."""
+
+    delay: float = 0.2
+    """That a frame waits for those after it."""
+    step: float = 0.1
+    """Between passes: a frame waits for up to this much more. Half of the delay at most."""
+    past: float = 2.5
+    """That a pass looks back on."""
+
+    def __post_init__(self):
+        if not 1 / PRIOR_FPS <= self.delay <= _LONGEST_DELAY:
+            raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_LONGEST_DELAY:g} s, got {self.delay:g}")
+
+
+class CausalDenoiser:
+    """Takes the frames of one capture as they come, gives back clean ones."""
+
+    def __init__(
+        self, denoiser: Denoiser, *, settings: DenoiseSettings | None = None, causal: CausalSettings | None = None
+    ):
+        self._denoiser, self._settings = denoiser, settings or DenoiseSettings()
+        self._causal = causal or CausalSettings()
+        self._past: Motion | None = None  # what a pass sees
+        self._first = 0  # the frame of the capture that it begins with
+        self._given = 0  # frames that were given back
+        self._foreseen: tuple[Motion, int] | None = None  # the last pass, and its first frame
+        self._masks: tuple[Mask, ...] = ()
+
+    @property
+    def delay(self) -> float:
+        """Seconds between a frame and its clean one, at most, but for the compute."""
+        return self._causal.delay + min(self._causal.step, self._causal.delay / 2)
+
+    def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> Denoised | None:
+        """The next frames of the capture; returns those that are due by now, None if none are. Masks count from the
+        first frame of all.
+        """
+        fps = float(frames.fps)
+        self._masks = (*self._masks, *masks)
+        self._past = frames if self._past is None else self._past.join(frames)
+        come = self._first + self._past.num_frames
+        due = come - round(self._causal.delay * fps)
+        if due - self._given < max(1, round(min(self._causal.step, self._causal.delay / 2) * fps)):
+            return None
+        return self._pass(due)
+
+    def finish(self) -> Denoised | None:
+        """The frames that still wait; the capture is over."""
+        come = 0 if self._past is None else self._first + self._past.num_frames
+        return self._pass(come) if come > self._given else None
+
+    def _pass(self, due: int) -> Denoised:
+        assert self._past is not None
+        masks = part_of(self._masks, self._first, self._first + self._past.num_frames)
+        done = denoise(self._past, self._denoiser, masks=masks, settings=self._settings)
+        start, count = self._given - self._first, due - self._given
+        given = done.slice(start, start + count)
+        if self._foreseen is not None:
+            old, first = self._foreseen
+            shared = min(count, first + old.num_frames - self._given)
+            if shared > 0:
+                before = old.slice(self._given - first, self._given - first + shared)
+                given = replace(given, motion=faded(before, given.motion, shared))
+        self._foreseen, self._given = (done.motion, self._first), due
+        self._forget()
+        return given
+
+    def _forget(self) -> None:
+        """What lies further back than a pass looks."""
+        assert self._past is not None
+        kept = max(1, round((self._causal.past + self._causal.delay) * float(self._past.fps)))
+        dropped = min(self._past.num_frames - kept, self._given - self._first)
+        if dropped > 0:
+            self._past, self._first = self._past.slice(dropped, self._past.num_frames), self._first + dropped
+
+
+def denoise_causal(
+    motion: Motion, denoiser: Denoiser, *, masks: Sequence[Mask] = (), settings: DenoiseSettings | None = None,
+    delay: float = CausalSettings.delay, progress: Callable[[int, int], None] | None = None,
+) -> Denoised:  # fmt: skip
+    """A whole motion through a CausalDenoiser, a frame at a time."""
+    began = time.perf_counter()
+    stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay))
+    whole: Denoised | None = None
+    for frame in range(motion.num_frames):
+        new = stream.push(motion.slice(frame, frame + 1), masks=masks if frame == 0 else ())
+        if new is not None:
+            whole = new if whole is None else joined([(whole, 0), (new, whole.motion.num_frames)])
+            if progress is not None:
+                progress(whole.motion.num_frames, motion.num_frames)
+    rest = stream.finish()
+    if rest is not None:
+        whole = rest if whole is None else joined([(whole, 0), (rest, whole.motion.num_frames)])
+    assert whole is not None, "a motion has a frame"
+    note = f"causal: a frame is decided {stream.delay:.2f} s after it came"
+    return replace(whole, seconds=time.perf_counter() - began, notes=(note, *whole.notes))

@@ -1,0 +1,150 @@
+"""What denoising gives back: the clean motion, what was found wrong, what was changed, and how sure it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.capture.faults import Fault
+from mapctl.features import PRIOR_FPS
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.result import Ledger
+
+_DOUBTED = 0.5  # share of a joint's frames from which the network counts as out of its depth
+
+
+@dataclass(frozen=True, eq=False)
+class Denoised:
+    """A clean motion, and what was found and changed."""
+
+    motion: Motion
+    """On the capture's rig, at its rate."""
+    capture: Motion
+    """As it came."""
+    noise: Float[Tensor, " joints"]
+    """Of each of a joint's angles, by joint of the rig, radians."""
+    noise_root: float
+    """Of each coordinate of the root's place, metres."""
+    faults: tuple[Fault, ...]
+    """Everything that was found wrong."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted, at the prior's rate."""
+    believed: Float[Tensor, "frames joints"]
+    """By frame at the prior's rate and canonical joint: 1 where the proposal was followed, 0 where the capture itself,
+    smoothed, took its place."""
+    ledger: Ledger
+    """Of the MAP stage, by term and frame at the prior's rate."""
+    seconds: float = 0.0
+    """Compute, wall clock."""
+    notes: tuple[str, ...] = ()
+    """What the user should know."""
+
+    def slice(self, start: int, stop: int) -> "Denoised":
+        """Frames start to stop, with the faults that begin in them; the noise stays that of the whole."""
+        ratio = PRIOR_FPS / float(self.motion.fps)
+        part = slice(round(start * ratio), round(stop * ratio))
+        faults = (replace(fault, start=fault.start - start, stop=min(fault.stop, stop) - start)
+                  for fault in self.faults if start <= fault.start < stop)  # fmt: skip
+        entries = (replace(e, energy=e.energy[part], residual=e.residual[part]) for e in self.ledger.entries)
+        return replace(
+            self, motion=self.motion.slice(start, stop), capture=self.capture.slice(start, stop),
+            faults=tuple(faults), contacts=self.contacts[part], believed=self.believed[part],
+            ledger=Ledger(tuple(entries)),
+        )  # fmt: skip
+
+    def summary(self) -> dict[str, Any]:
+        """For a report, in plain numbers."""
+        names = self.motion.skeleton.names
+        moved, turned = self.correction()
+        return {
+            "frames": self.motion.num_frames, "fps": float(self.motion.fps),
+            "noise_deg": dict(zip(names, torch.rad2deg(self.noise).tolist(), strict=True)),
+            "noise_root_cm": 100 * self.noise_root,
+            "faults": [vars(fault) for fault in self.faults],
+            "correction_cm": dict(zip(names, moved.tolist(), strict=True)),
+            "correction_deg": dict(zip(names, turned.tolist(), strict=True)),
+            "contacts": self.contact_frames(), "fallback": self.fallback(),
+            "ledger": self.ledger.summary(), "seconds": self.seconds,
+            "frame_ms": 1000 * self.seconds / self.motion.num_frames, "notes": list(self.notes),
+        }  # fmt: skip
+
+    def correction(self) -> tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]]:
+        """By joint of the rig the mean distance that it was moved by (cm), and the mean angle in its parent (deg)."""
+        moved = (self.motion.joint_positions() - self.capture.joint_positions()).norm(dim=-1)
+        turn = rotations.multiply(rotations.inverse(self.capture.local_quat_xyzw), self.motion.local_quat_xyzw)
+        angle = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
+        return 100 * moved.mean(dim=0), angle.mean(dim=0)
+
+    def contact_frames(self) -> dict[str, list[list[int]]]:
+        """By foot, first frame and one past the last of each contact, in frames of the capture."""
+        from mapctl.capture.faults import runs
+
+        scale = float(self.motion.fps) / PRIOR_FPS
+        found: dict[str, list[list[int]]] = {"left": [], "right": []}
+        for foot, start, stop in runs(self.contacts):
+            found[("left", "right")[foot]].append([round(start * scale), round(stop * scale)])
+        return found
+
+    def fallback(self) -> list[dict[str, Any]]:
+        """Joints, and frames of the capture, in which the network was out of its depth."""
+        from mapctl.capture.faults import runs
+
+        scale = float(self.motion.fps) / PRIOR_FPS
+        return [{"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": round(stop * scale)}
+                for joint, start, stop in runs(self.believed < _DOUBTED)]  # fmt: skip
+
+
+def joined(pieces: Sequence[tuple[Denoised, int]]) -> Denoised:
+    """Pieces of one capture, each with the frame that it begins at; where two overlap the second fades in."""
+    whole = pieces[0][0]
+    for piece, start in pieces[1:]:
+        whole = _after(whole, piece, start)
+    return whole
+
+
+def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
+    """`piece` begins at frame `start` of `whole`."""
+    shared = whole.motion.num_frames - start
+    motion = faded(whole.motion, piece.motion, shared)
+    ratio = PRIOR_FPS / float(motion.fps)
+    kept, skipped = round((start + shared // 2) * ratio), round(shared // 2 * ratio)
+    skip = start + shared // 2
+    faults = [fault for fault in whole.faults if fault.start < skip]
+    faults += [replace(f, start=f.start + start, stop=f.stop + start) for f in piece.faults if f.start + start >= skip]
+    share = piece.motion.num_frames / motion.num_frames
+    return replace(
+        whole, motion=motion, capture=whole.capture.join(piece.capture.slice(shared, piece.capture.num_frames)),
+        noise=(1 - share) * whole.noise + share * piece.noise,
+        noise_root=(1 - share) * whole.noise_root + share * piece.noise_root, faults=tuple(faults),
+        contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
+        believed=torch.cat([whole.believed[:kept], piece.believed[skipped:]]),
+        ledger=whole.ledger.slice(kept).join(piece.ledger), seconds=whole.seconds + piece.seconds,
+        notes=tuple(dict.fromkeys(whole.notes + piece.notes)),
+    )  # fmt: skip
+
+
+def faded(before: Motion, after: Motion, shared: int) -> Motion:
+    """`before`, then `after`, which fades in over the last `shared` frames of the one and the first of the other."""
+    if shared == 0:
+        return before.join(after)
+    first = before.num_frames - shared
+    weight = torch.linspace(0, 1, shared, dtype=torch.float64)
+    tail, head = before.slice(first, before.num_frames), after.slice(0, shared)
+    place = torch.lerp(tail.root_position, head.root_position, weight[:, None])
+    moving = {joint: torch.lerp(values, head.moving_offsets[joint], weight[:, None])
+              for joint, values in tail.moving_offsets.items()}  # fmt: skip
+    turns = weight[:, None].expand(shared, before.num_joints)
+    quats = rotations.slerp(tail.local_quat_xyzw, head.local_quat_xyzw, turns)
+    mixed = replace(tail, root_position=place, local_quat_xyzw=quats, moving_offsets=moving)
+    parts = [mixed]
+    if first > 0:
+        parts.insert(0, before.slice(0, first))
+    if shared < after.num_frames:
+        parts.append(after.slice(shared, after.num_frames))
+    return reduce(Motion.join, parts)

@@ -1,0 +1,176 @@
+"""`mapctl denoise`: a noisy capture comes back clean, on its own rig."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.errors import RequestError
+from mapctl.progress import bar
+
+if TYPE_CHECKING:
+    from controllers.denoised import Denoised
+
+_NOT_ALL_HOLDS = 3
+_MOST_NAMED = 6
+
+
+@dataclass(frozen=True)
+class Denoise:
+    """A noisy, sliding, gappy capture of any known rig comes back clean: same skeleton, names, frames and rate."""
+
+    source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
+    """A motion file; or a folder, every motion below it."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="OUT|FOLDER")]
+    """Where the clean motion goes; of a folder, another one, which gets the same names."""
+    mask: options.MaybeFile = None
+    """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is not to be
+    believed. `*` stands for everything, `root position` for where it is."""
+    sigma_deg: options.MaybeNumber = None
+    """Noise of every joint's angles, degrees; told from the capture, joint by joint, if not given."""
+    sigma_cm: options.MaybeNumber = None
+    """Noise of the place of the hips, centimetres; told from the capture if not given."""
+    anchor: bool = False
+    """Let the body go where its planted feet say, for captures in which it drifts against them. The way over the
+    ground changes."""
+    causal: bool = False
+    """As a live capture would be cleaned: a frame is decided `--delay` after it came."""
+    delay: options.Number = 0.2
+    """Seconds that --causal may look ahead."""
+    denoiser: options.Name = "denoiser"
+    """The bundled denoiser, or the file or run folder of a trained one."""
+    prior: options.MaybeName = None
+    """A density whose likelihood joins the last stage: a bundled one, a file or a run folder."""
+    report: options.MaybeFile = None
+    """JSON with the faults found, corrections, contacts, ledger; of a folder, a folder of them."""
+    plot: options.MaybeFile = None
+    """PNG of joint angles before and after, and of the feet."""
+    video: options.MaybeFile = None
+    """Film of the capture and the result side by side: .mp4, .gif or .png."""
+    jobs: options.Count = 1
+    """Of a folder: how many files at once, each in a process of its own."""
+    cluster: Annotated[str | None, arg(metavar="local|ADDRESS")] = None
+    """Of a folder: over a ray cluster instead; `local` starts one on this machine with --jobs workers."""
+    again: bool = False
+    """Of a folder: do files again whose result is there already."""
+    strict: bool = False
+    """Exit with status 3 where the network was out of its depth for more than half of the frames."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, denoise, write, tell."""
+        compute_on_one()
+        if self.source.is_dir():
+            from mapctl.commands import denoise_folder
+
+            return denoise_folder.run(self)
+        self._check()
+        done = self._denoised()
+        from mapctl import formats
+
+        formats.save(done.motion, self.out)
+        if self.report is not None:
+            from mapctl import report as reports
+
+            reports.write(self.as_report(done), self.report)
+        self._pictures(done)
+        if not self.quiet:
+            self._tell(done)
+        lost = float(done.believed.mean()) < 0.5 and done.noise.max() > 0
+        return _NOT_ALL_HOLDS if self.strict and lost else 0
+
+    def as_report(self, done: "Denoised") -> dict[str, object]:
+        """The request, versions, and what the result says of itself."""
+        from mapctl import __version__, metrics, report
+
+        request = {key: value for key, value in options.as_request("denoise", self).items() if value is not None}
+        return {"mapctl": __version__, "request": request, "versions": report.versions(), **done.summary(),
+                "measures": metrics.measure(done.motion)}  # fmt: skip
+
+    def _check(self) -> None:
+        from mapctl import formats
+
+        for name in ("cluster", "again"):
+            if getattr(self, name):
+                raise RequestError(f"--{name} is for folders; {self.source} is a file")
+        formats.check_ending(self.out)
+        outputs.check_files(options.given(self.out, self.report, self.plot, self.video))
+        if self.video is not None:
+            outputs.check_film(self.video, (1280, 720))
+        if self.plot is not None:
+            outputs.require_render("matplotlib")
+
+    def _denoised(self) -> "Denoised":
+        import priors
+        from mapctl import formats
+
+        settings, masks = self.settings(), self._masks()
+        density = None if self.prior is None else priors.load(self.prior)
+        denoiser, motion = priors.load_denoiser(self.denoiser), formats.load(self.source)
+        with bar("denoising", quiet=self.quiet) as progress:
+            if self.causal:
+                from controllers.denoise_causal import denoise_causal
+
+                return denoise_causal(
+                    motion, denoiser, masks=masks, settings=settings, delay=self.delay, progress=progress
+                )
+            from controllers.denoise import denoise
+
+            return denoise(motion, denoiser, masks=masks, settings=settings, density=density, progress=progress)
+
+    def settings(self):
+        """What is known of the capture; RequestError for numbers that make no sense."""
+        from controllers.denoise import DenoiseSettings
+
+        if self.causal and self.prior is not None:
+            raise RequestError("--causal has no time for a density; leave --prior out")
+        return DenoiseSettings(sigma_deg=self.sigma_deg, sigma_cm=self.sigma_cm, anchor=self.anchor)
+
+    def _masks(self):
+        from mapctl.capture.masks import load_masks
+
+        return () if self.mask is None else load_masks(self.mask)
+
+    def _pictures(self, done: "Denoised") -> None:
+        if self.plot is not None:
+            from scenes.denoise_plot import plot
+
+            plot(done.capture, done.motion, self.plot)
+        if self.video is not None:
+            from scenes.denoise_plot import side_by_side
+
+            with bar("filming", quiet=self.quiet) as progress:
+                side_by_side(done.capture, done.motion, self.video, progress=progress)
+
+    def _tell(self, done: "Denoised") -> None:
+        summary = done.summary()
+        moved = sum(summary["correction_cm"].values()) / len(summary["correction_cm"])
+        print(f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
+              f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame")  # fmt: skip
+        for line in fault_lines(done):
+            print(line)
+        for note in done.notes:
+            print(note)
+
+
+def fault_lines(done: "Denoised") -> list[str]:
+    """The faults in a few lines, a line a kind."""
+    kinds: dict[str, dict[str, list]] = {}
+    for fault in done.faults:
+        kinds.setdefault(fault.kind, {}).setdefault(fault.joint, []).append(fault)
+    lines = []
+    for kind, joints in kinds.items():
+        worst = sorted(joints, key=lambda name: -max(fault.amount for fault in joints[name]))
+        named = []
+        for name in worst[:_MOST_NAMED]:
+            found = joints[name]
+            top = max(found, key=lambda fault: fault.amount)
+            amount = f" {top.amount:.1f} {top.unit}" if top.unit else f" {sum(f.stop - f.start for f in found)} frames"
+            named.append(f"{name}{amount}" + (f" ({len(found)} times)" if len(found) > 1 else ""))
+        rest = len(worst) - len(named)
+        lines.append(f"{kind}: {', '.join(named)}" + (f" and {rest} more joints" if rest > 0 else ""))
+    return lines
