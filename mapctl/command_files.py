@@ -5,14 +5,12 @@ A line that leaves one of the wanted ones empty faces where it goes, goes straig
 and tells the prior nothing.
 """
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 from os import PathLike
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.reading import read_bytes, shorten
+from mapctl.formats.reading import finite_number, read_table, shorten
 from mapctl.steering import Command, CommandTrack
 
 _NEEDED = ("time_s", "speed_mps", "heading_deg")
@@ -23,20 +21,15 @@ _MOST_SPEED, _MOST_TIME, _MOST = 1000.0, 1e6, 1e6
 
 def read_commands(path: str | PathLike[str]) -> CommandTrack:
     """The commands of a file. FileFormatError names file and line, and what was expected there."""
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise FileFormatError(path, f"is not a text file; expected columns {','.join(_NEEDED)}") from None
-    lines = [(number, words) for number, words in enumerate(csv.reader(io.StringIO(text)), start=1)
-             if any(word.strip() for word in words)]  # fmt: skip
-    names = [word.strip().lower() for word in lines[0][1]] if lines else []
+    lines = read_table(path, f"a CSV of the columns {','.join(_NEEDED)}")
+    header, names = (lines[0][0], [word.lower() for word in lines[0][1]]) if lines else (1, [])
     missing = [name for name in _NEEDED if name not in names]
     if missing:
-        raise FileFormatError(path, f"has no column {', '.join(missing)}; expected {','.join(_NEEDED)}", 1)
+        raise FileFormatError(path, f"has no column {', '.join(missing)}; expected {','.join(_NEEDED)}", header)
     unknown = [name for name in names if name not in _ALLOWED]
     if unknown or len(set(names)) < len(names):
         found = shorten(",".join(names))
-        raise FileFormatError(path, f"found the columns {found}, expected {','.join(_ALLOWED)}, each once", 1)
+        raise FileFormatError(path, f"found the columns {found}, expected {','.join(_ALLOWED)}, each once", header)
     if len(lines) < 2:
         raise FileFormatError(path, "holds no commands")
     times: list[float] = []
@@ -44,7 +37,7 @@ def read_commands(path: str | PathLike[str]) -> CommandTrack:
     for number, words in lines[1:]:
         if len(words) != len(names):
             raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
-        line = _Line(path, number, dict(zip(names, (word.strip() for word in words), strict=True)))
+        line = _Line(path, number, dict(zip(names, words, strict=True)))
         time = line.within("time_s", 0, _MOST_TIME)
         if times and time <= times[-1]:
             raise FileFormatError(path, f"time_s must rise, got {time:g} after {times[-1]:g}", number)
@@ -79,10 +72,7 @@ class _Line:
         return value
 
     def value(self, name: str) -> float:
-        try:
-            value = float(self.words[name])
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= _MOST:
+        value = finite_number(self.words[name])
+        if value is None or abs(value) > _MOST:
             raise FileFormatError(self.path, f"{name} must be a number, got {shorten(self.words[name])}", self.number)
         return value

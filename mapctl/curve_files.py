@@ -91,10 +91,7 @@ def _plain_order(path: str | PathLike[str], words: list[str], number: int) -> li
 def _row(path: str | PathLike[str], words: list[str], number: int, columns: int) -> list[float]:
     if len(words) != columns:
         raise FileFormatError(path, f"found {len(words)} values where {columns} belong", number)
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = [math.nan]
+    values = [float(word) if _is_number(word) else math.nan for word in words]
     if all(abs(value) <= MAX_LENGTH for value in values):
         return values
     wrong = next(word for word in words if not (_is_number(word) and abs(float(word)) <= MAX_LENGTH))
@@ -103,12 +100,12 @@ def _row(path: str | PathLike[str], words: list[str], number: int, columns: int)
 
 
 def _is_number(word: str) -> bool:
-    """Whether Python reads the word as a number, nan and inf included: those are refused by their size."""
+    """Whether the word is a number, nan and inf included: those are refused by their size. `1_000` is none."""
     try:
         float(word)
     except ValueError:
         return False
-    return True
+    return word.isascii() and "_" not in word
 
 
 def read_svg(path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_UNIT) -> ndarray:
@@ -164,7 +161,8 @@ def _sampled(path: str | PathLike[str], segment, metres_per_unit: float) -> ndar
     from svgpathtools import Line
 
     def places(count: int) -> ndarray:
-        at = np.array([segment.point(t) for t in np.linspace(0, 1, count + 1)])
+        with np.errstate(all="ignore"):
+            at = np.array([segment.point(t) for t in np.linspace(0, 1, count + 1)])
         return np.stack([np.real(at), np.imag(at)], axis=1) * metres_per_unit
 
     rough = places(1 if type(segment) is Line else 8)

@@ -1,19 +1,20 @@
 """Masks: what of a recording its user says not to believe. CSV with the columns joint, start, stop."""
 
-import csv
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.reading import read_table, shorten
 from mapctl.motion import Motion
 
 _COLUMNS = ("joint", "start", "stop")
+_FRAME = re.compile(r"[+-]?[0-9]{1,12}")
 ALL, ROOT = "*", "root position"
 """Names that stand for everything, and for the place of the root."""
 
@@ -31,26 +32,26 @@ class Mask:
 
 
 def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
-    """Read a CSV; FileFormatError says which line is wrong."""
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-            names = rows[0].keys() if rows else _COLUMNS
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(path, f"no readable CSV ({error})") from error
-    if missing := [name for name in _COLUMNS if name not in names]:
-        raise FileFormatError(path, f"needs the columns {', '.join(_COLUMNS)}; {', '.join(missing)} missing")
-    return tuple(_mask(path, line, row) for line, row in enumerate(rows, start=2))
+    """Read a CSV, its columns in any order; FileFormatError says which line is wrong. A header alone masks nothing."""
+    (line, names), *rows = read_table(path, f"a CSV of the columns {','.join(_COLUMNS)}") or [(1, [])]
+    if not set(_COLUMNS) <= set(names) or len(set(names)) < len(names):
+        found = shorten(",".join(names)) if names else "nothing"
+        raise FileFormatError(path, f"needs the columns {', '.join(_COLUMNS)}, each once; found {found}", line)
+    return tuple(_mask(path, line, names, words) for line, words in rows)
 
 
-def _mask(path: str | PathLike[str], line: int, row: dict) -> Mask:
-    try:
-        mask = Mask(row["joint"].strip(), int(row["start"]), int(row["stop"]))
-    except (ValueError, TypeError, AttributeError):
-        raise FileFormatError(path, f"line {line}: start and stop are whole frames, got {list(row.values())}") from None
-    if not 0 <= mask.start < mask.stop:
-        raise FileFormatError(path, f"line {line}: needs 0 <= start < stop, got {mask.start} and {mask.stop}")
-    return mask
+def _mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Sequence[str]) -> Mask:
+    if len(words) != len(names):
+        raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", line)
+    row = dict(zip(names, words, strict=True))
+    numbers = [row[name] for name in ("start", "stop")]
+    if not row["joint"] or not all(_FRAME.fullmatch(number) for number in numbers):
+        got = shorten(",".join(words))
+        raise FileFormatError(path, f"expected a joint and two whole frames, got {got}", line)
+    start, stop = map(int, numbers)
+    if not 0 <= start < stop:
+        raise FileFormatError(path, f"needs 0 <= start < stop, got {start} and {stop}", line)
+    return Mask(row["joint"], start, stop)
 
 
 def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:

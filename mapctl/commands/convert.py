@@ -20,13 +20,16 @@ class Convert:
     """Write a motion in another format, on another skeleton or at another frame rate."""
 
     source: options.InFile
-    """.bvh or .npz."""
+    """.bvh, .npz, or .amc: its skeleton is the .asf of the same name, else the only one in the folder, else
+    named as in subject.asf+take.amc."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
-    """.bvh, .npz, or .glb with a skinned body."""
+    """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
     rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted."""
     fps: Annotated[str | None, arg(metavar="F")] = None
     """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
+    fps_in: Annotated[str | None, arg(metavar="F")] = None
+    """Frames per second of an .amc, which does not say; 120 unless given."""
 
     def run(self) -> int:
         """Read, change, write."""
@@ -35,7 +38,7 @@ class Convert:
         formats.check_ending(self.out)
         outputs.check_files([self.out])
         fps = None if self.fps is None else parse_fps(self.fps)
-        motion = formats.load(self.source)
+        motion = formats.load(self.source, fps=None if self.fps_in is None else parse_fps(self.fps_in))
         if self.rig is not None:
             motion = on_rig(motion, self.rig)
         if fps is not None:

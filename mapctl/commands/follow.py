@@ -21,7 +21,7 @@ class FollowCurve:
     curve: Positional[options.CurveText]
     """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or x,y,z, or an SVG file."""
     out: options.OutFile
-    """Where the motion goes: .bvh, .npz or .glb."""
+    """Where the motion goes: .bvh, .npz, .glb or .usda."""
     speed: options.Speed = "1.2"
     """Along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m."""
     seconds: options.MaybeNumber = None

@@ -36,7 +36,7 @@ class Generate:
     temperature: options.Number = 1.0
     """Spread of the draws, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
     start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
-    """A clip (.bvh, .npz) to go on from, or the number of one of the prior's starts for all; drawn if not given."""
+    """A clip (.bvh, .npz, .amc) to go on from, or the number of a start of the prior for all; drawn if not given."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None

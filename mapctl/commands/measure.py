@@ -25,7 +25,7 @@ class Measure:
     """
 
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
-    """.bvh or .npz; or a folder, every .bvh and .npz below it."""
+    """.bvh, .npz or .amc; or a folder, every one of them below it."""
     reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
     """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
     curve: options.MaybeCurve = None

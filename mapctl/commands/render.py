@@ -14,7 +14,7 @@ class Render:
     """Film a motion: MP4, GIF, or a PNG contact sheet."""
 
     source: options.InFile
-    """.bvh or .npz."""
+    """.bvh, .npz, or .amc with its .asf beside it."""
     out: options.OutFile
     """.mp4, .gif or .png."""
     curve: options.MaybeCurve = None

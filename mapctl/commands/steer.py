@@ -34,7 +34,7 @@ class Steer:
     strafing, turn_deg_s to turn on and on, step_m for a step length, gait and style as the prior knows them. The last
     line's time is the end."""
     out: options.OutFile
-    """Where the motion goes: .bvh, .npz or .glb."""
+    """Where the motion goes: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then."""
     prior: options.Name = "locomotion-live"

@@ -1,11 +1,12 @@
 """Files to Motion and back. Each module owns its format's quirks; this one only picks by ending."""
 
 from collections.abc import Callable
+from fractions import Fraction
 from os import PathLike
 from pathlib import PurePath
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import bvh, npz
+from mapctl.formats import asf_amc, bvh, npz
 from mapctl.motion import Motion
 
 
@@ -15,28 +16,55 @@ def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
     gltf.save(motion, path)
 
 
-READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load}
+def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
+    from mapctl.formats import usd  # late, likewise
+
+    usd.save(motion, path)
+
+
+READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {
+    ".bvh": bvh.load, ".npz": npz.load, ".amc": asf_amc.load,
+}  # fmt: skip
 WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
     ".bvh": bvh.save, ".npz": npz.save, ".glb": _save_glb,
+    ".usda": _save_usd, ".usdc": _save_usd, ".usd": _save_usd,
+}  # fmt: skip
+_USD = (".usda", ".usdc", ".usd")
+_WHY_NOT = {
+    ".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
+    ".glb": "can be written but not read", **dict.fromkeys(_USD, "can be written but not read"),
 }  # fmt: skip
 
 
-def load(path: str | PathLike[str]) -> Motion:
-    """Read a motion from a .bvh or .npz file. FileFormatError says what is wrong with the file, and where."""
+def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> Motion:
+    """Read a motion from a .bvh, .npz or .amc file, the last with the .asf beside it (see `asf_amc.load`).
+
+    `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do.
+    FileFormatError says what is wrong with the file, and where.
+    """
     ending = PurePath(path).suffix.lower()
     if ending not in READERS:
-        raise FileFormatError(path, f"cannot read the ending {ending!r}; allowed: {', '.join(READERS)}")
-    return READERS[ending](path)
+        why = _WHY_NOT.get(ending, f"cannot read the ending {ending!r}")
+        raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
+    if fps is None:
+        return READERS[ending](path)
+    if ending != ".amc":
+        raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
+    return asf_amc.load(path, fps=fps)
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
-    """Write a motion as .bvh, .npz or .glb, whole or not at all. RequestError if it cannot be written there."""
+    """Write a motion in a format of `WRITERS`, whole or not at all. RequestError if it cannot be written there."""
     check_ending(path)
     WRITERS[PurePath(path).suffix.lower()](motion, path)
 
 
 def check_ending(path: str | PathLike[str]) -> None:
-    """RequestError unless `path` ends as a format that can be written; to fail before long work."""
+    """RequestError unless `path` ends as a format that can be written, and is installed; to fail before long work."""
     ending = PurePath(path).suffix.lower()
     if ending not in WRITERS:
         raise RequestError(f"cannot write {path}: unknown ending {ending!r}; allowed: {', '.join(WRITERS)}")
+    if ending in _USD:
+        from mapctl.formats import usd
+
+        usd.check_installed(path)

@@ -4,23 +4,19 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import count, pairwise
-from math import isfinite
 from os import PathLike
 from typing import NoReturn
 
 import numpy as np
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.reading import shorten
+from mapctl.formats.reading import NUMBER, finite_number, shorten
 
 MAX_JOINTS = 1000
 """Most joints that are read; a body with fingers, face and props has about 200."""
 MAX_CHANNELS = 6
 """Most channels of one joint: three positions and three rotations."""
 
-LARGEST_VALUE = 1e8
-"""No length (file unit) or angle (degrees) of a capture comes near this, and squares stay exact."""
-NUMBER = f"a finite number below {LARGEST_VALUE:g}"
 AXES = {"X": 0, "Y": 1, "Z": 2}
 """Place of an axis in a vector."""
 
@@ -30,16 +26,6 @@ _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 
 Offset = tuple[float, float, float]
 _ORIGIN: Offset = (0.0, 0.0, 0.0)
-
-
-def finite_number(word: str) -> float | None:
-    """The number a word says, or None if it is none, not finite or absurd; `1_000` is none in a file."""
-    try:
-        value = float(word)
-    except ValueError:
-        return None
-    plain = word.isascii() and "_" not in word
-    return value if plain and isfinite(value) and abs(value) < LARGEST_VALUE else None
 
 
 class Scanner:

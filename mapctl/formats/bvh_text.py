@@ -12,16 +12,9 @@ from os import PathLike
 import numpy as np
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.bvh_hierarchy import (
-    LARGEST_VALUE,
-    NUMBER,
-    Hierarchy,
-    Scanner,
-    finite_number,
-    read_hierarchy,
-)
+from mapctl.formats.bvh_hierarchy import Hierarchy, Scanner, read_hierarchy
 from mapctl.formats.frame_rate import LONGEST_FRAME, SHORTEST_FRAME
-from mapctl.formats.reading import read_bytes, shorten
+from mapctl.formats.reading import LARGEST_VALUE, NUMBER, check_extent, decode, finite_number, read_bytes, shorten
 
 _FRAMES = re.compile(r"\s*+frames[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
 _DATUM = re.compile(r"\S+", re.ASCII)  # a no-break space parts no numbers
@@ -44,28 +37,15 @@ class BvhText:
 
 def read(path: str | PathLike[str]) -> BvhText:
     """Read a BVH file. FileFormatError names the line and what was expected there."""
-    text, encoding = _decode(path, read_bytes(path))
+    text, encoding = decode(path, read_bytes(path), "BVH text")
     scanner = Scanner(path, text)
     hierarchy = read_hierarchy(scanner)
     frames, frames_line = _frame_count(scanner), scanner.line
     frame_time = _frame_time(scanner)
     labels = hierarchy.labels()
     values = _values(scanner, labels, frames=frames, frames_line=frames_line)
+    check_extent(path, len(values), len(hierarchy.names))
     return BvhText(hierarchy, frame_time, values, encoding)
-
-
-def _decode(path: str | PathLike[str], raw: bytes) -> tuple[str, str]:
-    """Text with plain line feeds. Names in an old one-byte encoding are kept by reading them as latin-1."""
-    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise FileFormatError(path, "is UTF-16 text; save it as UTF-8", line=1)
-    if b"\0" in raw:
-        line = raw.count(b"\n", 0, raw.index(b"\0")) + 1
-        raise FileFormatError(path, "is a binary file, expected BVH text", line)
-    try:
-        text, encoding = raw.decode("utf-8-sig"), "utf-8"
-    except UnicodeDecodeError:
-        text, encoding = raw.decode("latin-1"), "latin-1"
-    return text.replace("\r\n", "\n").replace("\r", "\n"), encoding
 
 
 def _frame_count(scanner: Scanner) -> int:

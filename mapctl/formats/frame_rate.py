@@ -5,6 +5,8 @@ from fractions import Fraction
 
 SHORTEST_FRAME, LONGEST_FRAME = 1e-5, 100.0
 """Frame times (seconds) that are taken seriously."""
+SLOWEST, FASTEST = 0.01, 1e5
+"""The same as frames per second."""
 
 _RATES = (30, 60, 120, 24, 25, 50, 100, 15, 20, 40, 48, 72, 75, 90, 144, 150, 200, 240)
 _COMMON = tuple(Fraction(rate) for rate in _RATES)

@@ -10,9 +10,9 @@ import numpy as np
 import pygltflib
 
 from mapctl import __version__
-from mapctl.body.skin import Skin, skin
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_bytes
+from mapctl.formats.skinned import SkinnedBody, skinned
 from mapctl.motion import Motion
 from mapctl.rotations import sign_continuous
 
@@ -53,10 +53,10 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     buffer = _Buffer(document)
     joints = motion.num_joints
     document.nodes = _nodes(motion)
-    document.meshes = [_mesh(motion, skin(motion), buffer)]
-    rest = _rest_world(motion)
+    body = skinned(motion)
+    document.meshes = [_mesh(body, buffer)]
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
-    inverse[:, 3, :3] = -rest  # column-major: the translation is the last row here
+    inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
     document.skins = [pygltflib.Skin(joints=list(range(joints)), skeleton=0,
                                 inverseBindMatrices=buffer.add(inverse.reshape(joints, 16)))]  # fmt: skip
     document.nodes.append(pygltflib.Node(name="mannequin", mesh=0, skin=0))
@@ -85,24 +85,14 @@ def _nodes(motion: Motion) -> list[pygltflib.Node]:
     return [*joints, *ends]
 
 
-def _rest_world(motion: Motion) -> np.ndarray:
-    """(joints, 3) joints with all rotations zero and the root at the origin, metres."""
-    offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
-    for joint, parent in enumerate(motion.skeleton.parents):
-        rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
-    return rest
-
-
-def _mesh(motion: Motion, body: Skin, buffer: _Buffer) -> pygltflib.Mesh:
-    vertices = body.vertices + _rest_world(motion)[body.joint]  # in the rest pose joint frames are not turned
+def _mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
     carrier = np.zeros((len(body.joint), 4), np.uint16)
     carrier[:, 0] = body.joint
     weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(carrier), 1))
-    linear = np.where(body.rgb <= 0.04045, body.rgb / 12.92, ((body.rgb + 0.055) / 1.055) ** 2.4)  # glTF's colours
     attributes = pygltflib.Attributes(
-        POSITION=buffer.add(vertices.astype(np.float32), pygltflib.ARRAY_BUFFER),
+        POSITION=buffer.add(body.vertices.astype(np.float32), pygltflib.ARRAY_BUFFER),
         NORMAL=buffer.add(body.normals.astype(np.float32), pygltflib.ARRAY_BUFFER),
-        COLOR_0=buffer.add(linear.astype(np.float32), pygltflib.ARRAY_BUFFER),
+        COLOR_0=buffer.add(body.linear_rgb.astype(np.float32), pygltflib.ARRAY_BUFFER),
         JOINTS_0=buffer.add(carrier, pygltflib.ARRAY_BUFFER),
         WEIGHTS_0=buffer.add(weight, pygltflib.ARRAY_BUFFER),
     )

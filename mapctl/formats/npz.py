@@ -26,7 +26,8 @@ from torch import Tensor
 
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats.atomic import write_bytes
-from mapctl.formats.reading import MAX_FILE_BYTES, read_bytes
+from mapctl.formats.frame_rate import FASTEST, SLOWEST
+from mapctl.formats.reading import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, read_bytes, shorten
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -59,7 +60,7 @@ def load(path: str | PathLike[str]) -> Motion:
     try:
         return _motion(arrays)
     except (MapctlError, ZeroDivisionError, ValueError, IndexError) as error:
-        raise FileFormatError(path, f"does not hold a motion: {error}") from error
+        raise FileFormatError(path, f"does not hold a motion: {_reason(error)}") from error
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
@@ -97,10 +98,16 @@ def _motion(arrays: dict[str, np.ndarray]) -> Motion:
     if not set(end_names) <= set(names) or not set(moving) <= set(range(1, len(names))):
         raise MapctlError("end_names and moving_joints must be joints of the skeleton")
     ends = {name: (x, y, z) for name, (x, y, z) in zip(end_names, arrays["end_offsets"].tolist(), strict=True)}
+    skeleton = Skeleton(tuple(names), tuple(parents), _tensor(arrays["offsets"]), ends)
+    if len(set(end_names)) < len(end_names) or len(set(moving)) < len(moving):
+        raise MapctlError("end_names and moving_joints must name a joint once")
+    fps = Fraction(*arrays["fps"].tolist())
+    if not SLOWEST <= fps <= FASTEST:
+        raise MapctlError(f"{float(fps):g} frames per second, allowed are {SLOWEST:g} to {FASTEST:g}")
     tracks = zip(moving, arrays["moving_offsets"], strict=True)
     return Motion(
-        skeleton=Skeleton(tuple(names), tuple(parents), _tensor(arrays["offsets"]), ends),
-        fps=Fraction(*arrays["fps"].tolist()),
+        skeleton=skeleton,
+        fps=fps,
         root_position=_tensor(arrays["root_position_world"]),
         local_quat_xyzw=_tensor(arrays["local_quat_xyzw"]),
         moving_offsets={joint: _tensor(track) for joint, track in tracks},
@@ -109,16 +116,24 @@ def _motion(arrays: dict[str, np.ndarray]) -> Motion:
 
 def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
     """The known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
+    if not raw.startswith(b"PK\x03\x04"):
+        raise FileFormatError(path, "is not an .npz archive")
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             _check_members(path, archive)
             return {key: _read_array(archive, key) for key in _KEYS}
     except _UNSOUND as error:
-        raise FileFormatError(path, f"is not a sound .npz archive: {error}") from error
+        raise FileFormatError(path, f"is not a sound .npz archive: {_reason(error)}") from error
 
 
 def _read_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
     return np.lib.format.read_array(io.BytesIO(archive.read(f"{key}.npy")), allow_pickle=False)
+
+
+def _reason(error: Exception) -> str:
+    """In one short line: zipfile quotes pieces of the file, and a name may be a megabyte."""
+    text = " ".join(str(error).split())
+    return text if text.isprintable() and len(text) <= 200 else shorten(text, 160)
 
 
 def _check_members(path: str | PathLike[str], archive: zipfile.ZipFile) -> None:
@@ -138,9 +153,10 @@ def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> N
         if values.dtype.kind != kind or values.shape != wanted:
             found = f"{values.dtype} and shape {values.shape}"
             raise FileFormatError(path, f"{key} has {found}, expected kind {kind!r} and shape {wanted}")
-        if kind == "f" and not np.isfinite(values).all():
-            place = np.argwhere(~np.isfinite(values))[0].tolist()
-            raise FileFormatError(path, f"{key} is not finite at {place}")
+        # NaN compares as not small.
+        if kind == "f" and not (small := np.abs(values.astype(np.float64)) < LARGEST_VALUE).all():
+            place = np.argwhere(~small)[0].tolist()
+            raise FileFormatError(path, f"{key} at {place}: expected {NUMBER}")
 
 
 def _check_rotations(path: str | PathLike[str], quat_xyzw: np.ndarray) -> None:

@@ -1,5 +1,8 @@
-"""What every reader needs first: the bytes of an ordinary file, or one clear line why not."""
+"""What every reader needs first: the bytes of an ordinary file, its text and numbers, or one clear line why not."""
 
+import csv
+import io
+from math import isfinite
 from os import PathLike
 from pathlib import Path
 
@@ -7,6 +10,11 @@ from mapctl.errors import FileFormatError
 
 MAX_FILE_BYTES = 512 * 2**20
 """Largest file that is read; an hour of a 60-joint capture at 60 fps is about 350 MB of BVH."""
+MAX_POSES = 2**25
+"""Most frames times joints of one motion: a gigabyte of rotations. Joints without channels cost a file nothing."""
+LARGEST_VALUE = 1e8
+"""No length (file unit) or angle (degrees) of a capture comes near this, and squares stay exact."""
+NUMBER = f"a finite number below {LARGEST_VALUE:g}"
 
 
 def read_bytes(path: str | PathLike[str]) -> bytes:
@@ -33,3 +41,54 @@ def read_bytes(path: str | PathLike[str]) -> bytes:
 def shorten(word: str, limit: int = 40) -> str:
     """A quoted, printable, bounded form of a piece of a file, for error messages."""
     return ascii(word if len(word) <= limit else word[: limit - 3] + "...")
+
+
+def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, str]:
+    """Text with plain line feeds, and its encoding. Names in an old one-byte encoding are kept as latin-1.
+
+    `expected` is what a binary file was taken for, as "BVH text".
+    """
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise FileFormatError(path, "is UTF-16 text; save it as UTF-8", line=1)
+    if b"\0" in raw:
+        line = raw.count(b"\n", 0, raw.index(b"\0")) + 1
+        raise FileFormatError(path, f"is a binary file, expected {expected}", line)
+    try:
+        text, encoding = raw.decode("utf-8-sig"), "utf-8"
+    except UnicodeDecodeError:
+        text, encoding = raw.decode("latin-1"), "latin-1"
+    return text.replace("\r\n", "\n").replace("\r", "\n"), encoding
+
+
+def read_table(path: str | PathLike[str], expected: str) -> list[tuple[int, list[str]]]:
+    """The rows of a CSV that hold anything, each with its line, values without outer blanks.
+
+    `expected` says what the table should be, for messages. FileFormatError for what is no table of text.
+    """
+    text, encoding = decode(path, read_bytes(path), expected)
+    if encoding != "utf-8":
+        raise FileFormatError(path, f"is not a text file in UTF-8, expected {expected}")
+    table, rows = csv.reader(io.StringIO(text), strict=True), []
+    try:
+        for words in table:
+            if any(word.strip() for word in words):
+                rows.append((table.line_num, [word.strip() for word in words]))
+    except csv.Error as error:
+        raise FileFormatError(path, f"is no sound CSV ({error}), expected {expected}", table.line_num or 1) from None
+    return rows
+
+
+def check_extent(path: str | PathLike[str], frames: int, joints: int) -> None:
+    """FileFormatError where the rotations of so many frames and joints would fill the memory."""
+    if frames * joints > MAX_POSES:
+        raise FileFormatError(path, f"{frames} frames of {joints} joints, allowed are {MAX_POSES} in all")
+
+
+def finite_number(word: str) -> float | None:
+    """The number a word says, or None if it is none, not finite or absurd; `1_000` is none in a file."""
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    plain = word.isascii() and "_" not in word
+    return value if plain and isfinite(value) and abs(value) < LARGEST_VALUE else None

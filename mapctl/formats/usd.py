@@ -1,0 +1,154 @@
+"""USD out: skeleton and animation by UsdSkel, and the mannequin as a skinned mesh.
+
+Metres, Y up, one time code a frame from 0. Joints are paths, as UsdSkel wants (`hips/spine/chest`), of names that USD
+allows; `jointNames` holds the file's own. The ending says whether the file is text (.usda) or packed (.usdc, .usd).
+Needs the package usd-core: pip install 'mapctl[usd]'.
+"""
+
+# The package loads its modules at run time and declares no types.
+# pyright: reportAttributeAccessIssue=false
+
+import re
+from collections.abc import Sequence
+from importlib.util import find_spec
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapctl.errors import RequestError
+from mapctl.formats.atomic import atomic_path
+from mapctl.formats.bvh import all_translations, as_array, check_finite
+from mapctl.formats.skinned import SkinnedBody, skinned
+from mapctl.motion import Motion
+from mapctl.rotations import sign_continuous
+from mapctl.skeleton import Skeleton
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdSkel
+
+_ROOT = "/character"
+
+
+def is_installed() -> bool:
+    """Whether the package is here."""
+    return find_spec("pxr") is not None
+
+
+def check_installed(path: str | PathLike[str]) -> None:
+    """RequestError that names the extra if USD cannot be written here."""
+    if not is_installed():
+        raise RequestError(f"cannot write {path}: USD needs the package usd-core: pip install 'mapctl[usd]'")
+
+
+def save(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write the motion with its skinned mannequin. RequestError where it holds a NaN or USD is not installed."""
+    check_installed(path)
+    check_finite(motion, path)
+    stage = _stage(motion)
+    with atomic_path(path) as scratch:
+        if not stage.GetRootLayer().Export(str(scratch)):
+            raise RequestError(f"cannot write {path}: USD does not say why")
+
+
+def _stage(motion: Motion) -> "Usd.Stage":
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    stage, rate = Usd.Stage.CreateInMemory(), float(motion.fps)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(motion.num_frames - 1)
+    top = UsdSkel.Root.Define(stage, _ROOT)
+    stage.SetDefaultPrim(top.GetPrim())
+    body, joints = skinned(motion), joint_paths(motion.skeleton)
+    skeleton = _skeleton(stage, motion.skeleton, joints, body.rest)
+    animation = _animation(stage, motion, joints)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = _mesh(stage, body)
+    UsdSkel.BindingAPI.Apply(mesh).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    _extent(top, motion)
+    return stage
+
+
+def joint_paths(skeleton: Skeleton) -> list[str]:
+    """Each joint as USD names it: the names from the root on, of letters, digits and _, unique among siblings."""
+    found: list[str] = []
+    for name, parent in zip(skeleton.names, skeleton.parents, strict=True):
+        plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+        plain = f"_{plain}" if plain[0].isdigit() else plain
+        above = f"{found[parent]}/" if parent >= 0 else ""
+        again = (f"{plain}_{number}" for number in range(2, len(skeleton.names) + 2))
+        word = plain if f"{above}{plain}" not in found else next(w for w in again if f"{above}{w}" not in found)
+        found.append(above + word)
+    return found
+
+
+def _skeleton(stage: "Usd.Stage", skeleton: Skeleton, joints: Sequence[str], rest: np.ndarray) -> "UsdSkel.Skeleton":
+    from pxr import UsdSkel, Vt
+
+    made = UsdSkel.Skeleton.Define(stage, f"{_ROOT}/skeleton")
+    made.CreateJointsAttr(joints)
+    made.CreateJointNamesAttr(list(skeleton.names))
+    made.CreateBindTransformsAttr(Vt.Matrix4dArray.FromNumpy(_moves(rest)))
+    offsets = skeleton.offsets.numpy().copy()
+    offsets[0] = 0.0
+    made.CreateRestTransformsAttr(Vt.Matrix4dArray.FromNumpy(_moves(offsets)))
+    return made
+
+
+def _moves(places: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) matrices that only move; USD's vectors are rows, so the way is the last row."""
+    matrices = np.tile(np.eye(4), (len(places), 1, 1))
+    matrices[:, 3, :3] = places
+    return matrices
+
+
+def _animation(stage: "Usd.Stage", motion: Motion, joints: Sequence[str]) -> "UsdSkel.Animation":
+    from pxr import UsdSkel, Vt
+
+    made = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
+    made.CreateJointsAttr(joints)
+    made.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
+    places = all_translations(motion).astype(np.float32)
+    turns = as_array(sign_continuous(motion.local_quat_xyzw)).astype(np.float32)
+    moved, turned = made.CreateTranslationsAttr(), made.CreateRotationsAttr()
+    if not motion.moving_offsets and (places[:, 0] == places[0, 0]).all():
+        moved.Set(Vt.Vec3fArray.FromNumpy(places[0]))
+    else:
+        for frame, values in enumerate(places):
+            moved.Set(Vt.Vec3fArray.FromNumpy(values), frame)
+    for frame, values in enumerate(turns):
+        turned.Set(Vt.QuatfArray.FromNumpy(values), frame)  # from imaginary parts and then the real one, as ours
+    return made
+
+
+def _mesh(stage: "Usd.Stage", body: SkinnedBody):
+    from pxr import Gf, UsdGeom, UsdSkel, Vt
+
+    made = UsdGeom.Mesh.Define(stage, f"{_ROOT}/mannequin")
+    made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
+    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
+    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
+    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(body.normals.astype(np.float32)))
+    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    made.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
+    colour = made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    colour.Set(Vt.Vec3fArray.FromNumpy(body.linear_rgb.astype(np.float32)))
+    binding = UsdSkel.BindingAPI.Apply(made.GetPrim())
+    binding.CreateJointIndicesPrimvar(False, 1).Set(Vt.IntArray.FromNumpy(body.joint.astype(np.int32)))
+    binding.CreateJointWeightsPrimvar(False, 1).Set(Vt.FloatArray.FromNumpy(np.ones(len(body.joint), np.float32)))
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    return made.GetPrim()
+
+
+def _extent(top: "UsdSkel.Root", motion: Motion) -> None:
+    """The box of the whole way, an arm's length around the joints; viewers frame the character by it."""
+    from pxr import Gf
+
+    places = as_array(motion.joint_positions()).reshape(-1, 3)
+    corners = places.min(0) - 0.3, places.max(0) + 0.3
+    top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])

@@ -1,0 +1,292 @@
+"""ASF and AMC in: bones where the definition puts them; files found, units and rates told, faults named by line."""
+
+from dataclasses import replace
+from fractions import Fraction
+from itertools import permutations
+
+import numpy as np
+import pytest
+from acclaim import fixed, pair
+
+import mapctl
+from mapctl.errors import FileFormatError, RequestError
+
+
+def ends_of(motion):
+    """Where the End Sites are, (frames, 3) by joint name."""
+    from mapctl import rotations
+
+    places, turns = motion.joint_positions(), motion.joint_rotations()
+    return {
+        name: (places[:, j] + rotations.rotate(turns[:, j], places.new_tensor(site).expand(len(places), 3))).numpy()
+        for name, site in motion.skeleton.end_offsets.items()
+        for j in [motion.skeleton.index(name)]
+    }
+
+
+def assert_same_places(motion, told):
+    """Joints at the bones' starts, End Sites at the last bones' ends."""
+    starts, ends = told.places()
+    places = motion.joint_positions().numpy()
+    assert set(motion.skeleton.names) == set(starts)
+    for joint, name in enumerate(motion.skeleton.names):
+        np.testing.assert_allclose(places[:, joint], starts[name], atol=1e-9, err_msg=name)
+    leaves = {bone.name for bone in told.bones} - {bone.parent for bone in told.bones}
+    assert set(motion.skeleton.end_offsets) == leaves
+    for name, place in ends_of(motion).items():
+        np.testing.assert_allclose(place, ends[name], atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("degrees", [True, False])
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_bones_are_where_the_definition_puts_them(tmp_path, seed, degrees, missing):
+    turned = {"orientation": np.array([20.0, -30, 40]), "position": np.array([1.0, 2, 3])} if seed % 2 else {}
+    told = pair(seed=seed, degrees=degrees, missing=missing, **turned)
+    assert_same_places(mapctl.load(told.write(tmp_path)), told)
+
+
+def test_the_tests_own_turns_are_about_fixed_axes():
+    """A quarter about x takes y to z; then one about y takes z to x."""
+    for order in permutations("xyz"):
+        np.testing.assert_allclose(fixed(np.array([0.0, 0, 90]), "".join(order)) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(fixed(np.array([90.0, 90, 0]), "xyz") @ [0, 1, 0], [1, 0, 0], atol=1e-12)
+
+
+def test_the_rest_pose_is_a_person_with_joint_frames_as_the_world(tmp_path):
+    told = pair(1)
+    still = {name: values * 0 for name, values in told.frames[0].items()}
+    motion = mapctl.load(replace(told, frames=(still,)).write(tmp_path))
+    names, places = motion.skeleton.names, motion.joint_positions()[0].numpy()
+    assert names[0] == "root"
+    np.testing.assert_allclose(motion.joint_rotations()[0].numpy(), np.tile([0, 0, 0, 1], (len(names), 1)), atol=1e-12)
+    tall = places[names.index("head"), 1] - places[names.index("ltoes"), 1]
+    assert 1.2 < tall < 1.8
+    assert places[names.index("lhand"), 0] > 0.5
+
+
+@pytest.mark.parametrize("ending", [".bvh", ".npz"])
+def test_written_elsewhere_and_read_back_joints_are_in_the_same_places(tmp_path, ending):
+    motion = mapctl.load(pair(9, seed=3).write(tmp_path))
+    motion.save(tmp_path / f"again{ending}")
+    again = mapctl.load(tmp_path / f"again{ending}")
+    assert (again.fps, again.skeleton.names) == (motion.fps, motion.skeleton.names)
+    np.testing.assert_allclose(again.joint_positions(), motion.joint_positions(), atol=2e-6)
+    for name, place in ends_of(again).items():
+        np.testing.assert_allclose(place, ends_of(motion)[name], atol=2e-6)
+
+
+def test_bones_that_a_take_never_names_rest(tmp_path):
+    told = pair(3, seed=5)
+    frames = tuple({name: v for name, v in frame.items() if name != "head"} for frame in told.frames)
+    told = replace(told, frames=frames)
+    assert told.full
+    assert_same_places(mapctl.load(told.write(tmp_path)), told)
+
+
+def test_the_rate_is_120_unless_the_file_or_the_caller_says(tmp_path):
+    path = pair(2).write(tmp_path)
+    assert mapctl.load(path).fps == 120
+    assert mapctl.load(path, fps=60).fps == 60
+    assert mapctl.load(path, fps=Fraction(30000, 1001)).fps == Fraction(30000, 1001)
+    path.write_text(path.read_text().replace(":DEGREES", ":DEGREES\n:SAMPLES-PER-SECOND 59.94"))
+    assert mapctl.load(path).fps == Fraction(2997, 50)
+    assert mapctl.load(path, fps=30).fps == 30
+    for wrong in (0, -1, 1e9, float("nan")):
+        with pytest.raises(RequestError, match="frame rate"):
+            mapctl.load(path, fps=wrong)
+    with pytest.raises(RequestError, match=r"a \.bvh file says its frame rate itself"):
+        mapctl.load("walk.bvh", fps=30)
+
+
+@pytest.mark.parametrize(("length", "scale"), [(0.45, 1.0), (1.0, 1.0), (2.54, 0.45 / 2.54)])
+def test_lengths_are_told_by_the_file_or_else_by_the_body(tmp_path, length, scale):
+    """`length 1` says nothing: the leg is of a person in the CMU unit, so that it is."""
+    told = pair(1)
+    usual = mapctl.load(told.write(tmp_path)).skeleton.offsets
+    other = mapctl.load(replace(told, length=length).write(tmp_path)).skeleton.offsets
+    np.testing.assert_allclose(other, usual * scale, rtol=1e-4)
+
+
+def test_angles_are_in_the_unit_of_the_take_else_of_the_skeleton(tmp_path):
+    told = pair(2, degrees=False)
+    path = told.write(tmp_path)
+    path.write_text(path.read_text().replace(":RADIANS\n", ""))
+    assert_same_places(mapctl.load(path), told)
+
+
+def test_files_are_read_whatever_their_blanks_case_and_line_ends(tmp_path):
+    told = pair(2)
+    path = told.write(tmp_path)
+    plain = mapctl.load(path).joint_positions()
+    for file in (path, path.with_suffix(".asf")):
+        text = file.read_text().replace("begin", "BEGIN").replace("direction ", "direction\t").replace(":root", ":ROOT")
+        text = (
+            text.replace("lfemur", "LFemur")
+            if file == path
+            else text.replace(" length 0.45", " length (0.45), (a unit)")
+        )
+        file.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    np.testing.assert_array_equal(mapctl.load(path).joint_positions(), plain)
+
+
+class TestFinding:
+    """The skeleton of a take."""
+
+    def test_of_the_same_stem_before_others(self, tmp_path):
+        path = pair(1).write(tmp_path)
+        (tmp_path / "other.asf").write_text("junk")
+        assert mapctl.load(path).num_frames == 1
+
+    def test_the_only_one_beside_it(self, tmp_path):
+        assert mapctl.load(pair(1).write(tmp_path, subject="01", take="01_02")).num_frames == 1
+
+    def test_by_name(self, tmp_path, monkeypatch):
+        pair(1).write(tmp_path, subject="01", take="01_02")
+        (tmp_path / "02.asf").write_text("junk")
+        assert mapctl.load(f"{tmp_path}/01.asf+01_02.amc").num_frames == 1
+        assert mapctl.load(f"{tmp_path}/01.asf+{tmp_path}/01_02.amc").num_frames == 1
+        monkeypatch.chdir(tmp_path)
+        assert mapctl.load("01.asf+01_02.amc").num_frames == 1
+        with pytest.raises(FileFormatError, match=r"03\.asf: no such file"):
+            mapctl.load("03.asf+01_02.amc")
+        with pytest.raises(FileFormatError, match=r"01_03\.amc: no such file"):
+            mapctl.load("01.asf+01_03.amc")
+
+    def test_two_files_of_one_stem(self, tmp_path):
+        pair(1).write(tmp_path)
+        (tmp_path / "other.asf").write_text("junk")
+        assert mapctl.load(tmp_path / "walk.asf+.amc").num_frames == 1
+
+    def test_several_are_named(self, tmp_path):
+        path = pair(1).write(tmp_path, subject="01", take="01_02")
+        (tmp_path / "02.asf").write_text("junk")
+        with pytest.raises(FileFormatError, match=r"beside it: 01\.asf, 02\.asf; name one as 01\.asf\+01_02\.amc"):
+            mapctl.load(path)
+
+    def test_none_is_said(self, tmp_path):
+        path = pair(1).write(tmp_path)
+        path.with_suffix(".asf").unlink()
+        with pytest.raises(FileFormatError, match=r"beside it: none; name one as subject\.asf\+walk\.amc"):
+            mapctl.load(path)
+
+    def test_a_take_that_is_not_there_is_said_to_be_so(self, tmp_path):
+        pair(1).write(tmp_path)
+        with pytest.raises(FileFormatError, match=r"gone\.amc: no such file"):
+            mapctl.load(tmp_path / "gone.amc")
+
+    @pytest.mark.parametrize("name", [f"{'x' * 300}.amc", f"{'x' * 300}.asf+x.amc", f"a.asf+{'x' * 300}.amc"])
+    def test_a_name_that_cannot_be_is_said_to_be_so(self, tmp_path, name):
+        (tmp_path / "a.asf").write_text(pair(1).asf())
+        with pytest.raises(FileFormatError, match="name too long"):
+            mapctl.load(tmp_path / name)
+
+    def test_a_skeleton_alone_is_no_motion(self, tmp_path):
+        with pytest.raises(FileFormatError, match=r"is a skeleton alone: name its motion"):
+            mapctl.load(pair(1).write(tmp_path).with_suffix(".asf"))
+
+
+# What is put in place of what in which file, a text on the line that the message names, words it must hold.
+ASF = {
+    "no section": (":version", "version", "version 1.10", "expected a section as :version"),
+    "unknown section": (":name", ":nom", ":nom", "unknown section ':nom'"),
+    "section twice": (":name", ":version 1\n:name", ":version 1\n", "a second section :version"),
+    "length word": ("length 0.45", "length short", "length short", "expected for length 1 of a finite number"),
+    "length zero": ("length 0.45", "length 0", "length 0", "length unit from 0.001 to 1000"),
+    "angle": ("angle deg", "angle grad", "angle grad", "'angle deg' or 'angle rad'"),
+    "unit": ("mass 1.0", "weight 1.0", "weight", "mass, length or angle"),
+    "root order": ("order TX", "order TW", "order TW", "each at most once"),
+    "root order twice": ("order TX TY", "order TX TX", "order TX TX", "each at most once"),
+    "root axis": ("axis ZXY", "axis ZXX", "axis ZXX", "axis order as XYZ"),
+    "root position": ("position 0.0 0.0", "position 0.0", "position", "expected for position 3 of"),
+    "root word": ("orientation", "orient", "orient", "order, axis, position and orientation once each"),
+    "no begin": ("  begin\n     id 1\n", "  start\n     id 1\n", "  start", "expected begin"),
+    "no end": ("  end\n  begin\n     id 2", "  begin\n     id 2", "begin\n     id 2", "expected name, direction"),
+    "no name": ("     name head\n", "", "  end\n  begin\n     id 4", "has no name"),
+    "two names": ("name head", "name head two", "name head two", "expected one name"),
+    "no direction": ("head\n     direction", "head\n     cofmass", "  end\n  begin\n     id 4", "no direction"),
+    "short direction": ("direction 0.0 ", "direction ", "direction 0", "expected for direction 3"),
+    "nan direction": ("direction 0.0 ", "direction nan ", "direction nan", "expected for direction 3"),
+    "long direction": ("direction 1.0", "direction 2.0", "direction 2.0", "direction of length 1, got one of 2"),
+    "negative length": ("length 3.5", "length -3.5", "length -3.5", "expected a length of 0 or more"),
+    "axis without order": (" XYZ\n", "\n", None, "three angles and an order"),
+    "axis order": (" XYZ\n", " XYW\n", "XYW", "axis order as XYZ"),
+    "translation": ("dof rz ry rx", "dof tz ry rx", "dof tz", "expected of rx ry rz"),
+    "turn twice": ("dof rz ry rx", "dof rz rz rx", "dof rz rz", "each at most once"),
+    "unknown word": ("     id 3\n", "     colour red\n", "colour", "expected name, direction"),
+    "same name": ("name head", "name thorax", "begin\n     id 3", "a second bone named 'thorax'"),
+    "named root": ("name head", "name root", "begin\n     id 3", "a second bone named 'root'"),
+    "unknown child": ("    root lowerback", "    root back lowerback", "root back", "no bone 'back'"),
+    "child twice": ("thorax head", "thorax head head", "thorax head head", "'head' has a second parent"),
+    "root as child": ("thorax head", "thorax head root", "thorax head root", "'root' has a second parent"),
+    "loose bone": ("thorax head", "thorax", "begin\n     id 3", "'head' does not hang on the root"),
+    "loop": ("    root lowerback", "    thorax lowerback\n    root", "begin\n     id 1\n", "'lowerback' does not hang"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ASF)
+def test_a_broken_skeleton_is_refused_with_its_place(case, tmp_path):
+    old, new, place, words = ASF[case]
+    path = pair(2, seed=7).write(tmp_path)
+    asf = path.with_suffix(".asf")
+    assert old in asf.read_text()
+    text = asf.read_text().replace(old, new, 1)
+    asf.write_text(text)
+    with pytest.raises(FileFormatError, match=words) as caught:
+        mapctl.load(path)
+    if place is not None:
+        assert caught.value.line == text.count("\n", 0, text.index(place)) + 1
+    assert str(caught.value).startswith(f"{asf}, line {caught.value.line}: ")
+
+
+@pytest.mark.parametrize("section", [":root", ":bonedata", ":hierarchy"])
+def test_a_cut_skeleton_is_refused(section, tmp_path):
+    path = pair(1).write(tmp_path)
+    asf = path.with_suffix(".asf")
+    text = asf.read_text()
+    asf.write_text(text[: text.index(section)])
+    with pytest.raises(FileFormatError, match=f"has no section {section}") as caught:
+        mapctl.load(path)
+    assert caught.value.line
+
+
+AMC = {
+    "bone unknown": ("head", "haed", 5, "the skeleton has no bone 'haed'"),
+    "value missing": ("lowerback ", "lowerback #", 6, "lowerback' has 0 values, expected 3"),
+    "value too many": ("lowerback ", "lowerback 1 ", 6, "lowerback' has 4 values, expected 3"),
+    "nan": ("lowerback ", "lowerback nan 1 1 #", 6, "'lowerback' rx: expected a finite number"),
+    "absurd": ("lowerback ", "lowerback 1 1e300 1 #", 6, "'lowerback' ry: expected a finite number"),
+    "bone twice": ("lowerback", "root 0 0 0 0 0 0\nlowerback", 6, "a second line for 'root' in frame 1"),
+    "frame missing": ("\n2\n", "\n3\n", 27, "expected frame 2 after frame 1, got '3'"),
+    "frame twice": ("\n2\n", "\n1\n", 27, "expected frame 2 after frame 1, got '1'"),
+    "frame endless": ("\n2\n", f"\n{'9' * 99}\n", 27, "expected frame 2 after frame 1"),
+    "no number": ("\n1\n", "\n", 4, "expected the number of the first frame, got 'root'"),
+    "keyword": (":DEGREES", ":GRADES", 3, "expected one of :fully-specified"),
+    "late keyword": ("\n2\n", "\n:DEGREES\n2\n", 27, "expected a frame's number or a bone, got ':DEGREES'"),
+    "two units": (":DEGREES", ":DEGREES\n:RADIANS", 4, "a second word on the unit of angles"),
+    "rate": (":DEGREES", ":DEGREES\n:SAMPLES-PER-SECOND 0", 4, "samples a second, got '0'"),
+    "rate missing": (":DEGREES", ":DEGREES\n:SAMPLES-PER-SECOND", 4, "samples a second"),
+    "bone left out": ("\nhead", "\n#", 27, "not every frame up to 2 holds 'head'"),
+    "root left out": ("\nroot", "\n#", 4, "frame 1 has no line for the root"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", AMC)
+def test_a_broken_take_is_refused_with_its_place(case, tmp_path):
+    old, new, line, words = AMC[case]
+    path = pair(3, seed=7).write(tmp_path)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(FileFormatError, match=words) as caught:
+        mapctl.load(path)
+    assert str(caught.value).startswith(f"{path}, line ")
+    if case != "bone unknown":
+        assert caught.value.line == line, str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["#!OML\n:FULLY-SPECIFIED\n:DEGREES\n", "# nothing\n"])
+def test_a_take_without_frames_is_refused(text, tmp_path):
+    path = pair(1).write(tmp_path)
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match="holds no frame"):
+        mapctl.load(path)

@@ -1,0 +1,135 @@
+"""`mapctl convert` between all formats, as a user types it, and what docs/formats.md says of them."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from acclaim import pair
+from helpers import walk
+
+import mapctl
+from mapctl import cli, formats
+from mapctl.formats import npz, usd
+
+DOCS = (Path(__file__).parent.parent / "docs" / "formats.md").read_text("utf-8")
+needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
+OUT = [pytest.param(ending, marks=needs_usd if ending.startswith(".usd") else ()) for ending in formats.WRITERS]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with a walk in every format that is read."""
+    monkeypatch.chdir(tmp_path)
+    motion = walk(6)
+    motion.save("in.bvh")
+    motion.save("in.npz")
+    pair(6).write(tmp_path, subject="01", take="in")
+    return tmp_path
+
+
+def run(*words):
+    return cli.main([*map(str, words)])
+
+
+@pytest.mark.parametrize("source", formats.READERS)
+@pytest.mark.parametrize("ending", OUT)
+def test_any_format_to_any_format(here, capsys, source, ending):
+    assert run("convert", f"in{source}", f"out{ending}") == 0
+    told = capsys.readouterr()
+    motion = mapctl.load(f"in{source}")
+    assert told.err == ""
+    assert told.out.startswith(
+        f"out{ending}: 6 frames, {motion.num_joints} joints, {float(motion.fps):g} frames a second"
+    )
+    if ending in formats.READERS:
+        again = mapctl.load(f"out{ending}")
+        where = [again.skeleton.index(name) for name in motion.skeleton.names]  # BVH nests depth first
+        np.testing.assert_allclose(again.joint_positions()[:, where], motion.joint_positions(), atol=2e-6)
+    assert Path(f"out{ending}").stat().st_size > 1000
+
+
+def test_a_capture_says_its_rate_on_the_command_line(here):
+    assert run("convert", "01.asf+in.amc", "out.npz", "--fps-in", "60", "--fps", "30") == 0
+    motion = mapctl.load("out.npz")
+    assert (motion.fps, motion.num_frames) == (30, 3)
+    np.testing.assert_allclose(motion.joint_positions(), mapctl.load("in.amc").joint_positions()[::2], atol=1e-9)
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (("gone.amc", "out.bvh"), "gone.amc: no such file"),
+    (("gone.asf+in.amc", "out.bvh"), "gone.asf: no such file"),
+    (("01.asf", "out.bvh"), "01.asf: is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"),
+    (("in.glb", "out.bvh"), "in.glb: can be written but not read; allowed: .bvh, .npz, .amc"),
+    (("in.usda", "out.bvh"), "can be written but not read"),
+    (("in.fbx", "out.bvh"), "cannot read the ending '.fbx'; allowed: .bvh, .npz, .amc"),
+    (("in", "out.bvh"), "cannot read the ending ''"),
+    (("in.bvh", "out.amc"), "cannot write out.amc: unknown ending '.amc'; allowed: .bvh, .npz, .glb, .usda"),
+    (("in.bvh", "out.npz", "--fps-in", "60"), "a .bvh file says its frame rate itself"),
+    (("in.amc", "out.npz", "--fps-in", "none"), "a frame rate is a number"),
+    (("in.amc", "out.npz", "--fps-in", "0"), "the frame rate must be 0.01 to 1000"),
+    (("broken.amc", "out.npz"), "broken.amc, line 1: expected the number of the first frame, got 'hello'"),
+    (("two/in.amc", "out.npz"), "beside it: 01.asf, 02.asf; name one as 01.asf+in.amc"),
+    (("objects.npz", "out.bvh"), "objects.npz: is not a sound .npz archive: Object arrays cannot be loaded"),
+    (("in.bvh", "gone/out.usda"), "the folder"),
+])  # fmt: skip
+def test_what_cannot_be_is_said_in_one_line_and_nothing_is_written(here, capsys, words, said):
+    Path("broken.amc").write_text("hello\n")
+    Path("two").mkdir()
+    for name in ("01.asf", "02.asf", "in.amc"):
+        Path("two", name).write_text("x")
+    np.savez("objects.npz", **{**npz._arrays(walk(2)), "names": np.array([{}] * 21)})
+    before = sorted(here.rglob("*"))
+    assert run("convert", *words) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert (told.out, told.err.count("\n"), told.err[:8]) == ("", 1, "mapctl: ")
+    assert sorted(here.rglob("*")) == before
+
+
+def test_a_missing_package_is_named(here, capsys, monkeypatch):
+    monkeypatch.setattr(usd, "is_installed", lambda: False)
+    assert run("convert", "gone.bvh", "out.usda") == 2
+    assert "cannot write out.usda: USD needs the package usd-core: pip install 'mapctl[usd]'" in capsys.readouterr().err
+
+
+def test_as_installed(here):
+    done = subprocess.run([sys.executable, "-m", "mapctl.cli", "convert", "in.amc", "out.bvh"],
+                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert mapctl.load("out.bvh").num_frames == 6
+
+
+def test_help_names_every_format(capsys):
+    with pytest.raises(SystemExit):
+        run("convert", "--help")
+    told = capsys.readouterr().out
+    assert all(ending in told for ending in (*formats.READERS, *formats.WRITERS, ".asf"))
+
+
+def test_the_page_names_every_format_and_key():
+    rows = dict(re.findall(r"^\| (`\.[^|]*) \| (yes|no) \| ", DOCS, re.MULTILINE))
+    read = {ending for cell, yes in rows.items() if yes == "yes" for ending in re.findall(r"`(\.\w+)`", cell)}
+    assert read - {".asf"} == set(formats.READERS)
+    written = {e for cell, yes in re.findall(r"^\| (`\.[^|]*) \| \w+ \| (yes|no)", DOCS, re.MULTILINE) if yes == "yes"
+               for e in re.findall(r"`(\.\w+)`", cell)}  # fmt: skip
+    assert written == set(formats.WRITERS)
+    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(npz._arrays(walk(2)))
+
+
+def test_commands_of_the_page_are_understood():
+    lines = [line.split("#")[0] for line in DOCS.splitlines() if line.startswith("mapctl ")]
+    assert len(lines) == 5
+    for line in lines:
+        assert cli.parse(shlex.split(line)[1:]) is not None
+
+
+def test_the_pages_example_turns_the_walk(here):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)
+    Path("in.npz").rename("walk.npz")
+    exec(compile(code, "formats.md", "exec"), {})
+    before, after = (mapctl.load(name).joint_positions().numpy() for name in ("walk.npz", "turned.npz"))
+    np.testing.assert_allclose(after, before * (-1, 1, -1), atol=1e-12)
