@@ -21,12 +21,16 @@ WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
 }  # fmt: skip
 
 
-def load(path: str | PathLike[str]) -> Motion:
-    """Read a motion from a .bvh or .npz file. FileFormatError says what is wrong with the file, and where."""
+def load(path: str | PathLike[str], *, metres_per_unit: float | None = None) -> Motion:
+    """Read a motion from a .bvh or .npz file. FileFormatError says what is wrong with the file, and where.
+
+    `metres_per_unit` wins over what is found by the size of the body, in formats whose unit is not fixed.
+    """
     ending = PurePath(path).suffix.lower()
     if ending not in READERS:
         raise FileFormatError(path, f"cannot read the ending {ending!r}; allowed: {', '.join(READERS)}")
-    return READERS[ending](path)
+    motion = READERS[ending](path)
+    return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit)
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

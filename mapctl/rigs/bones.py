@@ -31,16 +31,17 @@ def measure(
             turn.append(tpose[canonical_of[joint]])
         else:
             turn.append(rotations.multiply(turn[parent], idle[joint]) if parent >= 0 else idle[joint])
-    ends = {skeleton.index(name): place[skeleton.index(name)] + rotations.rotate(
-        turn[skeleton.index(name)], torch.tensor(site, dtype=torch.float64))
-        for name, site in skeleton.end_offsets.items()}  # fmt: skip
+    ends = {}
+    for name, site in skeleton.end_offsets.items():
+        joint = skeleton.index(name)
+        ends[joint] = rotations.rotate(turn[joint], torch.tensor(site, dtype=torch.float64))
     known = {c: place[joint] for c, joint in enumerate(joint_of) if joint is not None}
     spots: list[Tensor] = []
     for c in range(CANONICAL.num_joints):
         spots.append(known[c] if c in known else _put(c, joint_of, spots, known, ends))
     places = torch.stack(spots)
     offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
-    tips = {CANONICAL.names[c]: _triple(ends[j] - place[j]) for c, j in enumerate(joint_of)
+    tips = {CANONICAL.names[c]: _triple(ends[j]) for c, j in enumerate(joint_of)
             if j is not None and j in ends and not CANONICAL.children(c)}  # fmt: skip
     return Skeleton(CANONICAL.names, CANONICAL.parents, offsets, tips)
 
@@ -52,7 +53,7 @@ def _put(
     name, parent = CANONICAL.names[c], CANONICAL.parents[c]
     above, own = joint_of[parent], float(CANONICAL.offsets[c].norm())
     if name.endswith(_END_SITES) and above is not None and above in ends:
-        return ends[above]
+        return spots[parent] + ends[above]
     length, following = own, next_of(name)
     while following is not None:
         length += float(CANONICAL.offsets[CANONICAL.index(following)].norm())
