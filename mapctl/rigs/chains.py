@@ -1,13 +1,17 @@
 """Which joint is which by the tree alone: legs and a trunk hang from the hips, arms and a head from the trunk."""
 
 from collections.abc import Mapping
+from itertools import product
 
 import torch
 
 from mapctl.skeleton import Skeleton
 
-_ALIKE = 1.2  # ratio of the reaches of two limbs of one pair
-_SHARE = 0.35  # of the body's reach, below which a branch is no limb
+_ALIKE = 1.2  # ratio of the lengths of two bones of one pair
+_SHARE = 0.25  # of the reach of the joint that they hang from, below which two branches are no limbs
+
+Ways = tuple[list[int], list[int]]
+"""The joints of the two limbs of a pair, side by side, from the body outward."""
 
 
 def find(skeleton: Skeleton) -> Mapping[str, int]:
@@ -18,7 +22,7 @@ def find(skeleton: Skeleton) -> Mapping[str, int]:
     tree = _Tree(skeleton)
     for hips in range(skeleton.num_joints):
         for legs in tree.pairs(hips):
-            others = [child for child in tree.children[hips] if child not in legs]
+            others = [child for child in tree.children[hips] if child not in (legs[0][0], legs[1][0])]
             for trunk in sorted(others, key=lambda child: -tree.reach[child]):
                 for chest in tree.below(trunk):
                     arms = tree.pairs(chest)
@@ -27,7 +31,7 @@ def find(skeleton: Skeleton) -> Mapping[str, int]:
     return {}
 
 
-def _body(tree: "_Tree", hips: int, legs: tuple[int, int], chest: int, arms: tuple[int, int]) -> Mapping[str, int]:
+def _body(tree: "_Tree", hips: int, legs: Ways, chest: int, arms: Ways) -> Mapping[str, int]:
     found = {"hips": hips}
     for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
         found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
@@ -37,7 +41,7 @@ def _body(tree: "_Tree", hips: int, legs: tuple[int, int], chest: int, arms: tup
         found["spine"] = trunk[0]
     if len(trunk) > 1:
         found["chest"] = trunk[-1]
-    others = [child for child in tree.children[chest] if child not in arms]
+    others = [child for child in tree.children[chest] if child not in (arms[0][0], arms[1][0])]
     if others:
         up = tree.chain(max(others, key=lambda child: tree.reach[child]))
         found |= {"head": up[0]} if len(up) == 1 else {"neck": up[0], "head": up[1]}
@@ -57,17 +61,33 @@ class _Tree:
             below = [self.length[child] + self.reach[child] for child in self.children[joint]]
             self.reach[joint] = max([ends.get(joint, 0.0), *below])
 
-    def pairs(self, joint: int) -> list[tuple[int, int]]:
-        """Children that are two limbs of one pair: of at least two bones, and of about the same length."""
-        least = _SHARE * max(self.reach)
-        limbs = [c for c in self.children[joint] if self.reach[c] >= least and len(self.chain(c)) >= 3]
-        alike = []
-        for k, first in enumerate(limbs):
-            for second in limbs[k + 1 :]:
-                far = sorted((self.reach[first], self.reach[second]))
-                if far[1] <= _ALIKE * far[0]:
-                    alike.append((far[1] / far[0], (first, second)))
-        return [pair for _, pair in sorted(alike)]
+    def pairs(self, joint: int) -> list[Ways]:
+        """Branches that are two limbs of one pair, bone for bone of about the same length; the longest pair first."""
+        found = []
+        for k, first in enumerate(self.children[joint]):
+            for second in self.children[joint][k + 1 :]:
+                ways = self.side_by_side(first, second)
+                long = sum(self.length[joint] for joint in ways[0][1:])
+                if len(ways[0]) >= 3 and long >= _SHARE * self.reach[joint] and self.alike(first, second):
+                    found.append((-long, ways))
+        return [ways for _, ways in sorted(found)]
+
+    def side_by_side(self, first: int, second: int) -> Ways:
+        """Down two branches as long as they are alike; a sword in one hand is not."""
+        ways = [first], [second]
+        while True:
+            ends = product(self.children[ways[0][-1]], self.children[ways[1][-1]])
+            steps = [step for step in ends if self.alike(*step)]
+            if not steps:
+                return ways
+            best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
+            for way, joint in zip(ways, best, strict=True):
+                way.append(joint)
+
+    def alike(self, first: int, second: int) -> bool:
+        """Whether two bones are of about the same length."""
+        short, long = sorted((self.length[first], self.length[second]))
+        return long <= _ALIKE * short + 1e-6
 
     def chain(self, joint: int) -> list[int]:
         """The joints from this one to the farthest leaf."""
@@ -91,9 +111,8 @@ class _Tree:
             joint = self.parents[joint]
         return way[::-1]
 
-    def limb(self, joint: int, names: list[str]) -> dict[str, int]:
-        """Names of a limb's joints, the second and third of which begin its two longest bones; '' names none."""
-        way = self.chain(joint)
+    def limb(self, way: list[int], names: list[str]) -> dict[str, int]:
+        """Names of a limb's joints, the second and third of which begin its two longest bones; a bare side names none."""
         both = [self.length[way[k + 1]] + self.length[way[k + 2]] for k in range(len(way) - 2)]
         upper = max(range(len(both)), key=both.__getitem__)
         placed = {name: upper + k - 1 for k, name in enumerate(names)}

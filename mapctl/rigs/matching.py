@@ -72,7 +72,8 @@ def with_sides_checked(found: Match, skeleton: Skeleton, motion: Motion | None) 
         return found
     partner = [CANONICAL.index(mirrored_name(name)) for name in CANONICAL.names]
     joint_of = tuple(found.joint_of[other] for other in partner)
-    return replace(found, joint_of=joint_of, score=found.score * _SWAPPED, sides_exchanged=True)
+    named = any(r.side is not Side.MIDDLE for j, r in enumerate(roles(skeleton)) if j in found.joint_of)
+    return replace(found, joint_of=joint_of, score=found.score * (_SWAPPED if named else 1.0), sides_exchanged=named)
 
 
 def _given(rig: Rig, skeleton: Skeleton) -> dict[str, int]:

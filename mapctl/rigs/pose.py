@@ -15,7 +15,6 @@ SAMPLES = 200
 """Frames of a clip that are looked at, spread over it."""
 _STANDING = 0.8  # cosine between an axis and the body that stands along it
 _CLEAR = 0.3  # of the triple product left x up x toes, below which toes do not tell the facing
-_AGREED = 0.8  # share of frames that must say the same
 
 JointOf = Sequence[int | None]
 """For each canonical joint the rig's joint, or None."""
@@ -122,9 +121,7 @@ def swapped(zero: Poses, clip: Poses | None) -> bool:
     rest = float(zero.handedness()[0])
     if abs(rest) > _CLEAR:
         return rest < 0
-    if clip is None:
-        return False
-    return float((clip.handedness() < -_CLEAR).double().mean()) > _AGREED
+    return clip is not None and float(clip.handedness().median()) < -_CLEAR
 
 
 def up_axis(zero: Poses, clip: Poses | None) -> str:

@@ -21,7 +21,9 @@ _SNAP = math.radians(20)  # a rest pose this near an axis stands and faces along
 _OFF = math.radians(40)  # trunk and shoulders keep their own shape up to here
 _LEVEL, _HANGING = math.radians(25), math.radians(100)  # of arms: T-pose up to the first, A-pose up to the second
 _STRAIGHT = math.radians(35)  # of legs in a rest pose that somebody stands in
-_BENT, _TWISTED = 0.2, math.radians(45)  # mean bend (radians) that tells a hinge, and its error that is put right
+_EXACT = math.radians(15)  # of arms and legs in a frame that is a T-pose and not a moment of a dance
+_BENT, _TWISTED = 0.2, math.radians(60)  # mean bend (radians) that tells a hinge, and the twist that is put right
+_QUARTER = math.pi / 2  # rigs are built in quarter turns
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -55,13 +57,13 @@ def find(zero: Poses, clip: Poses | None, *, rig: Rig) -> TPose:
     if clip is not None and rig.rest in ("auto", "frame0"):
         first = clip.first()
         turned = _standing(first, vector(up))
-        if rig.rest == "frame0" or (rest == "neither" and kind(first, turned) != "neither"):
+        if rig.rest == "frame0" or (rest == "neither" and is_tpose(first, turned)):
             base, front, found = first, turned, "frame 0"
     stands = kind(base, front) != "neither"
-    quats = _laid(base, front, stands, pitch=None if stands else _pitch(clip, upright), twists={})
-    if clip is not None and not stands:
-        twists = _twists(clip, quats, upright)
-        quats = _laid(base, front, stands, pitch=_pitch(clip, upright), twists=twists) if twists else quats
+    if clip is None or stands:
+        quats = _laid(base, front, stands, pitch=None, twists={})
+    else:
+        quats = _untwisted(base, front, clip, upright)
     return TPose(quats, _idle(base), upright, up, named_axis(_front(zero, facing)[2]), rest, found)
 
 
@@ -85,6 +87,16 @@ def kind(poses: Poses, front: Float[Tensor, "3 3"]) -> str:
 def upright_of(up: str) -> Float[Tensor, "4"] | None:
     """The rotation that turns a world so that Y is up; None where it is."""
     return None if up == "y" else _turn(_shortest(vector(up), vector("y")))
+
+
+def is_tpose(poses: Poses, front: Float[Tensor, "3 3"]) -> bool:
+    """Whether the first pose is a T-pose as captures begin with: everything straight, arms level, legs vertical."""
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for part, aim in (("Arm", vector("x") * sign), ("Leg", -vector("y"))):
+            ways = [_way(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
+            if any(float(way @ aim) < math.cos(_EXACT) for way in ways):
+                return False
+    return True
 
 
 def vector(axis: str) -> Float[Tensor, "3"]:
@@ -202,20 +214,52 @@ def _pitch(clip: Poses | None, upright: Tensor | None) -> float | None:
     return slope if 0 < slope < math.radians(70) else None
 
 
-def _twists(clip: Poses, quats: Tensor, upright: Tensor | None) -> dict[str, float]:
-    """Turns of limbs about their bones that make knees bend backward and elbows forward, as they do over the clip."""
-    found = {}
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        for upper, lower, hinge in (("Leg", "LowerLeg", (1.0, 0.0, 0.0)), ("Arm", "LowerArm", (0.0, -sign, 0.0))):
-            name = f"{side}Upper{upper}"
-            above, below = (_canonical_turns(clip, joint, quats, upright) for joint in (name, side + lower))
-            bend = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(above), below)).mean(0)
-            bone, wanted = _aim(CANONICAL.index(name)), torch.tensor(hinge, dtype=torch.float64)
-            bend = bend - bone * (bend @ bone)
-            angle = float(torch.atan2(torch.linalg.cross(bend, wanted) @ bone, bend @ wanted))
-            if float(bend.norm()) > _BENT and abs(angle) > _TWISTED:
-                found[name] = angle
-    return found
+def _untwisted(base: Poses, front: Tensor, clip: Poses, upright: Tensor | None) -> Float[Tensor, "joints 4"]:
+    """The T-pose of a rig whose zero pose is none: bones tell all but how joints are turned about them.
+
+    Over a clip the trunk's joints are hardly twisted, knees bend backward and elbows forward: what contradicts that is
+    put right, from the hips outward.
+    """
+    pitch, twists = _pitch(clip, upright), {}
+    for name in ("spine", "chest", "neck", "head", *(side + part for side in ("left", "right") for part in
+                 ("Shoulder", "UpperArm", "UpperLeg"))):  # fmt: skip
+        quats = _laid(base, front, stands=False, pitch=pitch, twists=twists)
+        if clip.has(name):
+            hinged = name.endswith(("Arm", "Leg"))
+            angle = _hinge_error(clip, name, quats, upright) if hinged else None
+            angle = _mean_twist(clip, name, quats, upright) if angle is None else angle
+            if abs(angle) > _TWISTED:
+                twists[name] = _QUARTER * round(angle / _QUARTER)
+    return _laid(base, front, stands=False, pitch=pitch, twists=twists)
+
+
+def _mean_twist(clip: Poses, name: str, quats: Tensor, upright: Tensor | None) -> float:
+    """The turn about a joint's bone, radians, that takes away its mean twist against the joint above."""
+    index = CANONICAL.index(name)
+    above = CANONICAL.parents[index]
+    while above > 0 and clip.joint_of[above] is None:
+        above = CANONICAL.parents[above]
+    turns = _canonical_turns(clip, CANONICAL.names[above], quats, upright)
+    local = rotations.multiply(rotations.inverse(turns), _canonical_turns(clip, name, quats, upright))
+    bone = _aim(index)
+    bone = vector("y") if bone.norm() == 0 else bone
+    twist = 2 * torch.atan2(local[:, :3] @ bone, local[:, 3])
+    return float(torch.atan2(torch.sin(twist).mean(), torch.cos(twist).mean()))
+
+
+def _hinge_error(clip: Poses, name: str, quats: Tensor, upright: Tensor | None) -> float | None:
+    """The turn about an upper limb's bone, radians, by which the joint below it bends as people's do; None if it hardly
+    bends."""
+    below = name.replace("Upper", "Lower")
+    left = 1.0 if name.startswith("left") else -1.0
+    wanted = vector("x") if name.endswith("Leg") else -left * vector("y")
+    upper, lower = (_canonical_turns(clip, joint, quats, upright) for joint in (name, below))
+    bend = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(upper), lower)).mean(0)
+    bone = _aim(CANONICAL.index(name))
+    bend = bend - bone * (bend @ bone)
+    if float(bend.norm()) < _BENT:
+        return None
+    return float(torch.atan2(torch.linalg.cross(bend, wanted) @ bone, bend @ wanted))
 
 
 def _canonical_turns(clip: Poses, name: str, quats: Tensor, upright: Tensor | None) -> Float[Tensor, "poses 4"]:
