@@ -52,6 +52,8 @@ class RigMap:
     """What the pose with all rotations zero is: T, A or neither."""
     tpose_from: str = "table"
     """Where the T-pose was found: table, rest pose, or frame 0."""
+    hips_travel: bool = True
+    """Whether hips below the root have an animated offset; else the root carries them."""
 
 
 def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
@@ -64,11 +66,16 @@ def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None
     found = match(skeleton, rig)
     told = _by_table(found, skeleton, motion)
     if told is not None:
-        return told
+        return _with_travel(told, motion)
     found = with_sides_checked(found, skeleton, motion)
     zero = Poses.zero(skeleton, found.joint_of)
     clip = None if motion is None else Poses.of(motion, found.joint_of)
-    return _map(found, skeleton, find(zero, clip, rig=found.rig))
+    return _with_travel(_map(found, skeleton, find(zero, clip, rig=found.rig)), motion)
+
+
+def _with_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
+    """The map, told whether the hips travel below the root; without a motion they may."""
+    return rigmap if motion is None else replace(rigmap, hips_travel=_hips(rigmap) in motion.moving_offsets)
 
 
 def _by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
@@ -175,9 +182,10 @@ def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion |
         return replace(on_rig, root_position=hips, moving_offsets=moving)
     if original is not None:
         on_rig = replace(on_rig, root_position=original.root_position, moving_offsets=original.moving_offsets)
-        if joint not in original.moving_offsets:
-            missed = hips - on_rig.joint_positions()[:, joint]
-            return replace(on_rig, root_position=original.root_position + missed)
+    travel = rigmap.hips_travel if original is None else joint in original.moving_offsets
+    if not travel:
+        missed = hips - on_rig.joint_positions()[:, joint]
+        return replace(on_rig, root_position=on_rig.root_position + missed)
     parent = on_rig.skeleton.parents[joint]
     turn, place = on_rig.joint_rotations()[:, parent], on_rig.joint_positions()[:, parent]
     offset = rotations.rotate(rotations.inverse(turn), hips - place)

@@ -112,7 +112,7 @@ class _Tree:
         return way[::-1]
 
     def limb(self, way: list[int], names: list[str]) -> dict[str, int]:
-        """Names of a limb's joints, the second and third of which begin its two longest bones; a bare side names none."""
+        """Names of a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
         both = [self.length[way[k + 1]] + self.length[way[k + 2]] for k in range(len(way) - 2)]
         upper = max(range(len(both)), key=both.__getitem__)
         placed = {name: upper + k - 1 for k, name in enumerate(names)}
