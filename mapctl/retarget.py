@@ -73,6 +73,20 @@ def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None
     return _with_travel(_map(found, skeleton, find(zero, clip, rig=found.rig)), motion)
 
 
+def settled(rigmap: RigMap) -> Rig:
+    """The rig as it was found, so that parts of a clip are converted as the whole was.
+
+    A part may lack the first frame that showed the T-pose, or the steps that showed how knees bend.
+    """
+    names = rigmap.rig_skeleton.names
+    pairs = list(zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
+    axes = {c: rotations.to_matrix(quat).T.tolist() for c, joint, quat in pairs if joint is not None}
+    return replace(
+        rigmap.rig, joints={c: names[joint] for c, joint, _ in pairs if joint is not None}, aliases={}, straighten=(),
+        tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()}, up=rigmap.up, rest="tpose",
+    )  # fmt: skip
+
+
 def _with_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
     """The map, told whether the hips travel below the root; without a motion they may."""
     return rigmap if motion is None else replace(rigmap, hips_travel=_hips(rigmap) in motion.moving_offsets)

@@ -193,6 +193,16 @@ def test_a_clip_that_begins_with_a_t_pose_shows_what_its_zero_pose_does_not():
     assert_returns(motion, canonical, rigmap)
 
 
+@pytest.mark.parametrize("rest", RESTS)
+def test_a_part_of_a_clip_is_converted_as_the_whole_was(rest):
+    *_, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of("vicon")))
+    part, again = retarget.to_canonical(motion.slice(30, 33), retarget.settled(rigmap))
+    assert again.joint_of == rigmap.joint_of
+    assert turn_between(part.local_quat_xyzw, canonical.local_quat_xyzw[30:33]) < 1e-6
+    torch.testing.assert_close(part.joint_positions(), canonical.joint_positions()[30:33], atol=1e-8, rtol=0)
+    assert_returns(motion.slice(30, 33), part, again)
+
+
 def test_a_z_up_file_is_turned_and_written_back_as_it_was(tmp_path):
     _, wanted, motion, *_ = converted(Make(names_of("mixamo"), zup=True, arms_down_deg=40))
     motion.save(tmp_path / "a.bvh")
