@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.stature import Stature
 from mapctl.contacts import without_short_runs
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place
@@ -42,6 +43,10 @@ class FinishSettings:
     """How windows are laid."""
     share: float = GuidedMethod.share
     """Of the motion's noise that the search starts with."""
+
+    def seen_by(self, person: Stature) -> "FinishSettings":
+        """The same for somebody of this size, in metres of the prior's size."""
+        return self if person.scale == 1.0 else replace(self, footing=person.footing(self.footing))
 
 
 def finish(

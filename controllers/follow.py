@@ -11,6 +11,7 @@ from torch import Tensor
 
 from controllers.feasibility import after_the_fact, in_advance
 from controllers.starting import choose_start
+from controllers.stature import Stature
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS, decode
 from mapctl.intent import Follow, SpeedProfile
@@ -48,6 +49,14 @@ class FollowSettings:
     joint: str = "hips"
     """Which joint follows the curve."""
 
+    def seen_by(self, person: Stature) -> "FollowSettings":
+        """The same sigmas for somebody of this size, in metres of the prior's size."""
+        if person.scale == 1.0:
+            return self
+        sigmas = {name: getattr(self, name) / person.scale for name in
+                  ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")}  # fmt: skip
+        return replace(self, footing=person.footing(self.footing), **sigmas)
+
 
 def follow(
     prior: Any, curve: Curve, *, seconds: float | None = None, speed: float | SpeedProfile = 1.2,
@@ -57,26 +66,30 @@ def follow(
     """A character walks the curve from its first point, facing along it.
 
     `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the
-    arc; without `seconds` the curve is walked once. The first frame is the start pose. The motion is at PRIOR_FPS;
-    `Motion.resample` gives other rates. After `deadline_seconds` of wall clock, and at Ctrl-C, what is solved by then
-    comes back and the status says so. RequestError for wishes that make no sense; wishes that cannot hold are named
-    with numbers in the status.
+    arc; without `seconds` the curve is walked once. On another `skeleton` (canonical names) strides are as long as its
+    legs, and the toes' rest height is that of `settings.footing`. The first frame is the start pose. The
+    motion is at PRIOR_FPS; `Motion.resample` gives other rates. After `deadline_seconds` of wall clock, and at
+    Ctrl-C, what is solved by then comes back and the status says so. RequestError for wishes that make no sense;
+    wishes that cannot hold are named with numbers in the status.
     """
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
     request, lowered = Follow(curve, profile, seconds).fitted(PRIOR_FPS)
     settings = settings or FollowSettings()
+    person = Stature(skeleton, settings.footing.rest_height)
     generator = generator or torch.Generator().manual_seed(0)
     frames = request.frames(PRIOR_FPS)
     # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
     arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
-    terms_of = follow_terms(curve, arcs, settings)
-    start = choose_start(prior, curve, arcs, terms_of, skeleton=skeleton, fps=PRIOR_FPS, generator=generator)
-    solver = WindowSolver(prior, settings.window, skeleton, method=settings.method)
+    seen, seen_arcs = person.curve(curve), arcs / person.scale
+    terms_of = follow_terms(seen, seen_arcs, settings.seen_by(person))
+    start = choose_start(prior, seen, seen_arcs, terms_of, skeleton=person.small, fps=PRIOR_FPS, generator=generator)
+    solver = WindowSolver(prior, settings.window, person.small, method=settings.method)
     done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
                                  deadline=deadline)  # fmt: skip
-    known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], prior.abilities))
-    motion = decode(done.features, start.before_first, skeleton=skeleton)
+    known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], person.abilities(prior.abilities)))
+    motion = person.motion(decode(done.features, start.before_first, skeleton=person.small))
+    done = replace(done, ledger=person.ledger(done.ledger))
     return _solution(motion, done, Status(outcome), known, curve, settings.joint)
 
 

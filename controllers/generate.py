@@ -5,7 +5,7 @@ stand that the motion's own contact labels call planted. All three work piece by
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -13,11 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.finish import FinishSettings, finish
+from controllers.stature import Stature
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, Place, decode, encode, root_places
 from mapctl.motion import Motion
 from mapctl.protocols import Refiner
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
 _CHUNK = 600
 _GOLDEN = (5**0.5 - 1) / 2
@@ -41,17 +43,24 @@ class GenerateSettings:
         if not 0 <= self.temperature <= 2:
             raise RequestError(f"the temperature must lie between 0 and 2, got {self.temperature:g}")
 
+    def person(self, skeleton: Skeleton) -> Stature:
+        """Whose bones move, whose toes rest as high as the finishing pass has it."""
+        return Stature(skeleton, self.finishing.footing.rest_height if self.finishing else TOE_REST_HEIGHT)
+
 
 def stream(
     prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None, refiner: Refiner | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None, skeleton: Skeleton = CANONICAL,
 ) -> Iterator[Motion]:  # fmt: skip
     """Consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its length.
 
     Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the memory.
-    RequestError, at once, for a length or a start that cannot be.
+    On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
+    `settings.finishing`. RequestError, at once, for a length or a start that cannot be.
     """
-    return _decoded(*_begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner))
+    settings = settings or GenerateSettings()
+    person = settings.person(skeleton)
+    return _decoded(*_begun(prior, seconds, generator, settings, start_clip, refiner, person), person)
 
 
 def stream_features(
@@ -59,16 +68,16 @@ def stream_features(
     start_clip: Motion | None = None, refiner: Refiner | None = None,
 ) -> Iterator[Float[Tensor, "_ size"]]:  # fmt: skip
     """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
-    return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner)[0]
+    return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner, Stature())[0]
 
 
 def generate(
     prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None, refiner: Refiner | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None, skeleton: Skeleton = CANONICAL,
 ) -> Motion:  # fmt: skip
     """The whole motion at once; see `stream`."""
     pieces = stream(prior, seconds=seconds, generator=generator, settings=settings, start_clip=start_clip,
-                    refiner=refiner)  # fmt: skip
+                    refiner=refiner, skeleton=skeleton)  # fmt: skip
     motion = next(pieces)
     for piece in pieces:
         motion = motion.join(piece)
@@ -76,14 +85,18 @@ def generate(
 
 
 def begin(
-    prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator
+    prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
 ) -> tuple[Any, Any, Place]:
     """The prior as it is to be told, its state and the place (float64) before the first frame.
 
-    Begins at a start of its own, or at the end of a clip, of which nothing is told.
+    Begins at a start of its own, or at the end of a clip, of which nothing is told; the clip's lengths are divided by
+    `scale`, the size of its performer beside the prior's.
     """
     if clip is not None:
         canonical, _ = retarget.to_canonical(clip)
+        if scale != 1.0:
+            bones = replace(canonical.skeleton, offsets=canonical.skeleton.offsets / scale)
+            canonical = replace(canonical, skeleton=bones, root_position=canonical.root_position / scale)
         features, place = encode(canonical.resample(PRIOR_FPS))
         ground, heading = root_places(features, place)
         seen = features.float()
@@ -113,18 +126,19 @@ def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[in
 
 def _begun(
     prior: Any, seconds: float, generator: torch.Generator, settings: GenerateSettings, clip: Motion | None,
-    refiner: Refiner | None,
+    refiner: Refiner | None, person: Stature,
 ) -> tuple[Iterator[Float[Tensor, "_ size"]], Place]:  # fmt: skip
     """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
-    prior, state, place = begin(prior, settings, clip, generator)
+    prior, state, place = begin(prior, settings, clip, generator, scale=person.scale)
     pieces = _drawn(prior, state, generator, settings.temperature)
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
     if settings.finishing is not None:
-        pieces = finish(prior, pieces, frames=frames, state=state, generator=generator, settings=settings.finishing)
+        pieces = finish(prior, pieces, frames=frames, state=state, generator=generator,
+                        settings=settings.finishing.seen_by(person), skeleton=person.small)  # fmt: skip
     return _in_chunks(pieces, frames), place
 
 
@@ -147,8 +161,8 @@ def _in_chunks(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterat
                 return
 
 
-def _decoded(pieces: Iterator[Float[Tensor, "_ size"]], place: Place) -> Iterator[Motion]:
+def _decoded(pieces: Iterator[Float[Tensor, "_ size"]], place: Place, person: Stature) -> Iterator[Motion]:
     for features in pieces:
-        yield decode(features, place)
+        yield person.motion(decode(features, place, skeleton=person.small))
         ground, heading = root_places(features.double(), place)
         place = Place(ground[-1], heading[-1])

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.starting import standing
+from controllers.stature import Stature
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
 from mapctl.motion import Motion
@@ -70,6 +71,13 @@ class SteerSettings:
         if not 1 <= self.commit < self.horizon or self.evaluations < 1:
             raise RequestError(f"steering needs 1 <= commit < horizon and evaluations >= 1, got {self}")
 
+    def seen_by(self, person: Stature) -> "SteerSettings":
+        """The same for somebody of this size, in metres of the prior's size."""
+        if person.scale == 1.0:
+            return self
+        sigmas = {name: getattr(self, name) / person.scale for name in ("sigma_speed", "sigma_step", "stuck")}
+        return replace(self, limits=person.limits(self.limits), footing=person.footing(self.footing), **sigmas)
+
 
 @dataclass(frozen=True, eq=False)
 class SteerState:
@@ -78,15 +86,15 @@ class SteerState:
     prior: Any
     """The density."""
     settings: SteerSettings
-    """The same in every step."""
-    skeleton: Skeleton
-    """Bones of the character."""
+    """The same in every step, in metres of the prior's size."""
+    person: Stature
+    """Bones of the character, and how long its legs are beside the prior's."""
     committed: Committed
     """The end of what was delivered."""
     wish: Wish
-    """Of the last delivered frame."""
+    """Of the last delivered frame, in the prior's size."""
     owed: Float[Tensor, "past 2"]
-    """Wanted velocities of the last delivered frames, oldest first, m/s."""
+    """Wanted velocities of the last delivered frames, oldest first, m/s in the prior's size."""
     frames: int = 1
     """Delivered so far, the first pose among them."""
 
@@ -121,18 +129,25 @@ def begin(
 
     It is one of the prior's starts near the wanted speed and of the labels it is told, drawn by the generator: the
     data's slowest for a command to stand.
+    On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
+    `settings.footing`; commands, limits and what is delivered are in its metres.
     """
+    chosen = settings or SteerSettings()
+    person = Stature(skeleton, chosen.footing.rest_height)
+    command = person.command(command)
     starts = (_told(prior, command.told) if command.told else prior).starts
     near = (starts.speed - command.speed).abs().argsort()[:_NEAREST]
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
-    start = standing(state, Place(torch.tensor(at), torch.tensor(command.heading)), skeleton)
+    there = torch.tensor(at) if person.scale == 1.0 else torch.tensor(at) / person.scale
+    start = standing(state, Place(there, torch.tensor(command.heading)), person.small)
     first = start.committed.features
-    motion = decode(first, start.before_first, skeleton=skeleton)
+    motion = person.motion(decode(first, start.before_first, skeleton=person.small))
     wish = Wish(float(ground_speed(first)[0]), command.heading, command.heading)
-    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), (wish,), start.committed.joints_world[:0], Ledger())
-    chosen = settings or SteerSettings()
-    return SteerState(prior, chosen, skeleton, start.committed, wish, torch.tensor([wish.velocity])), frames
+    delivered = (_in_their_metres(wish, person),)
+    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), delivered, start.committed.joints_world[:0], Ledger())
+    settings = chosen.seen_by(person)
+    return SteerState(prior, settings, person, start.committed, wish, torch.tensor([wish.velocity])), frames
 
 
 def step(
@@ -143,7 +158,8 @@ def step(
     RequestError where the command tells the prior what it does not know. The first step under new labels takes longer.
     """
     began = time.perf_counter()
-    settings = state.settings
+    settings, person = state.settings, state.person
+    command = person.command(command)
     stuck = _behind(state) > settings.stuck
     if stuck:
         state = _from_here(state)
@@ -155,17 +171,23 @@ def step(
         afresh = replace(told, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
         done, _ = _solve(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
-    motion = decode(new, state.committed.place, skeleton=state.skeleton)
+    motion = person.motion(decode(new, state.committed.place, skeleton=person.small))
     record, own = done.windows[-1], tuple(wishes[: settings.commit])
     short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations" if short else ""
     forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
-    frames = SteerFrames(motion, LAYOUT.pick(new, "contacts"), own, forecast, done.ledger, record.evaluations,
-                         time.perf_counter() - began, note)  # fmt: skip
+    forecast = forecast if person.scale == 1.0 else forecast * person.scale
+    delivered = tuple(_in_their_metres(wish, person) for wish in own)
+    frames = SteerFrames(motion, LAYOUT.pick(new, "contacts"), delivered, forecast, person.ledger(done.ledger),
+                         record.evaluations, time.perf_counter() - began, note)  # fmt: skip
     owed = torch.cat([state.owed, torch.tensor([wish.velocity for wish in own])])[-_OWED:]
     kept = replace(done, features=new, ledger=Ledger(), windows=())
     following = replace(state, committed=kept, wish=own[-1], owed=owed, frames=state.frames + len(new))
     return following, frames
+
+
+def _in_their_metres(wish: Wish, person: Stature) -> Wish:
+    return wish if person.scale == 1.0 else replace(wish, speed=wish.speed * person.scale)
 
 
 @lru_cache(maxsize=64)
@@ -190,7 +212,7 @@ def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, f
         )
         method = _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
     window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
-    solver = WindowSolver(state.prior, window, state.skeleton, method=method)
+    solver = WindowSolver(state.prior, window, state.person.small, method=method)
     frames = len(state.committed.features) + settings.commit
     return solver.solve(
         state.committed, lambda first, count: terms, frames, generator=torch.Generator().manual_seed(state.frames)

@@ -1,10 +1,11 @@
 """Between a rig's own joint frames and the canonical ones, both ways and without loss.
 
 In the T-pose every canonical joint frame is aligned with the world. A rig's joint j then has some world rotation B_j,
-and at any time: canonical world rotation = rig's world rotation * inverse(B_j). The canonical motion keeps the
-performer's own bone lengths; only the frames change.
+and at any time: canonical world rotation = U * rig's world rotation * inverse(B_j), where U turns the file's world so
+that Y is up. The canonical motion keeps the performer's own bone lengths; only the frames change.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,8 +15,13 @@ from torch import Tensor
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.rigs import Rig, recognise
+from mapctl.rigs import Rig, bones
+from mapctl.rigs.matching import Match, match, with_sides_checked
+from mapctl.rigs.pose import Poses, up_axis
+from mapctl.rigs.tpose import TPose, find, kind, rest_facing, upright_of
 from mapctl.skeleton import CANONICAL, Skeleton
+
+_FITS = math.radians(60)  # between a limb's bone in a table's T-pose and its canonical direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,25 +33,106 @@ class RigMap:
     rig_skeleton: Skeleton
     """The rig's own skeleton."""
     joint_of: tuple[int | None, ...]
-    """For each canonical joint the rig's joint, None where the rig has only an End Site."""
+    """For each canonical joint the rig's joint, None where the rig has only an End Site or nothing."""
     tpose_quat_xyzw: Float[Tensor, "joints 4"]
-    """B: world rotation of each canonical joint's rig joint in the T-pose."""
+    """B: world rotation of each canonical joint's rig joint in the T-pose, in a world with Y up."""
     skeleton: Skeleton
     """Canonical names and tree with this performer's bones."""
+    upright_quat_xyzw: Float[Tensor, "4"] | None = None
+    """U: turns the file's world so that Y is up; None where it is."""
+    idle_quat_xyzw: Float[Tensor, "rigged 4"] | None = None
+    """Local rotations at rest of joints that are no canonical one; None where they are all zero."""
+    match: Match | None = None
+    """How the joints were told, and how sure that is."""
+    up: str = "y"
+    """Axis of the file's world that points up."""
+    facing: str = "z"
+    """Axis of the file that the pose with all rotations zero faces; `unknown` where it is along none."""
+    rest: str = "neither"
+    """What the pose with all rotations zero is: T, A or neither."""
+    tpose_from: str = "table"
+    """Where the T-pose was found: table, rest pose, or frame 0."""
+    hips_travel: bool = True
+    """Whether hips below the root have an animated offset; else the root carries them."""
 
 
-def map_rig(skeleton: Skeleton) -> RigMap:
-    """Recognise the rig and measure its bones; RequestError if no known rig fits."""
-    rig = recognise(skeleton)
-    joint_of = tuple(skeleton.index(rig.joints[name]) if name in rig.joints else None for name in CANONICAL.names)
-    tpose = _tpose(rig, skeleton, joint_of)
-    bones, ends = _bones(skeleton, joint_of, tpose)
-    return RigMap(rig, skeleton, joint_of, tpose, Skeleton(CANONICAL.names, CANONICAL.parents, bones, ends))
+def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
+    """Tell the rig's joints, find its T-pose and measure its bones; RequestError where its joints cannot be told.
+
+    What `rig` says is taken as it is; else presets are tried, and then names, tree and places (see
+    mapctl.rigs.matching). A `motion` of the skeleton shows which way is up, how knees bend, and whether it begins with
+    a T-pose, where the pose with all rotations zero does not.
+    """
+    found = match(skeleton, rig)
+    told = _by_table(found, skeleton, motion)
+    if told is not None:
+        return _with_travel(told, motion)
+    found = with_sides_checked(found, skeleton, motion)
+    zero = Poses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else Poses.of(motion, found.joint_of)
+    return _with_travel(_map(found, skeleton, find(zero, clip, rig=found.rig)), motion)
 
 
-def to_canonical(motion: Motion) -> tuple[Motion, RigMap]:
-    """The motion in canonical joint frames with the performer's own bones, and the map that leads back."""
-    rigmap = map_rig(motion.skeleton)
+def settled(rigmap: RigMap) -> Rig:
+    """The rig as it was found, so that parts of a clip are converted as the whole was.
+
+    A part may lack the first frame that showed the T-pose, or the steps that showed how knees bend.
+    """
+    names = rigmap.rig_skeleton.names
+    pairs = list(zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
+    axes = {c: rotations.to_matrix(quat).T.tolist() for c, joint, quat in pairs if joint is not None}
+    return replace(
+        rigmap.rig, joints={c: names[joint] for c, joint, _ in pairs if joint is not None}, aliases={}, straighten=(),
+        tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()}, up=rigmap.up, rest="tpose",
+    )  # fmt: skip
+
+
+def _with_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
+    """The map, told whether the hips travel below the root; without a motion they may."""
+    return rigmap if motion is None else replace(rigmap, hips_travel=_hips(rigmap) in motion.moving_offsets)
+
+
+def _by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
+    """By the T-pose that the rig's table tells; None where it tells none, or its limbs would not lie as in one."""
+    rig, joint_of = found.rig, found.joint_of
+    if not rig.has_tpose:
+        return None
+    quats = _tpose(rig, skeleton, joint_of)
+    zero = Poses.zero(skeleton, joint_of)
+    clip = None if motion is None else Poses.of(motion, joint_of)
+    up = up_axis(zero, clip) if rig.up == "auto" else rig.up
+    idle = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(skeleton.num_joints, 4)
+    rest = kind(zero, torch.eye(3, dtype=torch.float64))
+    told = _map(found, skeleton, TPose(quats, idle, upright_of(up), up, rest_facing(zero), rest, "table"))
+    if rig.rest == "tpose" and rig.name != "canonical":  # what a user asks for is done
+        return told
+    return told if (rest == "T" or not rig.straighten) and _lies_as_canonical(told.skeleton) else None
+
+
+def _map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
+    measured = bones.measure(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw)
+    return RigMap(found.rig, skeleton, found.joint_of, tpose.quat_xyzw, measured, tpose.upright_quat_xyzw,
+                  tpose.idle_quat_xyzw, found, tpose.up, tpose.facing, tpose.rest, tpose.found)  # fmt: skip
+
+
+def _lies_as_canonical(skeleton: Skeleton) -> bool:
+    """Whether limbs lie about as they do in the T-pose, and hang from their own side of a trunk that stands."""
+    names = [side + part for side in ("left", "right") for part in ("LowerArm", "Hand", "LowerLeg", "Foot")]
+    own, usual = skeleton.offsets, CANONICAL.offsets
+    pairs = [(own[CANONICAL.index(name)], usual[CANONICAL.index(name)]) for name in names]
+    trunk = [CANONICAL.index(name) for name in ("spine", "chest", "neck")]
+    pairs.append((own[trunk].sum(0), usual[trunk].sum(0)))
+    legs = [CANONICAL.index(side + "UpperLeg") for side in ("left", "right")]
+    pairs.append((own[legs[0]] - own[legs[1]], usual[legs[0]] - usual[legs[1]]))
+    return all(float(bone @ wanted) >= math.cos(_FITS) * float(bone.norm() * wanted.norm()) for bone, wanted in pairs)
+
+
+def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap]:
+    """The motion in canonical joint frames with the performer's own bones, and the map that leads back.
+
+    `rig` wins over what would be recognised (see `map_rig`).
+    """
+    rigmap = map_rig(motion.skeleton, rig, motion=motion)
     world = motion.joint_rotations()
     picked = []
     for name, joint, tpose in zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True):
@@ -55,6 +142,10 @@ def to_canonical(motion: Motion) -> tuple[Motion, RigMap]:
             picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
     hips = motion.joint_positions()[:, _hips(rigmap)]
+    upright = rigmap.upright_quat_xyzw
+    if upright is not None:  # all other joints turn with the hips
+        local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
+        hips = rotations.rotate(upright.expand(len(world), 4), hips)
     return Motion(rigmap.skeleton, motion.fps, hips, rotations.sign_continuous(local)), rigmap
 
 
@@ -65,9 +156,12 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     """
     skeleton, frames = rigmap.rig_skeleton, motion.num_frames
     kept = original is not None and original.num_frames == frames
-    rest = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(frames, skeleton.num_joints, 4)
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    rest = still.expand(frames, skeleton.num_joints, 4)
+    if rigmap.idle_quat_xyzw is not None:
+        rest = rigmap.idle_quat_xyzw.expand(frames, skeleton.num_joints, 4)
     own = original.local_quat_xyzw if original is not None and kept else rest
-    wanted = _wanted_world(motion, rigmap)
+    hips, wanted = _in_the_files_world(motion, rigmap)
     local, world = [], []
     for joint, parent in enumerate(skeleton.parents):
         above = world[parent] if parent >= 0 else None
@@ -76,25 +170,36 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
             turn = rotations.multiply(rotations.inverse(above), wanted[joint])
         local.append(turn)
         world.append(turn if above is None else rotations.multiply(above, turn))
-    on_rig = Motion(skeleton, motion.fps, rest[:, 0, :3].clone(), rotations.sign_continuous(torch.stack(local, 1)),
+    on_rig = Motion(skeleton, motion.fps, torch.zeros(frames, 3, dtype=torch.float64),
+                    rotations.sign_continuous(torch.stack(local, 1)),
                     source=original.source if original is not None else None)  # fmt: skip
-    return _place_hips(on_rig, rigmap, motion.root_position, original if kept else None)
+    return _place_hips(on_rig, rigmap, hips, original if kept else None)
 
 
-def _wanted_world(motion: Motion, rigmap: RigMap) -> dict[int, Tensor]:
-    world = motion.joint_rotations()
+def _in_the_files_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
+    """Where the hips are to be, and which world rotation each joint of the rig is to have."""
+    world, hips = motion.joint_rotations(), motion.root_position
+    if rigmap.upright_quat_xyzw is not None:
+        back = rotations.inverse(rigmap.upright_quat_xyzw)
+        world = rotations.multiply(back.expand(world.shape), world)
+        hips = rotations.rotate(back.expand(len(world), 4), hips)
     pairs = enumerate(zip(rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
-    return {j: rotations.multiply(world[:, c], b.expand(len(world), 4)) for c, (j, b) in pairs if j is not None}
+    turns = {j: rotations.multiply(world[:, c], b.expand(len(world), 4)) for c, (j, b) in pairs if j is not None}
+    return hips, turns
 
 
 def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion | None) -> Motion:
-    """Put the hips where they belong: by the root itself, or by its animated offset below a static root."""
+    """Put the hips where they belong: by the root itself, or by their offset below it where that is animated."""
     joint = _hips(rigmap)
     if joint == 0:
         moving = original.moving_offsets if original is not None else {}
         return replace(on_rig, root_position=hips, moving_offsets=moving)
     if original is not None:
         on_rig = replace(on_rig, root_position=original.root_position, moving_offsets=original.moving_offsets)
+    travel = rigmap.hips_travel if original is None else joint in original.moving_offsets
+    if not travel:
+        missed = hips - on_rig.joint_positions()[:, joint]
+        return replace(on_rig, root_position=on_rig.root_position + missed)
     parent = on_rig.skeleton.parents[joint]
     turn, place = on_rig.joint_rotations()[:, parent], on_rig.joint_positions()[:, parent]
     offset = rotations.rotate(rotations.inverse(turn), hips - place)
@@ -147,34 +252,3 @@ def _shortest_turn(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float
         return rotations.rotation_vector_to_matrix(axis / axis.norm() * torch.pi)
     sine = axis.norm().clamp_min(1e-12)
     return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
-
-
-def _bones(skeleton: Skeleton, joint_of: tuple[int | None, ...], tpose: Tensor):
-    """Canonical offsets (21, 3) and end offsets of this performer: the rig put into its T-pose, joint by joint."""
-    canonical_of = {joint: c for c, joint in enumerate(joint_of) if joint is not None}
-    place, turn = [torch.zeros(3, dtype=torch.float64)], []
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            place.append(place[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
-        if joint in canonical_of:
-            turn.append(tpose[canonical_of[joint]])
-        else:
-            turn.append(turn[parent] if parent >= 0 else torch.tensor([0.0, 0, 0, 1], dtype=torch.float64))
-
-    def end_of(joint: int) -> Tensor:
-        site = torch.tensor(skeleton.end_offsets.get(skeleton.names[joint], (0.0, 0.0, 0.0)), dtype=torch.float64)
-        return rotations.rotate(turn[joint], site)
-
-    def spot_of(canonical: int) -> Tensor:
-        joint, above = joint_of[canonical], joint_of[CANONICAL.parents[canonical]]
-        if joint is not None:
-            return place[joint]
-        if above is None:
-            raise RequestError(f"the rig has neither {CANONICAL.names[canonical]} nor the joint above it")
-        return place[above] + end_of(above)
-
-    spots = torch.stack([spot_of(c) for c in range(CANONICAL.num_joints)])
-    offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), spots[1:] - spots[list(CANONICAL.parents[1:])]])
-    ends = {CANONICAL.names[c]: tuple(end_of(j).tolist()) for c, j in enumerate(joint_of)
-            if j is not None and skeleton.names[j] in skeleton.end_offsets and not CANONICAL.children(c)}  # fmt: skip
-    return offsets, ends

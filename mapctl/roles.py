@@ -39,6 +39,13 @@ def find_upper_legs(skeleton: Skeleton) -> tuple[int, int]:
     return _find_pair(skeleton, _UPPER_LEGS, "upper leg")
 
 
+def plain_name(name: str) -> str:
+    """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
+    strip = partial(_PREFIX.sub, "")
+    # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
+    return re.sub(r"[^a-z0-9]", "", (strip(strip(name)) or name).lower())
+
+
 def _find_pair(skeleton: Skeleton, parts: Sequence[str], role: str) -> tuple[int, int]:
     names = _plain_names(skeleton)
     for match in (_exactly, _at_the_end):
@@ -69,11 +76,7 @@ def _first(names: Sequence[str], fits: Callable[[str], bool]) -> int | None:
 
 
 def _plain_names(skeleton: Skeleton) -> list[str]:
-    """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
-    strip = partial(_PREFIX.sub, "")
-    # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
-    bare = [strip(strip(name)) or name for name in skeleton.names]
-    return [re.sub(r"[^a-z0-9]", "", name.lower()) for name in bare]
+    return [plain_name(name) for name in skeleton.names]
 
 
 def _missing(skeleton: Skeleton, role: str) -> RequestError:

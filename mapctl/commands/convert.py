@@ -13,6 +13,7 @@ from mapctl.errors import RequestError
 if TYPE_CHECKING:
     from mapctl.motion import Motion
     from mapctl.retarget import RigMap
+    from mapctl.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class Convert:
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
     rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted."""
+    source_rig: options.MaybeRig = None
+    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     fps: Annotated[str | None, arg(metavar="F")] = None
     """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
     fps_in: Annotated[str | None, arg(metavar="F")] = None
@@ -38,9 +41,11 @@ class Convert:
         formats.check_ending(self.out)
         outputs.check_files([self.out])
         fps = None if self.fps is None else parse_fps(self.fps)
-        motion = formats.load(self.source, fps=None if self.fps_in is None else parse_fps(self.fps_in))
+        source_rig = options.read_rig(self.source_rig)
+        fps_in = None if self.fps_in is None else parse_fps(self.fps_in)
+        motion = options.read_motion(self.source, source_rig, fps=fps_in)
         if self.rig is not None:
-            motion = on_rig(motion, self.rig)
+            motion = on_rig(motion, self.rig, source_rig)
         if fps is not None:
             motion = motion.resample(fps)
         formats.save(motion, self.out)
@@ -60,19 +65,19 @@ def parse_fps(text: str) -> Fraction:
     return fps
 
 
-def on_rig(motion: "Motion", rig: str) -> "Motion":
+def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Motion":
     """The motion on the canonical joints or on a clip's skeleton; RequestError for rigs that are not known.
 
     Rotations stay. On other bones the hips' way is scaled by the legs' length, so that feet reach the ground.
     """
     from mapctl import formats, retarget, rigs
 
-    canonical, own = retarget.to_canonical(motion)
+    canonical, own = retarget.to_canonical(motion, source_rig)
     if rig == "canonical":
         return canonical
     if rig in {known.name for known in rigs.known()}:
         raise RequestError(f"the bones of {rig} differ from performer to performer: name a clip of that rig")
-    wanted = retarget.map_rig(formats.load(rig).skeleton)
+    wanted = retarget.to_canonical(formats.load(rig))[1]
     scale = _leg_length(wanted) / _leg_length(own)
     canonical = replace(canonical, skeleton=wanted.skeleton, root_position=canonical.root_position * scale)
     return retarget.from_canonical(canonical, wanted)

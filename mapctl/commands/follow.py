@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import options, outputs, rigged
 from mapctl.commands.threads import compute_on_one
 from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
 from mapctl.progress import bar
@@ -30,6 +30,8 @@ class FollowCurve:
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Of everything random: the same seed gives the same file."""
+    rig: rigged.OutRig = "canonical"
+    """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
     camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
@@ -52,9 +54,9 @@ class FollowCurve:
         request = as_follow(options.read_curve(self.curve, self.metres_per_unit), self.speed, self.seconds)
         import priors
 
-        prior = priors.load(self.prior)
+        person, prior = rigged.read(self.rig), priors.load(self.prior)
         with bar("walking", quiet=self.quiet) as progress:
-            done = walk(prior, request, seed=self.seed, progress=progress)
+            done = walk(prior, request, seed=self.seed, progress=progress, person=person)
         video = None if done.interrupted else self.video
         self._write(done, video)
         if not self.quiet:
@@ -76,7 +78,7 @@ class FollowCurve:
     def _write(self, done: Walk, video: Path | None) -> None:
         from mapctl import report
 
-        done.solution.motion.save(self.out)
+        done.on_rig.save(self.out)
         if self.report is not None:
             report.write(done.report(options.as_request("follow", self)), self.report)
         if video is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import options, outputs, rigged
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
 from mapctl.progress import bar
@@ -49,6 +49,8 @@ class Generate:
     """Leave out the pass that makes planted feet stand: many times faster, with the refiner's feet."""
     no_refine: bool = False
     """Leave the draws as they are: no refiner, and no pass that makes planted feet stand."""
+    rig: rigged.OutRig = "canonical"
+    """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
     quiet: bool = False
     """No lines on the clips and no progress bar."""
 
@@ -66,13 +68,17 @@ class Generate:
             prior = prior.told([name.strip() for name in self.style.split(",")])
         wanted = self.refiner != "auto" or (self.no_footing and not self.no_refine)
         refiner = priors.refiner_of(self.prior, self.refiner) if wanted else None
-        draw = partial(stream, prior, seconds=self.seconds, start_clip=clip, refiner=refiner)
+        person = rigged.read(self.rig)
+        if settings.finishing is not None:
+            footing = replace(settings.finishing.footing, rest_height=person.toe_rest_height)
+            settings = replace(settings, finishing=replace(settings.finishing, footing=footing))
+        draw = partial(stream, prior, seconds=self.seconds, start_clip=clip, refiner=refiner, skeleton=person.skeleton)
         starts = spread_starts(prior, self.count, torch.Generator().manual_seed(self.seed))
         with outputs.made_folder(self.out) as folder:
             for number, seed in enumerate(self._seeds()):
                 own = settings if settings.start is not None else replace(settings, start=starts[number])
                 pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
-                self._write(pieces, folder / f"generated_{number:03d}.bvh", frames)
+                self._write(map(person.on_rig, pieces), folder / f"generated_{number:03d}.bvh", frames)
         return 0
 
     def _checked(self) -> tuple["GenerateSettings", "Motion | None"]:

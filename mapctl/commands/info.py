@@ -1,25 +1,29 @@
-"""`mapctl info`: what is installed: priors and their cards, scenes, versions, rendering, threads."""
+"""`mapctl info`: what is installed: priors and their cards, scenes, versions, rendering, threads; or what a clip is."""
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from mapctl.commands import options
+from mapctl.commands import clip_info, options
 from mapctl.commands.tables import print_table
+from mapctl.errors import RequestError
 
 NOTICE = "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is."
 
 
 @dataclass(frozen=True)
 class Info:
-    """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads."""
+    """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads; or a clip's rig."""
 
-    name: Positional[options.MaybeName] = None
-    """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder."""
+    name: Positional[Annotated[str | None, arg(metavar="NAME|CLIP")]] = None
+    """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip (.bvh, .npz), of which
+    rig, joints, unit, axes and length are told."""
+    rig: options.MaybeRig = None
+    """The clip's rig, where it is not the one that would be recognised."""
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -27,7 +31,11 @@ class Info:
         """Collect and print."""
         from mapctl import report
 
-        if self.name is not None:
+        if self.name is not None and clip_info.is_clip(self.name):
+            clip_info.tell(Path(self.name), self.rig, as_json=self.json)
+        elif self.rig is not None:
+            raise RequestError("--rig is of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
+        elif self.name is not None:
             print(report.as_json(card(self.name)), end="")
         elif self.json:
             print(

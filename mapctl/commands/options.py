@@ -4,11 +4,17 @@ import os
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from fractions import Fraction
+
+    from mapctl.motion import Motion
+    from mapctl.rigs import Rig
 
 OutFile = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
@@ -25,6 +31,7 @@ MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
 MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
 MaybeCount = Annotated[int | None, arg(metavar="N")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
+MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
@@ -64,6 +71,20 @@ def read_curve(text: str, metres_per_unit: float | None):
     if os.sep in text and not Path(text).exists():
         raise RequestError(f"{text}: no such file")
     return curves.read(text, metres_per_unit=metres_per_unit)
+
+
+def read_rig(text: str | None) -> "Rig | None":
+    """The rig of a --rig option: a preset, a TOML file, or that of a clip; None where none is asked for."""
+    from mapctl import rigs
+
+    return None if text is None else rigs.read(text)
+
+
+def read_motion(path: Path, rig: "Rig | None", *, fps: "Fraction | None" = None) -> "Motion":
+    """A motion in metres, in the rig's unit where it tells one; `fps` is that of an .amc."""
+    from mapctl import formats
+
+    return formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
 
 
 def as_request(name: str, command: Any) -> dict[str, Any]:

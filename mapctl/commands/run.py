@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import options, outputs, rigged
 from mapctl.commands.threads import compute_on_one
 from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
 from mapctl.progress import bar
@@ -27,6 +27,8 @@ class RunScene:
     """The scene file, or the name of a scene that comes with mapctl (`mapctl info` lists them)."""
     out: options.OutFolder = Path()
     """Folder for the scene's outputs; made if it is not there."""
+    rig: rigged.OutRig = "canonical"
+    """Whose body the actors have: the canonical one, or that of a clip (.bvh, .npz), on whose rig they are written."""
     quiet: bool = False
     """No summary and no progress bar."""
 
@@ -47,20 +49,21 @@ class RunScene:
         outputs.check_folder(self.out)
         for path in scene.films(self.out):
             outputs.require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
-        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior))
+        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior), rigged.read(self.rig))
         with outputs.made_folder(self.out):
             self._write(scene, walks, films=() if interrupted else scene.films(self.out))
         return INTERRUPTED if interrupted else 0
 
     def _walk(
-        self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity"
-    ) -> tuple[list[Walk], bool]:
+        self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity",
+        person: rigged.Wearer,
+    ) -> tuple[list[Walk], bool]:  # fmt: skip
         """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
         walks: list[Walk] = []
         for actor, request in zip(scene.actors, requests, strict=True):
             try:
                 with bar(actor.name, quiet=self.quiet) as progress:
-                    walks.append(walk(prior, request, seed=actor.seed, progress=progress))
+                    walks.append(walk(prior, request, seed=actor.seed, progress=progress, person=person))
             except KeyboardInterrupt:
                 if not walks:
                     raise
@@ -82,7 +85,7 @@ class RunScene:
         outputs.check_files(written)
         for actor, done in zip(begun, walks, strict=True):
             for path in motions[actor.name]:
-                done.solution.motion.save(path)
+                done.on_rig.save(path)
         for path in reports:
             report.write(self._report(scene, walks), path)
         if films:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import options, outputs, rigged
 from mapctl.commands.threads import compute_on_one
 from mapctl.commands.walks import INTERRUPTED
 from mapctl.errors import RequestError
@@ -39,6 +39,8 @@ class Steer:
     """Play against the wall clock: every step has a deadline and brings the best found by then."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
+    rig: rigged.OutRig = "canonical"
+    """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
     seed: options.Count = 0
     """Of the pose that it begins with."""
     acceleration: options.Number = Limits.acceleration
@@ -64,13 +66,13 @@ class Steer:
         from mapctl.command_files import read_commands
 
         track = read_commands(self.commands)
-        prior = priors.load(self.prior)
+        person, prior = rigged.read(self.rig), priors.load(self.prior)
         track, lowered = track.clamped(prior.abilities.fastest_asked)
         for labels in {command.told for command in track.commands if command.told}:
             prior.told(labels)  # what it does not know is said now
-        recorder, records, frames = self._steered(prior, track)
+        recorder, records, frames = self._steered(prior, track, person)
         motion = recorder.motion(frames)
-        motion.save(self.out)
+        person.on_rig(motion).save(self.out)
         report = self._report(motion, recorder, records, track, lowered, prior)
         if self.report is not None:
             from mapctl import report as reports
@@ -101,17 +103,21 @@ class Steer:
     def _limits(self) -> Limits:
         return Limits(self.acceleration, self.braking, math.radians(self.turn_rate))
 
-    def _steered(self, prior: Any, track: "CommandTrack") -> tuple["Recorder", list["StepRecord"], int]:
+    def _steered(
+        self, prior: Any, track: "CommandTrack", person: rigged.Wearer
+    ) -> tuple["Recorder", list["StepRecord"], int]:
         import torch
 
         from controllers import steer
         from controllers.loop import Recorder, StreamClock, WallClock, drive
+        from mapctl.terms import Footing
 
         first, recorder = track.commands[0], Recorder()
         frames = options.frames_of(track.times[-1] + (_LAST_HELD if len(track.times) == 1 else 0.0))
-        settings = steer.SteerSettings(limits=self._limits())
+        footing = Footing(rest_height=person.toe_rest_height)
+        settings = steer.SteerSettings(limits=self._limits(), footing=footing)
         generator = torch.Generator().manual_seed(self.seed)
-        state, pose = steer.begin(prior, first, generator=generator, settings=settings)
+        state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=person.skeleton)
         recorder.show(pose, 0.0)
         for command in (first, *{command.told: command for command in track.commands}.values()):
             steer.step(state, command)  # what is compiled, loaded or told on first use must not cost frames

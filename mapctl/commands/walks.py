@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from mapctl.commands.rigged import Wearer
 from mapctl.progress import Progress
 
 if TYPE_CHECKING:
     from mapctl.curve import Curve
     from mapctl.intent import Follow
+    from mapctl.motion import Motion
     from mapctl.solver.result import Solution
     from priors.density import LstmGmmDensity
 
@@ -33,6 +35,14 @@ class Walk:
     """What came out."""
     seconds: float
     """Wall clock of the solve."""
+    person: Wearer | None = None
+    """Who walks, where that is not the canonical body."""
+
+    @property
+    def on_rig(self) -> "Motion":
+        """The motion on the rig it was asked for."""
+        motion = self.solution.motion
+        return motion if self.person is None else self.person.on_rig(motion)
 
     @property
     def interrupted(self) -> bool:
@@ -81,20 +91,28 @@ class Walk:
         ]
 
 
-def walk(prior: "LstmGmmDensity", request: "Follow", *, seed: int, progress: Progress | None = None) -> Walk:
-    """Solve. Compiling or loading the fast path, once a process, is not counted as its time."""
+def walk(
+    prior: "LstmGmmDensity", request: "Follow", *, seed: int, progress: Progress | None = None,
+    person: Wearer | None = None,
+) -> Walk:  # fmt: skip
+    """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
     import torch
 
-    from controllers.follow import follow
+    from controllers.follow import FollowSettings, follow
+    from mapctl.skeleton import CANONICAL
+    from mapctl.terms import Footing
 
     if prior.use_fast:
         _ = prior.fast
+    bones = CANONICAL if person is None else person.skeleton
+    settings = None if person is None else FollowSettings(footing=Footing(rest_height=person.toe_rest_height))
     began = time.perf_counter()
     solution = follow(
         prior, request.curve, seconds=request.seconds, speed=request.profile,
         generator=torch.Generator().manual_seed(seed), progress=progress,
+        skeleton=bones, settings=settings,
     )  # fmt: skip
-    return Walk(request, prior, seed, solution, time.perf_counter() - began)
+    return Walk(request, prior, seed, solution, time.perf_counter() - began, person)
 
 
 def as_follow(curve: "Curve", speed: str | float | None, seconds: float | None) -> "Follow":

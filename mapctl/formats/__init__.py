@@ -36,21 +36,23 @@ _WHY_NOT = {
 }  # fmt: skip
 
 
-def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> Motion:
+def load(
+    path: str | PathLike[str], *, fps: Fraction | float | None = None, metres_per_unit: float | None = None
+) -> Motion:
     """Read a motion from a .bvh, .npz or .amc file, the last with the .asf beside it (see `asf_amc.load`).
 
-    `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do.
-    FileFormatError says what is wrong with the file, and where.
+    `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit`
+    wins over what is found by the size of the body, in formats whose unit is not fixed. FileFormatError says what is
+    wrong with the file, and where.
     """
     ending = PurePath(path).suffix.lower()
     if ending not in READERS:
         why = _WHY_NOT.get(ending, f"cannot read the ending {ending!r}")
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
-    if fps is None:
-        return READERS[ending](path)
-    if ending != ".amc":
+    if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
-    return asf_amc.load(path, fps=fps)
+    motion = READERS[ending](path) if fps is None else asf_amc.load(path, fps=fps)
+    return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit)
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

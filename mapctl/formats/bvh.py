@@ -4,6 +4,7 @@ A position channel replaces its joint's OFFSET when read. Lengths are scaled to 
 (see `units`), and scaled back when written.
 """
 
+from dataclasses import replace
 from os import PathLike
 
 import numpy as np
@@ -47,6 +48,25 @@ def load(path: str | PathLike[str]) -> Motion:
         moving_offsets={joint: torch.from_numpy(travels[joint] * scale) for joint in moving},
         source=layout,
     )
+
+
+def unit_of(motion: Motion) -> float | None:
+    """Metres per unit of the file that a motion was read from; None where it came from none of BVH."""
+    return motion.source.metres_per_unit if isinstance(motion.source, BvhLayout) else None
+
+
+def in_unit(motion: Motion, metres_per_unit: float) -> Motion:
+    """The motion as its BVH file says it if a unit of it is so many metres; other motions as they are."""
+    if not isinstance(motion.source, BvhLayout) or motion.source.metres_per_unit == metres_per_unit:
+        return motion
+    scale, old = metres_per_unit / motion.source.metres_per_unit, motion.skeleton
+    ends = {name: (x * scale, y * scale, z * scale) for name, (x, y, z) in old.end_offsets.items()}
+    return replace(
+        motion, skeleton=Skeleton(old.names, old.parents, old.offsets * scale, ends),
+        root_position=motion.root_position * scale,
+        moving_offsets={joint: track * scale for joint, track in motion.moving_offsets.items()},
+        source=replace(motion.source, metres_per_unit=metres_per_unit),
+    )  # fmt: skip
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

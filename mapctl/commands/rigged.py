@@ -1,0 +1,69 @@
+"""Motion on the user's own rig: whose bones the solver uses, and the way from canonical joints to the rig."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from mapctl.motion import Motion
+    from mapctl.retarget import RigMap
+    from mapctl.skeleton import Skeleton
+
+OutRig = Annotated[str, arg(metavar="canonical|CLIP")]
+"""Type of the option."""
+_HIGHEST_TOES = 0.15  # of the leg: a clip whose planted toes are higher does not have its floor at 0
+
+
+@dataclass(frozen=True, eq=False)
+class Wearer:
+    """Who is to move."""
+
+    skeleton: "Skeleton"
+    """Canonical names and tree with the person's bones."""
+    toe_rest_height: float
+    """Of the person's toe joints while the foot stands flat, metres."""
+    rigmap: "RigMap | None" = None
+    """The way back to the rig; None for the canonical skeleton."""
+    source: object | None = None
+    """Layout and unit of the rig's clip, which the result is written in."""
+
+    def on_rig(self, motion: "Motion") -> "Motion":
+        """A canonical motion of this person on the rig; fingers and whatever else is not canonical rest."""
+        if self.rigmap is None:
+            return motion
+        from mapctl import retarget
+
+        return replace(retarget.from_canonical(motion, self.rigmap), source=self.source)
+
+
+def read(text: str) -> Wearer:
+    """The person of a --rig option: canonical, or of a clip's skeleton. RequestError for a rig without bones."""
+    from mapctl import rigs
+    from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+
+    if text == "canonical":
+        return Wearer(CANONICAL, TOE_REST_HEIGHT)
+    if text in {rig.name for rig in rigs.known()} or Path(text).suffix.lower() == ".toml":
+        raise RequestError(f"the bones of {text} differ from performer to performer: name a clip of that rig")
+    from mapctl import contacts, formats, retarget
+
+    clip = formats.load(text)
+    canonical, rigmap = retarget.to_canonical(clip)
+    toes = canonical.joint_positions()[:, [CANONICAL.index(name) for name in ("leftToes", "rightToes")]]
+    planted = contacts.planted(toes, canonical.fps)
+    heights = toes[..., 1][planted] if planted.any() else contacts.floor_heights(toes)
+    return Wearer(rigmap.skeleton, _rest_height(float(heights.median()), rigmap.skeleton), rigmap, clip.source)
+
+
+def _rest_height(seen: float, skeleton: "Skeleton") -> float:
+    """What a clip shows, if its floor is at 0; else the canonical toes' in scale."""
+    from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+
+    bones = [CANONICAL.index(name) for name in ("leftLowerLeg", "leftFoot")]
+    leg = float(skeleton.offsets[bones].norm(dim=-1).sum())
+    usual = float(CANONICAL.offsets[bones].norm(dim=-1).sum())
+    return seen if 0 <= seen < _HIGHEST_TOES * leg else TOE_REST_HEIGHT * leg / usual

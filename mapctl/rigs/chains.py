@@ -1,0 +1,119 @@
+"""Which joint is which by the tree alone: legs and a trunk hang from the hips, arms and a head from the trunk."""
+
+from collections.abc import Mapping
+from itertools import product
+
+import torch
+
+from mapctl.skeleton import Skeleton
+
+_ALIKE = 1.2  # ratio of the lengths of two bones of one pair
+_SHARE = 0.25  # of the reach of the joint that they hang from, below which two branches are no limbs
+
+Ways = tuple[list[int], list[int]]
+"""The joints of the two limbs of a pair, side by side, from the body outward."""
+
+
+def find(skeleton: Skeleton) -> Mapping[str, int]:
+    """Canonical joint name to the rig's joint, as far as the tree tells; empty where it is no human body's.
+
+    Which limb of a pair is the left one is not told: sides are to be checked by what else is known.
+    """
+    tree = _Tree(skeleton)
+    for hips in range(skeleton.num_joints):
+        for legs in tree.pairs(hips):
+            others = [child for child in tree.children[hips] if child not in (legs[0][0], legs[1][0])]
+            for trunk in sorted(others, key=lambda child: -tree.reach[child]):
+                for chest in tree.below(trunk):
+                    arms = tree.pairs(chest)
+                    if arms:
+                        return _body(tree, hips, legs, chest, arms[0])
+    return {}
+
+
+def _body(tree: "_Tree", hips: int, legs: Ways, chest: int, arms: Ways) -> Mapping[str, int]:
+    found = {"hips": hips}
+    for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
+        found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
+        found |= tree.limb(arm, [side + part for part in ("Shoulder", "UpperArm", "LowerArm", "Hand", "")])
+    trunk = tree.way(hips, chest)
+    if trunk:
+        found["spine"] = trunk[0]
+    if len(trunk) > 1:
+        found["chest"] = trunk[-1]
+    others = [child for child in tree.children[chest] if child not in (arms[0][0], arms[1][0])]
+    if others:
+        up = tree.chain(max(others, key=lambda child: tree.reach[child]))
+        found |= {"head": up[0]} if len(up) == 1 else {"neck": up[0], "head": up[1]}
+    return found
+
+
+class _Tree:
+    """Bone lengths and reaches."""
+
+    def __init__(self, skeleton: Skeleton):
+        self.parents = skeleton.parents
+        self.children = [skeleton.children(joint) for joint in range(skeleton.num_joints)]
+        self.length = skeleton.offsets.norm(dim=-1).tolist()
+        ends = {skeleton.index(name): torch.tensor(site).norm().item() for name, site in skeleton.end_offsets.items()}
+        self.reach = [0.0] * skeleton.num_joints
+        for joint in reversed(range(skeleton.num_joints)):
+            below = [self.length[child] + self.reach[child] for child in self.children[joint]]
+            self.reach[joint] = max([ends.get(joint, 0.0), *below])
+
+    def pairs(self, joint: int) -> list[Ways]:
+        """Branches that are two limbs of one pair, bone for bone of about the same length; the longest pair first."""
+        found = []
+        for k, first in enumerate(self.children[joint]):
+            for second in self.children[joint][k + 1 :]:
+                ways = self.side_by_side(first, second)
+                long = sum(self.length[joint] for joint in ways[0][1:])
+                if len(ways[0]) >= 3 and long >= _SHARE * self.reach[joint] and self.alike(first, second):
+                    found.append((-long, ways))
+        return [ways for _, ways in sorted(found)]
+
+    def side_by_side(self, first: int, second: int) -> Ways:
+        """Down two branches as long as they are alike; a sword in one hand is not."""
+        ways = [first], [second]
+        while True:
+            ends = product(self.children[ways[0][-1]], self.children[ways[1][-1]])
+            steps = [step for step in ends if self.alike(*step)]
+            if not steps:
+                return ways
+            best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
+            for way, joint in zip(ways, best, strict=True):
+                way.append(joint)
+
+    def alike(self, first: int, second: int) -> bool:
+        """Whether two bones are of about the same length."""
+        short, long = sorted((self.length[first], self.length[second]))
+        return long <= _ALIKE * short + 1e-6
+
+    def chain(self, joint: int) -> list[int]:
+        """The joints from this one to the farthest leaf."""
+        way = [joint]
+        while self.children[way[-1]]:
+            way.append(max(self.children[way[-1]], key=lambda child: self.length[child] + self.reach[child]))
+        return way
+
+    def below(self, joint: int) -> list[int]:
+        """The joint and all below it, parents first."""
+        found = [joint]
+        for above in found:
+            found.extend(self.children[above])
+        return found
+
+    def way(self, above: int, joint: int) -> list[int]:
+        """The joints below `above` on the way to a joint, and that joint."""
+        way = []
+        while joint != above:
+            way.append(joint)
+            joint = self.parents[joint]
+        return way[::-1]
+
+    def limb(self, way: list[int], names: list[str]) -> dict[str, int]:
+        """Names of a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
+        both = [self.length[way[k + 1]] + self.length[way[k + 2]] for k in range(len(way) - 2)]
+        upper = max(range(len(both)), key=both.__getitem__)
+        placed = {name: upper + k - 1 for k, name in enumerate(names)}
+        return {name: way[at] for name, at in placed.items() if len(name) > 5 and 0 <= at < len(way)}

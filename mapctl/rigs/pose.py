@@ -1,0 +1,144 @@
+"""What a pose of an unknown rig tells by its joints' places: which way is up, forward and left."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
+
+SAMPLES = 200
+"""Frames of a clip that are looked at, spread over it."""
+_STANDING = 0.8  # cosine between an axis and the body that stands along it
+_CLEAR = 0.3  # of the triple product left x up x toes, below which toes do not tell the facing
+
+JointOf = Sequence[int | None]
+"""For each canonical joint the rig's joint, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of one rig in its file's world: frames of a clip, or the single pose with all rotations zero."""
+
+    places: Float[Tensor, "poses joints 3"]
+    """World positions, metres."""
+    turns: Float[Tensor, "poses joints 4"]
+    """World rotations (xyzw)."""
+    skeleton: Skeleton
+    """The rig's own."""
+    joint_of: tuple[int | None, ...]
+    """Which joint of the rig each canonical one is."""
+
+    @staticmethod
+    def zero(skeleton: Skeleton, joint_of: JointOf) -> "Poses":
+        """All rotations zero."""
+        still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
+        root = torch.zeros(1, 3, dtype=torch.float64)
+        return Poses(*kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, root, still), skeleton,
+                     tuple(joint_of))  # fmt: skip
+
+    @staticmethod
+    def of(motion: Motion, joint_of: JointOf) -> "Poses":
+        """Up to SAMPLES frames of a clip, the first among them."""
+        picked = torch.linspace(0, motion.num_frames - 1, min(SAMPLES, motion.num_frames)).round().long()
+        return Poses(motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton,
+                     tuple(joint_of))  # fmt: skip
+
+    def first(self) -> "Poses":
+        """The first pose alone."""
+        return Poses(self.places[:1], self.turns[:1], self.skeleton, self.joint_of)
+
+    def has(self, *names: str) -> bool:
+        """Whether the rig has all these canonical joints."""
+        return all(self.joint_of[CANONICAL.index(name)] is not None for name in names)
+
+    def place(self, name: str) -> Float[Tensor, "poses 3"]:
+        """Of a canonical joint that the rig has."""
+        joint = self.joint_of[CANONICAL.index(name)]
+        assert joint is not None
+        return self.places[:, joint]
+
+    def end(self, name: str) -> Float[Tensor, "poses 3"] | None:
+        """Of the End Site of a canonical joint, if there is one of some length."""
+        joint = self.joint_of[CANONICAL.index(name)]
+        site = self.skeleton.end_offsets.get(self.skeleton.names[joint]) if joint is not None else None
+        if joint is None or site is None or max(map(abs, site)) < 1e-4:
+            return None
+        offset = torch.tensor(site, dtype=torch.float64).expand(len(self.places), 3)
+        return self.places[:, joint] + rotations.rotate(self.turns[:, joint], offset)
+
+    def up(self) -> Float[Tensor, "poses 3"]:
+        """From the thighs to the upper arms, unit."""
+        high = self.place("leftUpperArm") + self.place("rightUpperArm")
+        return _unit(high - self.place("leftUpperLeg") - self.place("rightUpperLeg"))
+
+    def left(self) -> Float[Tensor, "poses 3"]:
+        """From the right thigh to the left, square to `up`, unit; the upper arms where thighs are one."""
+        across = self.place("leftUpperLeg") - self.place("rightUpperLeg")
+        arms = self.place("leftUpperArm") - self.place("rightUpperArm")
+        across = torch.where(across.norm(dim=-1, keepdim=True) > 1e-3, across, arms)
+        return _unit(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
+
+    def toes(self) -> Float[Tensor, "poses 3"]:
+        """From the feet to the toes or the feet's End Sites, unit; zero where there are none."""
+        ways = [self.way(side + "Foot") for side in ("left", "right")]
+        return _unit(sum((way for way in ways if way is not None), torch.zeros_like(self.places[:, 0])))
+
+    def way(self, name: str) -> Float[Tensor, "poses 3"] | None:
+        """From a canonical joint to the next one of its limb or trunk that the rig has, or its End Site; not unit.
+
+        None where it lacks one of the two.
+        """
+        if not self.has(name):
+            return None
+        following = next_of(name)
+        while following is not None and not self.has(following):
+            following = next_of(following)
+        stop = self.end(name) if following is None else self.place(following)
+        return None if stop is None else stop - self.place(name)
+
+    def handedness(self) -> Float[Tensor, " poses"]:
+        """Left x up along the toes: 1 where sides are what their names say, -1 where they are exchanged."""
+        toes, up = self.toes(), self.up()
+        return (torch.linalg.cross(self.left(), up) * toes).sum(-1)
+
+
+def next_of(name: str) -> str | None:
+    """The canonical joint that a bone leads to: the knee for the thigh; None for hips and for the ends of limbs."""
+    below = {"spine": "chest", "chest": "neck", "neck": "head"}
+    if name in ("hips", *below):
+        return below.get(name)
+    children = CANONICAL.children(CANONICAL.index(name))
+    return CANONICAL.names[children[0]] if children else None
+
+
+def swapped(zero: Poses, clip: Poses | None) -> bool:
+    """Whether the joints that are called left are on the right, seen by the way that the toes point."""
+    rest = float(zero.handedness()[0])
+    if abs(rest) > _CLEAR:
+        return rest < 0
+    return clip is not None and float(clip.handedness().median()) < -_CLEAR
+
+
+def up_axis(zero: Poses, clip: Poses | None) -> str:
+    """Y or Z, as the body stands in the clip, else in the zero pose; Y where neither tells.
+
+    Against the zero pose, and where that tells nothing, only a clip counts in which the body stands along Z all the
+    time: people lie down, too.
+    """
+    rest = zero.up()[0]
+    told = "z" if float(rest[2]) > _STANDING else "y"
+    if clip is None:
+        return told
+    tall = clip.up()
+    if told == "y":
+        return "z" if float(tall[:, 2].min()) > 0.5 and float(tall[:, 2].mean()) > _STANDING else "y"
+    return "y" if float(tall[:, 1].min()) > 0.5 and float(tall[:, 1].mean()) > _STANDING else "z"
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vectors, dim=-1, eps=1e-9)

@@ -1,0 +1,182 @@
+"""What the commands do with rigs: tell them, take them from a file, and put motion on them."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import bandai_skeleton, generator, tiny_density
+from rig_maker import Make, make, names_of, person
+from tiny_prior import save_tiny_prior
+
+import controllers
+import mapctl
+from controllers import steer
+from controllers.follow import FollowSettings
+from controllers.generate import GenerateSettings, generate
+from controllers.stature import Stature
+from mapctl import cli, curves, retarget
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+from mapctl.solver.budget import Budget
+from mapctl.solver.methods import LatentMethod
+from mapctl.solver.window import WindowSettings
+from mapctl.steering import Command
+from mapctl.terms import Footing
+
+QUICK = FollowSettings(window=WindowSettings(frames=10, overlap=4, past=12),
+                       method=LatentMethod(rounds=1, budget=Budget(evaluations=5)))  # fmt: skip
+SIZE = 1.3
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> str:
+    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """Somebody tall, on a Z-up rig whose root travels and whose rest pose is an A."""
+    made = make(Make(names_of("mixamo"), size=SIZE, zup=True, arms_down_deg=40, root="Reference"))
+    path = tmp_path_factory.mktemp("rig") / "tall.bvh"
+    made.motion(person(SIZE, 45)).save(path)
+    return path
+
+
+def run(*words: object) -> int:
+    return cli.main([str(word) for word in words])
+
+
+def taller() -> Skeleton:
+    """The canonical body, larger."""
+    return Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * SIZE)
+
+
+def test_info_tells_a_clips_rig(clip, capsys):
+    assert run("info", clip, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["rig"], told["up"], told["facing"], told["rest_pose"]) == ("mixamo", "z", "-y", "A")
+    assert (told["frames"], told["fps"], told["metres_per_unit"]) == (45, 30, 0.01)
+    assert told["score"] == 1
+    assert told["joints"]["leftUpperLeg"] == "mixamorig:LeftUpLeg"
+    assert "Prop_sword" in told["unmapped"]
+    assert run("info", clip) == 0
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("mixamo", "centimetres", "+z", "1.50", "mixamorig:LeftUpLeg", "Prop_sword"))
+
+
+def test_a_rig_that_is_given_wins(clip, tmp_path, capsys):
+    (tmp_path / "mine.toml").write_text('unit = "in"\nup = "y"\n[joints]\nhips = "mixamorig:Hips"\n')
+    assert run("info", clip, "--json", "--rig", tmp_path / "mine.toml") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["rig"], told["up"], told["metres_per_unit"]) == ("mine", "y", 0.0254)
+    assert run("convert", clip, tmp_path / "a.bvh", "--rig", "canonical", "--source-rig", tmp_path / "mine.toml") == 0
+    assert set(mapctl.load(tmp_path / "a.bvh").skeleton.names) == set(CANONICAL.names)
+    assert run("info", clip, "--rig", clip) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--rig", "cmu-daz"], "rig cmu-daz: no joint 'hip' for hips"),
+        (["--rig", "nobody"], "no rig 'nobody'"),
+        (["--rig", "none.toml"], "no such file"),
+    ],
+)
+def test_rigs_that_do_not_fit_are_refused(clip, words, said, capsys):
+    assert run("info", clip, *words) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+
+
+def test_a_rig_without_a_clip_has_no_bones(prior, tmp_path, capsys):
+    assert run("info", "--rig", "mixamo") == 2
+    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", "--rig", "mixamo", "--prior", prior) == 2
+    assert "name a clip of that rig" in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
+
+
+def test_convert_to_a_z_up_rig_stands_in_its_world(clip, tmp_path):
+    walk = retarget.from_canonical(person(1.0), retarget.map_rig(bandai_skeleton()))
+    walk.save(tmp_path / "in.bvh")
+    assert run("convert", tmp_path / "in.bvh", tmp_path / "out.bvh", "--rig", clip) == 0
+    canonical, rigmap = retarget.to_canonical(mapctl.load(tmp_path / "out.bvh"))
+    assert (rigmap.up, rigmap.rig.name) == ("z", "mixamo")
+    hips = canonical.root_position[:, 1] / SIZE
+    torch.testing.assert_close(hips, person(1.0).root_position[:, 1], atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("job", ["follow", "steer", "generate", "run"])
+def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
+    out = tmp_path / "a.bvh"
+    (tmp_path / "c.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.7,1.0,40\n")
+    scene = f'prior = "{prior}"\noutputs = ["a.bvh"]\n[[actors]]\ncurve = "line:2"\nseconds = 0.7\n'
+    (tmp_path / "s.toml").write_text(scene)
+    words = {
+        "follow": ("line:2", "-o", out, "--seconds", 0.7, "--prior", prior),
+        "steer": (tmp_path / "c.csv", "-o", out, "--prior", prior),
+        "generate": ("-o", tmp_path, "--seconds", 0.7, "--prior", prior, "--no-footing", "--no-refine"),
+        "run": (tmp_path / "s.toml", "-o", tmp_path),
+    }[job]
+    assert run(job, *words, "--rig", clip, "--quiet") == 0
+    made = mapctl.load(tmp_path / "generated_000.bvh" if job == "generate" else out)
+    rig = mapctl.load(clip)
+    assert made.num_frames == 21
+    assert made.skeleton.matches(rig.skeleton, 1e-4)
+    canonical, rigmap = retarget.to_canonical(made)
+    assert rigmap.up == "z"
+    assert 0.8 < float(canonical.root_position[:, 1].mean()) / SIZE < 1.0
+
+
+def test_the_canonical_body_is_not_scaled_at_all():
+    assert Stature().scale == 1.0
+    assert Stature().small is CANONICAL
+    curve, command = curves.circle(radius=2.0), Command(1.0, 0.0)
+    assert Stature().curve(curve) is curve
+    assert Stature().command(command) is command
+
+
+def test_twice_the_legs_make_twice_the_way():
+    """The same walk, of everything twice as long: a prior cannot tell it from its own."""
+    density, double = tiny_density(), Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 2)
+    small = controllers.follow(density, curves.circle(radius=2.0), seconds=1.0, speed=1.0, settings=QUICK,
+                               generator=generator())  # fmt: skip
+    footing = Footing(sigma_speed=0.06, sigma_height=0.02, sigma_below=0.01, rest_height=2 * TOE_REST_HEIGHT)
+    twice = {name: 2 * getattr(QUICK, name) for name in
+             ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")}  # fmt: skip
+    large = controllers.follow(density, curves.circle(radius=4.0), seconds=1.0, speed=2.0, skeleton=double,
+                               settings=replace(QUICK, footing=footing, **twice), generator=generator())  # fmt: skip
+    assert large.motion.skeleton is double
+    places = large.motion.joint_positions() / 2
+    torch.testing.assert_close(places, small.motion.joint_positions(), atol=0.02, rtol=0)
+    residuals = [{entry.name: float(entry.residual.mean()) for entry in done.ledger.entries} for done in (small, large)]
+    assert residuals[1]["path"] == pytest.approx(2 * residuals[0]["path"], rel=0.1)
+
+
+def test_a_tall_character_is_steered_in_its_own_metres():
+    settings = steer.SteerSettings(horizon=10, evaluations=3, footing=Footing(rest_height=SIZE * TOE_REST_HEIGHT))
+    state, first = steer.begin(tiny_density(), Command(1.3, 0.0), generator=generator(), settings=settings,
+                               at=(1.0, 2.0), skeleton=taller())  # fmt: skip
+    torch.testing.assert_close(first.motion.root_position[0, ::2], torch.tensor([1.0, 2.0]).double(), atol=1e-5, rtol=0)
+    state, frames = steer.step(state, Command(1.3, 0.0))
+    assert state.person.scale == pytest.approx(SIZE)
+    assert frames.motion.skeleton.offsets is state.person.skeleton.offsets
+    step = (frames.motion.root_position[0] - first.motion.root_position[0]).norm()
+    assert 0.005 < float(step) < 0.15
+    assert frames.wishes[0].speed == pytest.approx(first.wishes[0].speed, abs=0.2)
+
+
+def test_a_tall_character_goes_on_where_its_clip_ends():
+    clip = person(SIZE, 40)
+    settings = GenerateSettings(finishing=None)
+    drawn = generate(tiny_density(), seconds=0.5, generator=generator(), settings=settings, start_clip=clip,
+                              skeleton=clip.skeleton)  # fmt: skip
+    assert float((drawn.root_position[0] - clip.root_position[-1]).norm()) < 0.1
+    assert drawn.skeleton is clip.skeleton
+
+
+def test_who_has_no_legs_is_refused():
+    stump = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 0.0)
+    with pytest.raises(RequestError, match="legs of a human's length"):
+        Stature(stump, 0.0)

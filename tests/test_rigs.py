@@ -1,0 +1,342 @@
+"""Any rig to canonical joints and back: the listed ones, and those that nobody listed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import bandai_skeleton, cmu_skeleton, generator, random_motion, turn_between, walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rig_maker import Make, make, names_of, person, versions_of
+from scipy.spatial.transform import Rotation
+
+import mapctl
+from mapctl import kinematics, retarget, rigs, rotations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats import bvh
+from mapctl.rigs.matching import ACCEPTED, REQUIRED, match
+from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+
+PRESETS = [rig.name for rig in rigs.known()]
+VERSIONS = [(preset, version) for preset in PRESETS for version in range(versions_of(preset))]
+RESTS = {
+    "T": Make({}),
+    "A, Z up, below a root, facing back": Make({}, arms_down_deg=45, zup=True, turned_deg=180, root="Ground", size=1.3),
+    "no pose, bones along x": Make({}, bones_along_x=True, size=0.8),
+    "no pose, Z up": Make({}, bones_along_x=True, zup=True),
+}
+INVENTED = dict(zip(CANONICAL.names, [
+    "Rumpf_Pelvis", "belly", "upperBack", "nape_neck", "skull",
+    *(f"{part}.{side}" for side in "LR" for part in
+      ("collarbone", "humerus", "elbow", "wrist", "thighbone", "kneejoint", "anklejoint", "toe_root")),
+], strict=True))  # fmt: skip
+NONSENSE = {name: f"bone_{number}" for number, name in enumerate(CANONICAL.names)}
+
+
+def moved(motion, joints):
+    """The motion with the offsets of some joints animated."""
+    still = motion.skeleton.offsets
+    wobble = 0.02 * torch.randn(motion.num_frames, 3, generator=generator(1), dtype=torch.float64)
+    return replace(motion, moving_offsets={j: still[j] + wobble for j in joints})
+
+
+def assert_returns(motion, canonical, rigmap):
+    """Every joint, within 0.01 degree and 0.1 mm and far less."""
+    back = retarget.from_canonical(canonical, rigmap, motion)
+    assert turn_between(back.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
+    torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-8, rtol=0)
+    assert back.moving_offsets.keys() == motion.moving_offsets.keys()
+
+
+def assert_understood(made, wanted, canonical, rigmap, *, degrees=2.0):
+    """The right joints, turned as they are in truth, and the hips where they are."""
+    names = {c: made.skeleton.names[j] for c, j in zip(CANONICAL.names, rigmap.joint_of, strict=True) if j is not None}
+    assert names == dict(made.joint)
+    known = [CANONICAL.index(name) for name in made.joint]
+    turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
+    assert np.rad2deg(turned) < degrees
+    torch.testing.assert_close(canonical.root_position, wanted.root_position, atol=1e-6, rtol=0)
+
+
+def converted(wish, *, frames=40):
+    """A rig as wished, a walk on it, what of it comes out, and the walk itself."""
+    made, wanted = make(wish), person(wish.size, frames)
+    motion = made.motion(wanted)
+    return made, wanted, motion, *retarget.to_canonical(motion)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_says_what_it_is_and_names_what_is_required(preset):
+    rig = next(rig for rig in rigs.known() if rig.name == preset)
+    assert rig.about
+    assert set(REQUIRED) <= rig.joints.keys()
+    for version in range(versions_of(preset)):
+        names = list(names_of(preset, version).values())
+        assert len(set(names)) == len(names)
+    assert rigs.read(preset) == rig
+
+
+@pytest.mark.parametrize("rest", RESTS)
+@pytest.mark.parametrize(("preset", "version"), VERSIONS)
+def test_every_preset_there_and_back(preset, version, rest):
+    made, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of(preset, version)))
+    assert rigmap.rig.name == preset
+    assert rigmap.match.score > 0.9
+    assert_understood(made, wanted, canonical, rigmap)
+    assert_returns(motion, canonical, rigmap)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    preset=st.sampled_from(PRESETS[2:]), size=st.floats(0.6, 1.7), arms=st.floats(0, 80), zup=st.booleans(),
+    quarters=st.integers(0, 3), extras=st.booleans(), root=st.sampled_from([None, "Reference"]), data=st.data(),
+)  # fmt: skip
+def test_whatever_the_rest_pose_it_comes_back(preset, size, arms, zup, quarters, extras, root, data):
+    wish = Make(names_of(preset), size, arms, zup=zup, turned_deg=90.0 * quarters, extras=extras, root=root)
+    made, wanted = make(wish), person(size, 5)
+    joints = st.sets(st.integers(1, made.skeleton.num_joints - 1), max_size=4)
+    motion = moved(made.motion(wanted), data.draw(joints))
+    canonical, rigmap = retarget.to_canonical(motion)
+    assert_returns(motion, canonical, rigmap)
+    known = [CANONICAL.index(name) for name in made.joint]
+    turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
+    assert np.rad2deg(turned) < 0.1
+    assert rigmap.up == ("z" if zup else "y")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_any_motion_at_all_comes_back(preset):
+    """Nobody can tell anything from random rotations, and nothing is lost all the same."""
+    made = make(Make(names_of(preset), arms_down_deg=30))
+    motion = moved(random_motion(made.skeleton, 6, seed=4), [1, 5])
+    assert_returns(motion, *retarget.to_canonical(motion))
+
+
+@pytest.mark.parametrize("rest", RESTS)
+@pytest.mark.parametrize(("names", "least"), [(INVENTED, 0.75), (NONSENSE, ACCEPTED)], ids=["invented", "nonsense"])
+def test_a_rig_that_nobody_listed(names, least, rest):
+    made, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names))
+    assert least < rigmap.match.score <= 1
+    assert_understood(made, wanted, canonical, rigmap)
+    assert_returns(motion, canonical, rigmap)
+    assert set(rigmap.match.unmapped) == set(made.skeleton.names) - set(names.values())
+
+
+@pytest.mark.parametrize("along", [False, True], ids=["T", "no pose"])
+@pytest.mark.parametrize("preset", ["mixamo", "lafan1", "cmu-daz", "bandai-namco"])
+def test_left_is_where_the_left_is_not_what_is_called_so(preset, along):
+    made, wanted, motion, canonical, rigmap = converted(Make(names_of(preset), swapped=True, bones_along_x=along))
+    assert rigmap.match.sides_exchanged
+    assert_understood(made, wanted, canonical, rigmap)
+    assert_returns(motion, canonical, rigmap)
+
+
+@pytest.mark.parametrize("gone", ["Toes", "Shoulder", "Hand", "neck", "chest", "chest neck Shoulder Toes"])
+@pytest.mark.parametrize("preset", ["mixamo", "ue4", "smpl", "vrm"])
+def test_what_a_rig_may_lack(preset, gone):
+    lacking = gone.split()
+    names = {c: own for c, own in names_of(preset).items() if not c.endswith(tuple(lacking))}
+    made, wanted, motion, canonical, rigmap = converted(Make(names, extras=False))
+    assert_understood(made, wanted, canonical, rigmap)
+    assert_returns(motion, canonical, rigmap)
+    for c, joint in enumerate(rigmap.joint_of):
+        if joint is not None:
+            places = canonical.joint_positions()[:, c], motion.joint_positions()[:, joint]
+            torch.testing.assert_close(*places, atol=1e-8, rtol=0)
+    # What is put in lies about where it would be.
+    lengths = rigmap.skeleton.offsets[1:].norm(dim=-1)
+    assert float(lengths.min()) > 0.01
+    assert float((canonical.joint_positions() - wanted.joint_positions()).norm(dim=-1).max()) < 0.08
+
+
+def test_a_foot_without_toes_and_end_site_gets_toes_in_scale():
+    names = {c: own for c, own in names_of("ue4").items() if not c.endswith("Toes")}
+    *_, rigmap = converted(Make(names, size=1.5, end_sites=False))
+    toes = CANONICAL.index("leftToes")
+    torch.testing.assert_close(rigmap.skeleton.offsets[toes], 1.5 * CANONICAL.offsets[toes], atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("gone", ["leftLowerLeg", "rightLowerArm"])
+def test_a_rig_that_lacks_more_is_refused_by_name(gone):
+    names = {c: own for c, own in INVENTED.items() if c != gone}
+    made = make(Make(names, extras=False))
+    with pytest.raises(RequestError, match=f"{gone}.*known rigs"):
+        match(made.skeleton)
+
+
+def test_a_horse_is_refused():
+    names = ("root", "belly", "front_l", "front_l2", "hind_l", "hind_l2", "tail")
+    horse = Skeleton(names, (-1, 0, 1, 2, 0, 4, 0), torch.rand(7, 3, generator=generator()).double())
+    with pytest.raises(RequestError, match=r"leftUpperArm.*score 0\.\d+"):
+        match(horse)
+
+
+def test_a_clip_that_begins_with_a_t_pose_shows_what_its_zero_pose_does_not():
+    """A rig whose joints are turned at random: only the first frame tells how."""
+    made, wanted = make(Make(names_of("xsens"), extras=False)), person(1.0, 30)
+    frames = Rotation.random(made.skeleton.num_joints, rng=3)
+    turned = dict(zip(made.skeleton.names, frames, strict=True))
+    offsets = [made.skeleton.offsets[0]] + [
+        torch.from_numpy(frames[p].inv().apply(made.skeleton.offsets[j].numpy()))
+        for j, p in enumerate(made.skeleton.parents)
+        if p >= 0
+    ]
+    still = torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4)
+    begins = replace(wanted, root_position=wanted.root_position[:1], local_quat_xyzw=still).join(wanted)
+    strange = replace(made, skeleton=replace(made.skeleton, offsets=torch.stack(offsets), end_offsets={}),
+                      tpose={c: turned[own] for c, own in made.joint.items()})  # fmt: skip
+    motion = strange.motion(begins)
+    canonical, rigmap = retarget.to_canonical(motion)
+    assert (rigmap.rest, rigmap.tpose_from) == ("neither", "frame 0")
+    assert_understood(strange, begins, canonical, rigmap)
+    assert_returns(motion, canonical, rigmap)
+
+
+@pytest.mark.parametrize("rest", RESTS)
+def test_a_part_of_a_clip_is_converted_as_the_whole_was(rest):
+    *_, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of("vicon")))
+    part, again = retarget.to_canonical(motion.slice(30, 33), retarget.settled(rigmap))
+    assert again.joint_of == rigmap.joint_of
+    assert turn_between(part.local_quat_xyzw, canonical.local_quat_xyzw[30:33]) < 1e-6
+    torch.testing.assert_close(part.joint_positions(), canonical.joint_positions()[30:33], atol=1e-8, rtol=0)
+    assert_returns(motion.slice(30, 33), part, again)
+
+
+def test_a_z_up_file_is_turned_and_written_back_as_it_was(tmp_path):
+    _, wanted, motion, *_ = converted(Make(names_of("mixamo"), zup=True, arms_down_deg=40))
+    motion.save(tmp_path / "a.bvh")
+    read = mapctl.load(tmp_path / "a.bvh")
+    canonical, rigmap = retarget.to_canonical(read)
+    retarget.from_canonical(canonical, rigmap, read).save(tmp_path / "b.bvh")
+    assert rigmap.up == "z"
+    feet = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
+    low = canonical.joint_positions()[:, feet, 1].amin(-1)
+    torch.testing.assert_close(low, wanted.joint_positions()[:, feet, 1].amin(-1), atol=1e-4, rtol=0)
+    again = mapctl.load(tmp_path / "b.bvh")
+    torch.testing.assert_close(again.joint_positions(), read.joint_positions(), atol=1e-5, rtol=0)
+
+
+def test_hips_below_a_travelling_root_move_with_it():
+    """A changed motion is carried by the root, since the file's hips do not travel within it."""
+    *_, motion, canonical, rigmap = converted(Make(names_of("ue5"), root="root"))
+    there = replace(canonical, root_position=canonical.root_position + 1)
+    back = retarget.from_canonical(there, rigmap, motion)
+    assert not back.moving_offsets
+    torch.testing.assert_close(back.root_position, motion.root_position + 1, atol=1e-9, rtol=0)
+
+
+def frozen_conversion(motion, rig):
+    """The conversion of the two rigs that the bundled priors were trained through, as it was then."""
+    joint_of = [motion.skeleton.index(rig.joints[c]) if c in rig.joints else None for c in CANONICAL.names]
+    picked, world = [], motion.joint_rotations()
+    for index, (name, joint) in enumerate(zip(CANONICAL.names, joint_of, strict=True)):
+        axes, matrix = rig.tpose.get(name), torch.eye(3, dtype=torch.float64)
+        if axes:
+            x, y = (torch.tensor(axes[axis], dtype=torch.float64) for axis in ("x", "y"))
+            x = torch.nn.functional.normalize(x, dim=0)
+            y = torch.nn.functional.normalize(y - x * (x @ y), dim=0)
+            matrix = torch.stack([x, y, torch.linalg.cross(x, y)], dim=1)
+        if name in rig.straighten:
+            child = CANONICAL.children(index)[0]
+            bone = torch.nn.functional.normalize(motion.skeleton.offsets[joint_of[child]], dim=0)
+            aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
+            axis, cosine = torch.linalg.cross(bone, aim), bone @ aim
+            sine = axis.norm().clamp_min(1e-12)
+            matrix = rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
+        tpose = rotations.from_matrix(matrix)
+        if joint is None:
+            picked.append(picked[CANONICAL.parents[index]])
+        else:
+            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
+    local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
+    return rotations.sign_continuous(local), motion.joint_positions()[:, joint_of[0]]
+
+
+@pytest.mark.parametrize(("name", "skeleton"), [("bandai-namco", bandai_skeleton()), ("cmu-daz", cmu_skeleton())])
+def test_the_rigs_that_priors_were_trained_through_convert_bit_for_bit_as_they_did(name, skeleton):
+    for motion in (random_motion(skeleton, 8), retarget.from_canonical(walk(20), retarget.map_rig(skeleton))):
+        canonical, rigmap = retarget.to_canonical(motion)
+        local, hips = frozen_conversion(motion, rigs.read(name))
+        assert rigmap.rig.name == name
+        assert torch.equal(canonical.local_quat_xyzw, local)
+        assert torch.equal(canonical.root_position, hips)
+
+
+TOML = """
+name = "ours"
+up = "{up}"
+rest = "{rest}"
+facing = "{facing}"
+unit = "{unit}"
+[joints]
+hips = "Rumpf_Pelvis"
+spine = "belly"
+"""
+
+
+def test_a_toml_file_wins(tmp_path):
+    made, wanted, motion, *_ = converted(Make(INVENTED, zup=True, arms_down_deg=20))
+    path = tmp_path / "ours.toml"
+    path.write_text(TOML.format(up="z", rest="straighten", facing="-y", unit="cm"))
+    rig = rigs.read(path)
+    assert (rig.name, rig.up, rig.metres_per_unit) == ("ours", "z", 0.01)
+    canonical, rigmap = retarget.to_canonical(motion, rig)
+    assert rigmap.rig is rig
+    assert_understood(made, wanted, canonical, rigmap)
+    path.write_text(TOML.format(up="y", rest="tpose", facing="auto", unit="m"))
+    canonical, rigmap = retarget.to_canonical(motion, rigs.read(path))
+    assert (rigmap.up, rigmap.tpose_from) == ("y", "table")
+    assert_returns(motion, canonical, rigmap)
+
+
+def test_a_unit_that_is_set_wins(tmp_path):
+    motion = make(Make(names_of("mixamo"))).motion(person(1.0, 5))
+    motion.save(tmp_path / "a.bvh")
+    found = mapctl.load(tmp_path / "a.bvh")
+    inches = mapctl.load(tmp_path / "a.bvh", metres_per_unit=0.0254)
+    assert (bvh.unit_of(found), bvh.unit_of(inches), bvh.unit_of(motion)) == (0.01, 0.0254, None)
+    torch.testing.assert_close(inches.joint_positions(), 2.54 * found.joint_positions())
+    inches.save(tmp_path / "b.bvh")
+    torch.testing.assert_close(mapctl.load(tmp_path / "b.bvh").root_position, found.root_position, atol=1e-6, rtol=0)
+
+
+def test_the_rig_of_a_clip_is_one_for_others(tmp_path):
+    made, _, motion, _, rigmap = converted(Make(NONSENSE))
+    motion.save(tmp_path / "a.bvh")
+    assert rigs.read(tmp_path / "a.bvh").joints == NONSENSE
+    assert retarget.map_rig(made.skeleton, rigs.read(tmp_path / "a.bvh")).joint_of == rigmap.joint_of
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name = ", "no TOML"),
+        ('up = "w"', "up is one of"),
+        ('rest = "lying"', "rest is one of"),
+        ('unit = "parsec"', "unit is"),
+        ("unit = -1", "unit is"),
+        ('[joints]\nnose = "Nose"', "canonical joint 'nose'"),
+        ("[joints]\nhips = 3", "hips is the rig's name"),
+        ('joint = "Hips"', "no 'joint'"),
+        ("joints = 3", "table"),
+    ],
+)
+def test_a_bad_toml_file_is_refused_with_its_name(tmp_path, text, said):
+    (tmp_path / "bad.toml").write_text(text)
+    with pytest.raises(FileFormatError, match=f"bad.toml.*{said}"):
+        rigs.read(tmp_path / "bad.toml")
+
+
+def test_what_is_no_rig_at_all_is_refused(tmp_path):
+    with pytest.raises(RequestError, match=r"no rig 'mixammo'; known rigs: canonical.*mixamo"):
+        rigs.read("mixammo")
+    with pytest.raises(FileFormatError, match="no such file"):
+        rigs.read(tmp_path / "none.toml")
+    with pytest.raises(RequestError, match=r"rig mixamo: no joint 'mixamorig:Hips' for hips; the skeleton has"):
+        retarget.map_rig(cmu_skeleton(), rigs.read("mixamo"))
+
+
+def test_canonical_joints_mirror_each_other_in_every_preset():
+    for rig in rigs.known():
+        assert {mirrored_name(name) for name in rig.joints} == set(rig.joints)
