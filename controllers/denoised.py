@@ -35,7 +35,7 @@ class Denoised:
     """Everything that was found wrong."""
     contacts: Bool[Tensor, "frames 2"]
     """Left and right toe planted, at the prior's rate."""
-    believed: Float[Tensor, "frames joints"]
+    believed: Float[Tensor, "frames canonical"]
     """By frame at the prior's rate and canonical joint: 1 where the proposal was followed, 0 where the capture itself,
     smoothed, took its place."""
     ledger: Ledger
