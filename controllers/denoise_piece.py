@@ -56,7 +56,7 @@ class Piece:
         self.seen_root = examined.seen_root & _above_hips(examined.seen, self.rigmap)
         self.sigma, self.sigma_root = self._noise(canonical, seen)
         self.bands = split(canonical)
-        if self.bands.whole:
+        if self.bands.exact:
             # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
             self.bands = split(_signed_like(to_canonical(examined.motion)[0], canonical))
         self.shown = self.bands.at_prior_rate()
@@ -65,7 +65,7 @@ class Piece:
     def run(self, density: Any) -> Denoised:
         """Propose, give back, put the feet down, return to the rig."""
         proposal, contacts = self._propose()
-        if self.bands.whole:
+        if self.bands.exact:
             self.capture = self._look_again(proposal)
             proposal, contacts = self._propose()
         proposal, share = self._given_back(proposal)
@@ -99,7 +99,7 @@ class Piece:
     def _spikes_on_rig(self) -> Bool[Tensor, "frames joints"]:
         """By joint of the rig; where the proposal told them, as it told them."""
         spikes = self.examined.spikes.clone()
-        if self.bands.whole:
+        if self.bands.exact:
             told = ~self.capture.seen[0]
             for canonical, joint in enumerate(self.rigmap.joint_of):
                 if joint is not None:
@@ -108,7 +108,7 @@ class Piece:
 
     def _spikes_of_root(self) -> Bool[Tensor, "frames 1"]:
         """In which frames the root's place leaps."""
-        if not self.bands.whole:
+        if not self.bands.exact:
             return self.examined.spikes_root[:, None]
         return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
 

@@ -37,8 +37,13 @@ class Bands:
 
     @property
     def whole(self) -> bool:
-        """Whether all of the recording is slow: no frame is then mixed with its neighbours."""
+        """Whether all of the recording is slow."""
         return _is_slow(float(self.slow.fps))
+
+    @property
+    def exact(self) -> bool:
+        """Whether the prior is shown the recording's own frames: none is then mixed with its neighbours."""
+        return self.slow.fps == PRIOR_FPS
 
     def noise_at_prior_rate(self, sigma: Tensor) -> Tensor:
         """White noise at the prior's rate that is as dense, below the edge, as the recording's of this sigma."""
