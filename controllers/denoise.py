@@ -17,7 +17,7 @@ from controllers.denoise_piece import DenoiseSettings, Piece
 from controllers.denoised import Denoised, joined
 from mapctl import rotations
 from mapctl.capture.examine import examine
-from mapctl.capture.masks import Mask, part_of
+from mapctl.capture.masks import Mask, masked, part_of
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
 from mapctl.retarget import to_canonical
@@ -43,6 +43,7 @@ def denoise(
     memory beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
     """
     settings = settings or DenoiseSettings()
+    masked(motion, masks)  # whole: of a piece they are cut to its frames
     lead = 1 if begins_with_tpose(motion) else 0
     frames = motion.num_frames - lead
     long, shared = (max(_SHORTEST, round(seconds * float(motion.fps))) for seconds in (_PIECE, _SHARED))
