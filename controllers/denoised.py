@@ -51,11 +51,10 @@ class Denoised:
         part = slice(round(start * ratio), round(stop * ratio))
         faults = (replace(fault, start=fault.start - start, stop=min(fault.stop, stop) - start)
                   for fault in self.faults if start <= fault.start < stop)  # fmt: skip
-        entries = (replace(e, energy=e.energy[part], residual=e.residual[part]) for e in self.ledger.entries)
         return replace(
             self, motion=self.motion.slice(start, stop), capture=self.capture.slice(start, stop),
             faults=tuple(faults), contacts=self.contacts[part], believed=self.believed[part],
-            ledger=Ledger(tuple(entries)),
+            ledger=_part(self.ledger, part),
         )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -113,8 +112,9 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
     shared = whole.motion.num_frames - start
     motion = faded(whole.motion, piece.motion, shared)
     ratio = PRIOR_FPS / float(motion.fps)
-    kept, skipped = round((start + shared // 2) * ratio), round(shared // 2 * ratio)
     skip = start + shared // 2
+    kept = round(skip * ratio)
+    skipped = kept - round(start * ratio)
     faults = [fault for fault in whole.faults if fault.start < skip]
     faults += [replace(f, start=f.start + start, stop=f.stop + start) for f in piece.faults if f.start + start >= skip]
     share = piece.motion.num_frames / motion.num_frames
@@ -124,9 +124,16 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
         noise_root=(1 - share) * whole.noise_root + share * piece.noise_root, faults=tuple(faults),
         contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
         believed=torch.cat([whole.believed[:kept], piece.believed[skipped:]]),
-        ledger=whole.ledger.slice(kept).join(piece.ledger), seconds=whole.seconds + piece.seconds,
+        ledger=whole.ledger.slice(kept).join(_part(piece.ledger, slice(skipped, None))),
+        seconds=whole.seconds + piece.seconds,
         notes=tuple(dict.fromkeys(whole.notes + piece.notes)),
     )  # fmt: skip
+
+
+def _part(ledger: Ledger, frames: slice) -> Ledger:
+    """Of some frames."""
+    entries = (replace(e, energy=e.energy[frames], residual=e.residual[frames]) for e in ledger.entries)
+    return Ledger(tuple(entries))
 
 
 def faded(before: Motion, after: Motion, shared: int) -> Motion:
