@@ -72,9 +72,11 @@ class Piece:
         stood = stand(proposal, contacts, self.capture, self.settings.standing, density=density)
         joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
-        examined, found = self.examined, self._faults(motion, proposal, stood)
-        return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts, 1 - share,
-                        stood.ledger)  # fmt: skip
+        within = self.bands.within
+        stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
+        examined, found = self.examined, self._faults(motion, proposal.slice(0, within), stood)
+        return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts,
+                        1 - share[:within], stood.ledger)  # fmt: skip
 
     def _faults(self, motion: Motion, proposal: Motion, stood: Stood) -> tuple[faults.Fault, ...]:
         """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""
