@@ -45,6 +45,16 @@ def test_a_recording_without_noise_of_which_nothing_is_changed_comes_back(fps):
     assert (again.root_position - motion.root_position).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("fps", [24, 29, Fraction(30000, 1001), 30, 60, 100, 120])
+@pytest.mark.parametrize("frames", [1, 2, 3, 50, 51, 52, 53])
+def test_what_the_prior_is_shown_reaches_to_the_end_and_no_further_than_it_must(fps, frames):
+    bands = split(recording(fps).slice(0, frames))
+    end = Fraction(frames - 1) / Fraction(fps) * 30
+    assert end <= bands.at_prior_rate().num_frames - 1 < end + 1
+    assert bands.within - 1 <= end < bands.within
+    assert bands.exact == (fps == 30)
+
+
 @pytest.mark.parametrize("fps", [Fraction(1, 2), 10, 24, Fraction(30000, 1001), 30])
 def test_at_the_priors_rate_or_less_everything_is_slow(fps):
     motion = recording(fps, 6.0)
