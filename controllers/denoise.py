@@ -12,15 +12,17 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from controllers.denoise_piece import DenoiseSettings, Piece
 from controllers.denoised import Denoised, joined
 from mapctl import rotations
 from mapctl.capture.examine import examine
-from mapctl.capture.masks import Mask, part_of
+from mapctl.capture.masks import Mask, masked, part_of
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
-from mapctl.retarget import to_canonical
+from mapctl.retarget import from_canonical, map_rig, to_canonical
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.result import Ledger
 
@@ -43,6 +45,7 @@ def denoise(
     memory beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
     """
     settings = settings or DenoiseSettings()
+    masked(motion, masks)  # whole: of a piece they are cut to its frames
     lead = 1 if begins_with_tpose(motion) else 0
     frames = motion.num_frames - lead
     long, shared = (max(_SHORTEST, round(seconds * float(motion.fps))) for seconds in (_PIECE, _SHARED))
@@ -89,12 +92,25 @@ def _cleaned(
 def _led_by(motion: Motion, done: Denoised) -> Denoised:
     """With frame 0 before it: a T-pose, from which joints go back to rest that are there but for the noise."""
     first = motion.slice(0, 1)
-    turned = rotations.to_rotation_vector(first.local_quat_xyzw).norm(dim=-1)
+    rest = min(_rests(motion), key=lambda quats: float(_apart(quats, first.local_quat_xyzw).mean()))
     # In a noisy capture a joint that is further off has been hit by a spike.
     reach = torch.where(done.noise > math.radians(_NOISY_DEG), math.radians(_SPIKE_DEG), _NEAR_REST * done.noise)
-    at_rest = turned < reach
-    rest = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    at_rest = _apart(rest, first.local_quat_xyzw) < reach
     first = replace(first, local_quat_xyzw=torch.where(at_rest[..., None], rest, first.local_quat_xyzw))
     faults = tuple(replace(fault, start=fault.start + 1, stop=fault.stop + 1) for fault in done.faults)
     note = "frame 0 is a T-pose: it stays, but for noise of joints at rest"
     return replace(done, motion=first.join(done.motion), capture=motion, faults=faults, notes=(note, *done.notes))
+
+
+def _rests(motion: Motion) -> list[Float[Tensor, "1 joints 4"]]:
+    """Local rotations that a T-pose may be meant to have: none, as in CMU's takes, and those of the rig's T-pose."""
+    rigmap = map_rig(motion.skeleton)
+    none = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    tpose = Motion(rigmap.skeleton, motion.fps, torch.zeros(1, 3, dtype=torch.float64),
+                   none.expand(1, CANONICAL.num_joints, 4))  # fmt: skip
+    return [none.expand(1, motion.num_joints, 4), from_canonical(tpose, rigmap).local_quat_xyzw]
+
+
+def _apart(first: Float[Tensor, "1 joints 4"], second: Float[Tensor, "1 joints 4"]) -> Float[Tensor, "1 joints"]:
+    """Angles between rotations, radians."""
+    return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(first), second)).norm(dim=-1)

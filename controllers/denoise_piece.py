@@ -58,7 +58,7 @@ class Piece:
         self.seen_root = examined.seen_root & _above_hips(examined.seen, self.rigmap)
         self.sigma, self.sigma_root = self._noise(canonical, seen)
         self.bands = split(canonical)
-        if self.bands.whole:
+        if self.bands.exact:
             # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
             self.bands = split(_signed_like(to_canonical(examined.motion)[0], canonical))
         self.shown = self.bands.at_prior_rate()
@@ -67,7 +67,7 @@ class Piece:
     def run(self, density: Any) -> Denoised:
         """Propose, give back, put the feet down, return to the rig."""
         proposal, contacts = self._propose()
-        if self.bands.whole:
+        if self.bands.exact:
             self.capture = self._look_again(proposal)
             proposal, contacts = self._propose()
         proposal, share = self._given_back(proposal)
@@ -76,9 +76,11 @@ class Piece:
         stood = stand(proposal, contacts, self.capture, self.settings.standing, density=density)
         joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
-        examined, found = self.examined, self._faults(motion, proposal, stood)
-        return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts, 1 - share,
-                        stood.ledger)  # fmt: skip
+        within = self.bands.within
+        stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
+        examined, found = self.examined, self._faults(motion, proposal.slice(0, within), stood)
+        return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts,
+                        1 - share[:within], stood.ledger)  # fmt: skip
 
     def _faults(self, motion: Motion, proposal: Motion, stood: Stood) -> tuple[faults.Fault, ...]:
         """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""
@@ -103,7 +105,7 @@ class Piece:
     def _spikes_on_rig(self) -> Bool[Tensor, "frames joints"]:
         """By joint of the rig; where the proposal told them, as it told them."""
         spikes = self.examined.spikes.clone()
-        if self.bands.whole:
+        if self.bands.exact:
             told = ~self.capture.seen[0]
             for canonical, joint in enumerate(self.rigmap.joint_of):
                 if joint is not None:
@@ -112,7 +114,7 @@ class Piece:
 
     def _spikes_of_root(self) -> Bool[Tensor, "frames 1"]:
         """In which frames the root's place leaps."""
-        if not self.bands.whole:
+        if not self.bands.exact:
             return self.examined.spikes_root[:, None]
         return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
 

@@ -35,7 +35,7 @@ class Denoised:
     """Everything that was found wrong."""
     contacts: Bool[Tensor, "frames 2"]
     """Left and right toe planted, at the prior's rate."""
-    believed: Float[Tensor, "frames joints"]
+    believed: Float[Tensor, "frames canonical"]
     """By frame at the prior's rate and canonical joint: 1 where the proposal was followed, 0 where the capture itself,
     smoothed, took its place."""
     ledger: Ledger
@@ -46,16 +46,14 @@ class Denoised:
     """What the user should know."""
 
     def slice(self, start: int, stop: int) -> "Denoised":
-        """Frames start to stop, with the faults that begin in them; the noise stays that of the whole."""
+        """Frames start to stop, with what was wrong in them; the noise stays that of the whole."""
         ratio = PRIOR_FPS / float(self.motion.fps)
         part = slice(round(start * ratio), round(stop * ratio))
-        faults = (replace(fault, start=fault.start - start, stop=min(fault.stop, stop) - start)
-                  for fault in self.faults if start <= fault.start < stop)  # fmt: skip
-        entries = (replace(e, energy=e.energy[part], residual=e.residual[part]) for e in self.ledger.entries)
+        faults = (replace(f, start=f.start - start, stop=f.stop - start) for f in _between(self.faults, start, stop))
         return replace(
             self, motion=self.motion.slice(start, stop), capture=self.capture.slice(start, stop),
             faults=tuple(faults), contacts=self.contacts[part], believed=self.believed[part],
-            ledger=Ledger(tuple(entries)),
+            ledger=_part(self.ledger, part),
         )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -113,20 +111,48 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
     shared = whole.motion.num_frames - start
     motion = faded(whole.motion, piece.motion, shared)
     ratio = PRIOR_FPS / float(motion.fps)
-    kept, skipped = round((start + shared // 2) * ratio), round(shared // 2 * ratio)
     skip = start + shared // 2
-    faults = [fault for fault in whole.faults if fault.start < skip]
-    faults += [replace(f, start=f.start + start, stop=f.stop + start) for f in piece.faults if f.start + start >= skip]
+    kept = round(skip * ratio)
+    skipped = kept - round(start * ratio)
+    later = [replace(fault, start=fault.start + start, stop=fault.stop + start) for fault in piece.faults]
+    faults = _chained(_between(whole.faults, 0, skip), _between(later, skip, motion.num_frames))
     share = piece.motion.num_frames / motion.num_frames
     return replace(
         whole, motion=motion, capture=whole.capture.join(piece.capture.slice(shared, piece.capture.num_frames)),
         noise=(1 - share) * whole.noise + share * piece.noise,
-        noise_root=(1 - share) * whole.noise_root + share * piece.noise_root, faults=tuple(faults),
+        noise_root=(1 - share) * whole.noise_root + share * piece.noise_root, faults=faults,
         contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
         believed=torch.cat([whole.believed[:kept], piece.believed[skipped:]]),
-        ledger=whole.ledger.slice(kept).join(piece.ledger), seconds=whole.seconds + piece.seconds,
+        ledger=whole.ledger.slice(kept).join(_part(piece.ledger, slice(skipped, None))),
+        seconds=whole.seconds + piece.seconds,
         notes=tuple(dict.fromkeys(whole.notes + piece.notes)),
     )  # fmt: skip
+
+
+def _between(faults: Sequence[Fault], start: int, stop: int) -> list[Fault]:
+    """What of the faults lies in frames start to stop."""
+    cut = [replace(fault, start=max(fault.start, start), stop=min(fault.stop, stop)) for fault in faults]
+    return [fault for fault in cut if fault.start < fault.stop]
+
+
+def _chained(before: Sequence[Fault], after: Sequence[Fault]) -> tuple[Fault, ...]:
+    """Both; what ends where the same goes on is one fault, as bad as the worse of the two."""
+    ends = {(fault.joint, fault.kind, fault.unit, fault.stop): number for number, fault in enumerate(before)}
+    chained = list(before)
+    for fault in after:
+        number = ends.get((fault.joint, fault.kind, fault.unit, fault.start))
+        if number is None:
+            chained.append(fault)
+        else:
+            first = chained[number]
+            chained[number] = replace(first, stop=fault.stop, amount=max(first.amount, fault.amount))
+    return tuple(chained)
+
+
+def _part(ledger: Ledger, frames: slice) -> Ledger:
+    """Of some frames."""
+    entries = (replace(e, energy=e.energy[frames], residual=e.residual[frames]) for e in ledger.entries)
+    return Ledger(tuple(entries))
 
 
 def faded(before: Motion, after: Motion, shared: int) -> Motion:

@@ -4,6 +4,7 @@ The slow band is what the prior is shown at its own rate; what it changes is car
 kept as far as it is more than the noise, moment by moment and joint by joint, so that a true kick survives.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,16 +38,32 @@ class Bands:
 
     @property
     def whole(self) -> bool:
-        """Whether all of the recording is slow: no frame is then mixed with its neighbours."""
+        """Whether all of the recording is slow."""
         return _is_slow(float(self.slow.fps))
+
+    @property
+    def exact(self) -> bool:
+        """Whether the prior is shown the recording's own frames: none is then mixed with its neighbours."""
+        return self.slow.fps == PRIOR_FPS
 
     def noise_at_prior_rate(self, sigma: Tensor) -> Tensor:
         """White noise at the prior's rate that is as dense, below the edge, as the recording's of this sigma."""
         return sigma * min(1.0, PRIOR_FPS / float(self.slow.fps)) ** 0.5
 
     def at_prior_rate(self) -> Motion:
-        """The slow band at the prior's rate."""
-        return self.slow.resample(PRIOR_FPS)
+        """The slow band at the prior's rate, to its very end: a last frame that falls between two is followed by one
+        more, in which the motion holds. What is changed there is else only held on to, and noise that differs stays.
+        """
+        slow, last = self.slow, (self.slow.num_frames - 1) * PRIOR_FPS / self.slow.fps
+        beyond = math.ceil((math.ceil(last) - last) * slow.fps / PRIOR_FPS)
+        frame = torch.arange(slow.num_frames + beyond).clamp(max=slow.num_frames - 1)
+        held = Motion(slow.skeleton, slow.fps, slow.root_position[frame], slow.local_quat_xyzw[frame])
+        return held.resample(PRIOR_FPS).slice(0, math.ceil(last) + 1)
+
+    @property
+    def within(self) -> int:
+        """How many frames at the prior's rate lie within the recording."""
+        return int((self.slow.num_frames - 1) * PRIOR_FPS / self.slow.fps) + 1
 
     def joined(self, shown: Motion, cleaned: Motion, sigma: Float[Tensor, " joints"], sigma_root: float) -> Motion:
         """The slow band changed as `shown` (see `at_prior_rate`) was to `cleaned`, and what the fast one has of motion.

@@ -46,10 +46,12 @@ def leaps(rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"
 
 
 def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
-    """Over `_SPAN` frames; at the ends the outermost frame is repeated."""
-    side = _SPAN // 2
-    padded = torch.cat([values[:1].expand(side, -1), values, values[-1:].expand(side, -1)])
-    return padded.unfold(0, _SPAN, 1).median(dim=-1).values
+    """Over `_SPAN` frames; beyond the ends they are mirrored, since repeated, an outermost frame that leaps would be
+    its own median.
+    """
+    side, last = _SPAN // 2, len(values) - 1
+    frame = last - (last - torch.arange(-side, len(values) + side).abs()).abs()
+    return values[frame.clamp_min(0)].unfold(0, _SPAN, 1).median(dim=-1).values
 
 
 def _usual_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames joints"]:

@@ -102,6 +102,8 @@ class Denoise:
         if self.video is not None:
             outputs.check_film(self.video, (1280, 720))
         if self.plot is not None:
+            if self.plot.suffix.lower() != ".png":
+                raise RequestError(f"--plot writes .png, not {self.plot.suffix or 'a file without ending'}")
             outputs.require_render("matplotlib")
 
     def _denoised(self) -> "Denoised":

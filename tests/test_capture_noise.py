@@ -1,0 +1,117 @@
+"""How noisy a recording is, told from the recording alone."""
+
+import math
+
+import pytest
+import torch
+from captures import DEGREE, shaken, swaying
+from helpers import generator
+
+from mapctl.capture.noise import angle_noise, place_noise
+
+
+def all_seen(quats):
+    return torch.ones(quats.shape[:2], dtype=torch.bool)
+
+
+def told_deg(quats, seen=None):
+    return torch.rad2deg(angle_noise(quats, all_seen(quats) if seen is None else seen))
+
+
+def smooth_place(frames):
+    time = torch.arange(frames, dtype=torch.float64) / 30
+    return torch.stack([1.2 * time, 0.9 + 0.03 * torch.sin(9 * time), 0.2 * torch.sin(2 * time)], dim=-1)
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+@pytest.mark.parametrize("degrees", [0.5, 1, 3, 8, 15])
+def test_white_noise_of_angles_is_told(degrees, fps):
+    quats = shaken(swaying(800, fps=fps), degrees * DEGREE)
+    assert told_deg(quats).tolist() == pytest.approx([degrees] * 6, rel=0.12)
+
+
+@pytest.mark.parametrize("centimetres", [0.1, 1, 5])
+def test_white_noise_of_places_is_told(centimetres):
+    places = smooth_place(800)
+    noisy = places + centimetres / 100 * torch.randn(800, 3, generator=generator(), dtype=torch.float64)
+    seen = torch.ones(800, dtype=torch.bool)
+    assert 100 * place_noise(noisy, seen) == pytest.approx(centimetres, rel=0.12)
+
+
+def test_every_joint_has_its_own():
+    sigmas = torch.tensor([0.0, 0.5, 1.0, 2.0, 4.0, 8.0]) * DEGREE
+    found = told_deg(shaken(swaying(800), sigmas))
+    assert found[0] < 0.05
+    assert found[1:].tolist() == pytest.approx([0.5, 1, 2, 4, 8], rel=0.12)
+
+
+def test_smooth_motion_without_noise_has_none():
+    assert told_deg(swaying(300)).max() < 0.05
+    assert 100 * place_noise(smooth_place(300), torch.ones(300, dtype=torch.bool)) < 0.05
+
+
+def test_a_joint_that_never_moves_has_none():
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(100, 2, 4)
+    assert angle_noise(still, all_seen(still)).tolist() == [0, 0]
+
+
+def test_spikes_do_not_upset_it():
+    quats = shaken(swaying(800), 2 * DEGREE)
+    hit = (torch.rand(800, 6, generator=generator(3)) < 0.02)[..., None]
+    assert told_deg(torch.where(hit, shaken(quats, 45 * DEGREE, seed=4), quats)).tolist() == pytest.approx(
+        [2.0] * 6, rel=0.2
+    )
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_noise_about_some_axes_only_is_told_as_the_root_mean_square_of_three(axes):
+    found = told_deg(shaken(swaying(800), 3 * DEGREE, axes=axes))
+    assert found.tolist() == pytest.approx([3 * math.sqrt(axes / 3)] * 6, rel=0.15)
+
+
+def test_what_is_masked_does_not_matter():
+    clean = shaken(swaying(400), 2 * DEGREE)
+    seen = all_seen(clean)
+    seen[100:160, 2] = False
+    seen[200:205] = False
+    wild = torch.where(seen[..., None], clean, shaken(clean, 2.0, seed=9))
+    assert torch.equal(angle_noise(clean, seen), angle_noise(wild, seen))
+    places = smooth_place(400) + 0.01 * torch.randn(400, 3, generator=generator(), dtype=torch.float64)
+    thrown = torch.where(seen[:, 0, None], places, 100.0)
+    assert place_noise(places, seen[:, 0]) == place_noise(thrown, seen[:, 0])
+
+
+def test_a_joint_seen_now_and_then_is_taken_to_be_as_noisy_as_the_others():
+    quats = shaken(swaying(400), 2 * DEGREE)
+    seen = all_seen(quats)
+    seen[::2, 0] = False
+    seen[:, 1] = False
+    found = told_deg(quats, seen)
+    assert found.tolist() == pytest.approx([2.0] * 6, rel=0.25)
+
+
+def test_nothing_is_known_where_nothing_was_seen():
+    quats = shaken(swaying(50), 2 * DEGREE)
+    assert angle_noise(quats, torch.zeros(50, 6, dtype=torch.bool)).tolist() == [0] * 6
+    assert place_noise(smooth_place(50), torch.zeros(50, dtype=torch.bool)) == 0
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_recordings_too_short_to_tell_have_none(frames):
+    quats = shaken(swaying(frames), 5 * DEGREE)
+    assert angle_noise(quats, all_seen(quats)).tolist() == [0] * 6
+    assert place_noise(torch.zeros(min(frames, 2), 3, dtype=torch.float64), torch.ones(min(frames, 2)).bool()) == 0
+
+
+@pytest.mark.parametrize("frames", range(4, 30))
+def test_short_recordings_are_told_of_roughly(frames):
+    quats = shaken(swaying(frames, 40), 5 * DEGREE)
+    found = told_deg(quats)
+    assert found.isfinite().all()
+    assert 1 < found.median() < 12
+
+
+def test_the_sign_of_a_quaternion_says_nothing():
+    quats = shaken(swaying(200), 2 * DEGREE)
+    flipped = quats * torch.where(torch.rand(200, 6, 1, generator=generator(5)) < 0.5, -1.0, 1.0)
+    assert torch.allclose(angle_noise(quats, all_seen(quats)), angle_noise(flipped, all_seen(quats)))

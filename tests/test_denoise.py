@@ -1,0 +1,307 @@
+"""Denoising from one end to the other, with a network that is untrained or made of drawn weights."""
+
+import json
+import math
+from dataclasses import replace
+from importlib import import_module
+
+import pytest
+import torch
+from captures import DEGREE, apart_deg, error_cm, on_rig, shaken
+from helpers import generator
+from tiny_denoiser import tiny_denoiser
+
+import mapctl
+from controllers.denoise import DenoiseSettings, begins_with_tpose, denoise
+from controllers.denoised import faded, joined
+from controllers.standing import StandingSettings
+from mapctl import retarget, rotations
+from mapctl.capture.masks import ALL, ROOT, Mask
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+
+RIGS = ("canonical", "bandai", "daz")
+QUICK = DenoiseSettings(standing=StandingSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4)))
+
+
+def noisy(motion, degrees=4.0, centimetres=1.5, seed=0):
+    """White noise on all joints and on the place of the hips."""
+    quats = shaken(motion.local_quat_xyzw, degrees * DEGREE, seed=seed)
+    shift = centimetres / 100 * torch.randn(motion.num_frames, 3, generator=generator(seed + 1), dtype=torch.float64)
+    if motion.moving_offsets:
+        moving = {joint: values + shift for joint, values in motion.moving_offsets.items()}
+        # The static root is static.
+        quats[:, 0] = motion.local_quat_xyzw[:, 0]
+        return replace(motion, local_quat_xyzw=quats, moving_offsets=moving)
+    return replace(motion, local_quat_xyzw=quats, root_position=motion.root_position + shift)
+
+
+def cleaned(motion, **changes):
+    return denoise(motion, tiny_denoiser(), **{"settings": QUICK} | changes)
+
+
+OTHERS = [("bandai", 24), ("daz", 25), ("canonical", 31), ("canonical", 60), ("daz", 120)]
+
+
+@pytest.mark.parametrize(("rig", "fps"), [*((rig, 30) for rig in RIGS), *OTHERS])
+def test_noise_shrinks_and_rig_frames_and_rate_stay(rig, fps):
+    truth = on_rig(rig, 3 * fps, fps=fps)
+    given = noisy(truth)
+    done = cleaned(given)
+    assert done.capture is given or done.capture.num_frames == given.num_frames
+    assert done.motion.skeleton is given.skeleton
+    assert (done.motion.num_frames, done.motion.fps) == (given.num_frames, given.fps)
+    assert set(done.motion.moving_offsets) == set(given.moving_offsets)
+    assert error_cm(truth, done.motion) < 0.75 * error_cm(truth, given)
+    assert torch.allclose(done.motion.local_quat_xyzw.norm(dim=-1), torch.ones(1, dtype=torch.float64))
+    assert torch.equal(done.motion.root_position, given.root_position) == (rig == "bandai")
+    assert abs(len(done.contacts) - 90) <= 4
+    assert len(done.believed) == len(done.contacts)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_joints_that_the_canonical_skeleton_lacks_are_smoothed_too(rig):
+    truth = on_rig(rig)
+    given = noisy(truth)
+    done = cleaned(given)
+    used = set(retarget.map_rig(truth.skeleton).joint_of)
+    for joint in set(range(truth.num_joints)) - used:
+        before, after = (apart_deg(truth.local_quat_xyzw[:, joint], m.local_quat_xyzw[:, joint]).mean()
+                         for m in (given, done.motion))  # fmt: skip
+        assert after < 0.7 * before or before < 1e-4
+
+
+@pytest.mark.parametrize("drawn", [0.0, 0.3])
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 30), ("daz", 120)])
+def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps, drawn):
+    truth = on_rig(rig, 3 * fps, fps=fps)
+    done = denoise(truth, tiny_denoiser(drawn=drawn), settings=QUICK)
+    assert error_cm(truth, done.motion) < 0.5
+
+
+def test_a_network_that_is_wrong_does_little_harm():
+    """What it leaves out of the capture goes back in."""
+    truth = on_rig("bandai", 150)
+    given = noisy(truth, 6.0)
+    done = denoise(given, tiny_denoiser(drawn=0.5), settings=QUICK)
+    assert error_cm(truth, done.motion) < 1.1 * error_cm(truth, given)
+    assert done.believed.mean() < 0.9
+
+
+def test_the_same_capture_gives_the_same():
+    given = noisy(on_rig("daz", 60))
+    first, again = cleaned(given), cleaned(given)
+    assert torch.equal(first.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
+    assert torch.equal(first.motion.root_position, again.motion.root_position)
+
+
+def test_the_layout_of_the_file_stays(tmp_path):
+    given = noisy(on_rig("bandai", 60))
+    given.save(tmp_path / "in.bvh")
+    read = mapctl.load(tmp_path / "in.bvh")
+    cleaned(read).motion.save(tmp_path / "out.bvh")
+    before, after = ((tmp_path / name).read_text().split("MOTION")[0] for name in ("in.bvh", "out.bvh"))
+    assert before == after
+    assert mapctl.load(tmp_path / "out.bvh").num_frames == 60
+
+
+def test_the_density_joins_where_one_is_given():
+    from helpers import tiny_density
+
+    given = noisy(on_rig("canonical", 40))
+    done = cleaned(given, density=tiny_density())
+    assert "likelihood" in {entry.name for entry in done.ledger.entries}
+    assert done.motion.num_frames == 40
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_what_masked_frames_show_does_not_leak(rig):
+    truth = on_rig(rig, 120)
+    given, rigmap = noisy(truth, 2.0, 0.5), retarget.map_rig(truth.skeleton)
+    joint = rigmap.joint_of[CANONICAL.index("leftLowerArm")]
+    masks, out = [Mask(truth.skeleton.names[joint], 50, 58)], []
+    for seed in (1, 2):
+        quats = given.local_quat_xyzw.clone()
+        quats[50:58, joint] = shaken(given.local_quat_xyzw, 2.0, seed=seed)[50:58, joint]
+        out.append(cleaned(replace(given, local_quat_xyzw=quats), masks=masks).motion)
+    assert apart_deg(out[0].local_quat_xyzw, out[1].local_quat_xyzw).max() < 1e-3
+    assert error_cm(truth, out[0]) < 3
+    assert apart_deg(out[0].local_quat_xyzw, truth.local_quat_xyzw)[50:58, joint].max() < 20
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_frames_in_which_everything_is_masked_are_filled_in(rig):
+    truth = on_rig(rig, 120)
+    given = noisy(truth, 2.0, 0.5)
+    quats, root = shaken(given.local_quat_xyzw, 2.0, seed=3), given.root_position + 5
+    lost = torch.zeros(120, dtype=torch.bool)
+    lost[60:66] = True
+    wild = replace(given, local_quat_xyzw=torch.where(lost[:, None, None], quats, given.local_quat_xyzw),
+                   root_position=torch.where(lost[:, None], root, given.root_position))  # fmt: skip
+    if given.moving_offsets:
+        wild = replace(
+            wild,
+            root_position=given.root_position,
+            moving_offsets={
+                joint: torch.where(lost[:, None], values + 5, values) for joint, values in given.moving_offsets.items()
+            },
+        )
+    assert error_cm(truth, wild) > 10
+    done = cleaned(wild, masks=[Mask(ALL, 60, 66)])
+    places = (done.motion.joint_positions() - truth.joint_positions()).norm(dim=-1).mean(dim=-1)
+    assert places[60:66].max() < 0.15
+    assert {fault.kind for fault in done.faults if fault.start == 60} >= {"dropout"}
+
+
+def test_masks_that_do_not_fit_are_refused():
+    motion = on_rig("daz", 40)
+    with pytest.raises(RequestError, match="the nearest is lHand"):
+        cleaned(motion, masks=[Mask("lhand", 0, 3)])
+    for span in ((30, 60), (50, 60)):
+        with pytest.raises(RequestError, match="the recording at 40"):
+            cleaned(motion, masks=[Mask("lHand", *span)])
+
+
+def test_planted_faults_are_listed_where_they_are():
+    truth = on_rig("daz", 120)
+    given = noisy(truth, 2.0, 1.0)
+    arm, hand = (truth.skeleton.index(name) for name in ("lForeArm", "rHand"))
+    quats = given.local_quat_xyzw.clone()
+    leap = torch.tensor([0.0, math.sin(0.5), 0.0, math.cos(0.5)], dtype=torch.float64)  # 57 degrees
+    quats[40, arm] = rotations.multiply(quats[40, arm], leap)
+    quats[70:84, hand] = quats[70, hand]
+    root = given.root_position.clone()
+    root[90, 1] += 0.8
+    done = cleaned(replace(given, local_quat_xyzw=quats, root_position=root))
+    spikes = [(f.joint, f.start, f.stop) for f in done.faults if f.kind == "spike" and f.unit == "deg"]
+    assert ("lForeArm", 40, 41) in spikes
+    assert len(spikes) < 20
+    (height,) = [f.amount for f in done.faults if f.kind == "spike" and f.joint == "lForeArm" and f.start == 40]
+    assert height == pytest.approx(57, abs=12)
+    assert ("hip", 90, 91) in [(f.joint, f.start, f.stop) for f in done.faults if f.unit == "cm" and f.kind == "spike"]
+    assert ("rHand", 71, 84) in [(f.joint, f.start, f.stop) for f in done.faults if f.kind == "dropout"]
+    noise = {f.joint: f.amount for f in done.faults if f.kind == "noise" and f.unit == "deg"}
+    assert noise["lForeArm"] == pytest.approx(2, rel=0.4)
+    assert (done.motion.root_position - truth.root_position).norm(dim=-1)[88:93].max() < 0.15
+    assert apart_deg(done.motion.local_quat_xyzw, truth.local_quat_xyzw)[40, arm] < 12
+
+
+def test_a_summary_is_plain_numbers():
+    for given in (noisy(on_rig("bandai", 60)), on_rig("canonical", 5)):
+        told = cleaned(given).summary()
+        again = json.loads(json.dumps(told, allow_nan=False))
+        assert again["frames"] == given.num_frames
+        assert set(again["noise_deg"]) == set(given.skeleton.names) == set(again["correction_cm"])
+        assert set(again["contacts"]) == {"left", "right"}
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_tpose_in_frame_0_stays(rig):
+    truth = on_rig(rig, 60)
+    tpose = retarget.from_canonical(
+        replace(retarget.to_canonical(truth)[0].slice(0, 1), local_quat_xyzw=torch.tensor(
+            [0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)), retarget.map_rig(truth.skeleton)
+    ) if rig != "canonical" else replace(truth.slice(0, 1), local_quat_xyzw=torch.tensor(
+        [0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4))  # fmt: skip
+    given = replace(tpose, source=truth.source).join(noisy(truth))
+    assert begins_with_tpose(given)
+    assert not begins_with_tpose(truth)
+    done = cleaned(given, masks=[Mask(ROOT, 10, 12)])
+    assert done.motion.num_frames == 61
+    assert apart_deg(done.motion.local_quat_xyzw[0], tpose.local_quat_xyzw[0]).max() < 1e-4
+    assert torch.equal(done.motion.joint_positions()[0], tpose.joint_positions()[0])
+    assert error_cm(truth, done.motion.slice(1, 61)) < 0.85 * error_cm(truth, given.slice(1, 61))
+    assert next((f.start, f.stop) for f in done.faults if f.kind == "noise") == (1, 61)
+    assert "T-pose" in done.notes[0]
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])
+def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, fps):
+    module = import_module("controllers.denoise")  # the package has a function of this name
+    monkeypatch.setattr(module, "_PIECE", 2.0)
+    monkeypatch.setattr(module, "_SHARED", 0.5)
+    truth, calls = on_rig(rig, 7 * fps, fps=fps), []
+    given = noisy(truth)
+    done = cleaned(given, progress=lambda now, of: calls.append((now, of)), masks=[Mask(ALL, 3 * fps, 3 * fps + 2)])
+    assert done.motion.num_frames == 7 * fps
+    assert len(calls) >= 4
+    assert calls[-1] == (7 * fps, 7 * fps)
+    assert len(done.contacts) == len(done.believed) == 210
+    assert all(len(entry.energy) == 210 for entry in done.ledger.entries)
+    assert error_cm(truth, done.motion) < 0.8 * error_cm(truth, given)
+    leap = torch.diff(done.motion.joint_positions(), n=2, dim=0).norm(dim=-1).amax(dim=-1)
+    within = leap[fps // 6 :]
+    assert within.max() < 3 * within.quantile(0.9)
+    lost = [fault for fault in done.faults if fault.kind == "dropout"]
+    assert {(fault.start, fault.stop) for fault in lost} == {(3 * fps, 3 * fps + 2)}
+    noise = {(fault.start, fault.stop) for fault in done.faults if fault.kind == "noise"}
+    assert noise == {(0, 7 * fps)}
+    json.dumps(done.summary(), allow_nan=False)
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(60, 120), (120, 240), (120, 238), (25, 51)])
+def test_the_last_frames_are_as_clean_as_the_others(fps, frames):
+    """Also where they fall between those that the network is shown."""
+    truth = on_rig("canonical", frames, fps=fps)
+    done = cleaned(noisy(truth))
+    jumps = torch.diff(done.motion.local_quat_xyzw - truth.local_quat_xyzw, dim=0).norm(dim=-1).mean(dim=-1)
+    assert jumps[-3:].max() < 4 * jumps[10:-10].mean()  # as noise is where there is nothing after it
+
+
+@pytest.mark.parametrize("frames", [1, 2, 7])
+def test_too_short_a_capture_is_unchanged_and_says_so(frames):
+    given = noisy(on_rig("bandai", 30)).slice(0, frames)
+    done = cleaned(given)
+    assert torch.equal(done.motion.local_quat_xyzw, given.local_quat_xyzw)
+    assert "nothing was changed" in " ".join(done.notes)
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+@pytest.mark.parametrize("frames", [8, 9, 15])
+def test_short_captures_come_back_whole(frames, fps):
+    given = noisy(on_rig("daz", 30, fps=fps)).slice(0, frames)
+    assert cleaned(given).motion.num_frames == frames
+
+
+def test_the_noise_may_be_said():
+    given = noisy(on_rig("canonical", 90))
+    none = cleaned(given, settings=replace(QUICK, sigma_deg=0.0, sigma_cm=0.0))
+    assert error_cm(given, none.motion) < 0.5
+    much = cleaned(given, settings=replace(QUICK, sigma_deg=20.0, sigma_cm=10.0))
+    assert error_cm(given, much.motion) > error_cm(given, cleaned(given).motion)
+    for wrong in ({"sigma_deg": -1.0}, {"sigma_cm": 101.0}, {"sigma_deg": math.nan}):
+        with pytest.raises(RequestError, match="must lie between 0 and 100"):
+            DenoiseSettings(**wrong)
+
+
+def test_unknown_rigs_are_refused():
+    motion = on_rig("canonical", 20)
+    skeleton = replace(motion.skeleton, names=tuple(f"j{k}" for k in range(motion.num_joints)))
+    with pytest.raises(RequestError):
+        cleaned(replace(motion, skeleton=skeleton))
+
+
+@pytest.mark.parametrize("rig", ["canonical", "bandai"])
+def test_pieces_fade_into_each_other(rig):
+    truth = on_rig(rig, 60)
+    before, after = noisy(truth, seed=1).slice(0, 40), noisy(truth, seed=2).slice(30, 60)
+    mixed = faded(before, after, 10)
+    assert mixed.num_frames == 60
+    assert apart_deg(mixed.local_quat_xyzw[:31], before.local_quat_xyzw[:31]).max() < 1e-4
+    assert apart_deg(mixed.local_quat_xyzw[39:], after.local_quat_xyzw[9:]).max() < 1e-4
+    assert faded(truth.slice(0, 20), truth.slice(20, 60), 0).num_frames == 60
+    assert error_cm(faded(truth.slice(0, 40), truth.slice(25, 60), 15), truth) < 1e-4
+
+
+def test_a_part_of_a_result_is_of_those_frames():
+    done = cleaned(noisy(on_rig("daz", 120, fps=60)))
+    first, second = done.slice(0, 50), done.slice(50, 120)
+    assert (first.motion.num_frames, len(first.contacts)) == (50, 25)
+    assert all(0 <= fault.start < fault.stop <= 70 for fault in second.faults)
+    whole = joined([(first, 0), (second, 50)])
+    assert torch.equal(whole.motion.local_quat_xyzw, done.motion.local_quat_xyzw)
+    assert set(whole.faults) == set(done.faults)
+    assert torch.equal(whole.contacts, done.contacts)
+    assert torch.equal(whole.believed, done.believed)

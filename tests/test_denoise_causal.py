@@ -1,0 +1,142 @@
+"""Denoising as a live capture needs it: nothing that comes later changes what was given."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import error_cm, on_rig, shaken
+from test_denoise import QUICK, noisy
+from tiny_denoiser import tiny_denoiser
+
+from controllers.denoise_causal import CausalDenoiser, CausalSettings, denoise_causal
+from controllers.standing import StandingSettings
+from mapctl.capture.masks import Mask
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+
+FAST = replace(QUICK, standing=StandingSettings(lbfgs=LbfgsSettings(max_iterations=1), budget=Budget(evaluations=1)))
+
+
+def stream(causal=None):
+    return CausalDenoiser(tiny_denoiser(), settings=FAST, causal=causal or CausalSettings(past=1.0))
+
+
+def pushed(motion: Motion, at_once: int = 1, causal=None):
+    """What each push gave, and how many frames had come by then; the last is what finish gave."""
+    source, given = stream(causal), []
+    for first in range(0, motion.num_frames, at_once):
+        stop = min(first + at_once, motion.num_frames)
+        done = source.push(motion.slice(first, stop))
+        if done is not None:
+            given.append((done, stop))
+    rest = source.finish()
+    assert source.finish() is None or rest is None
+    return given, rest
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 50)])
+def test_all_frames_come_back_once_and_in_time(rig, fps):
+    motion = noisy(on_rig(rig, 40, fps=fps))
+    given, rest = pushed(motion)
+    count = 0
+    for done, come in given:
+        count += done.motion.num_frames
+        assert count <= come - round(0.2 * fps)
+        assert come - count <= math.ceil(0.31 * fps)  # no frame waits longer than is said
+        assert done.motion.skeleton is motion.skeleton
+    assert count + rest.motion.num_frames == 40
+    captured = torch.cat([done.capture.local_quat_xyzw for done in [*(d for d, _ in given), rest]])
+    assert torch.equal(captured, motion.local_quat_xyzw)
+
+
+def test_what_comes_after_the_delay_changes_nothing_that_was_given():
+    motion = noisy(on_rig("daz", 54))
+    quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    quats[40:] = shaken(quats, 2.0, seed=7)[40:]
+    root[40:] += 3
+    other = replace(motion, local_quat_xyzw=quats, root_position=root)
+    first, second = (pushed(one)[0] for one in (motion, other))
+    count = 0
+    for (mine, come), (theirs, _) in zip(first, second, strict=True):
+        if come > 40:
+            break
+        count += mine.motion.num_frames
+        assert torch.equal(mine.motion.local_quat_xyzw, theirs.motion.local_quat_xyzw)
+        assert torch.equal(mine.motion.root_position, theirs.motion.root_position)
+    assert count >= 40 - 0.3 * 30 - 1
+
+
+def test_the_noise_shrinks_and_passes_meet_without_a_jump():
+    truth = on_rig("canonical", 60)
+    given = noisy(truth)
+    calls = []
+    done = denoise_causal(given, tiny_denoiser(), settings=FAST, progress=lambda now, of: calls.append((now, of)))
+    assert (done.motion.num_frames, done.capture.num_frames, len(done.contacts)) == (60, 60, 60)
+    assert error_cm(truth, done.motion) < 0.85 * error_cm(truth, given)
+    jump, before = (torch.diff(m.joint_positions(), n=2, dim=0).norm(dim=-1)[10:].max() for m in (done.motion, given))
+    assert jump < 0.5 * before
+    assert "causal: a frame is decided 0.30 s after it came" in done.notes
+    assert calls
+    assert all(now <= of == 60 for now, of in calls)
+
+
+def test_frames_may_come_in_any_portions():
+    motion = noisy(on_rig("canonical", 60))
+    given, rest = pushed(motion, at_once=25)
+    assert sum(done.motion.num_frames for done, _ in given) + rest.motion.num_frames == 60
+
+
+@pytest.mark.parametrize("frames", [1, 3, 7])
+def test_a_capture_that_is_over_at_once_comes_back(frames):
+    motion = noisy(on_rig("bandai", 20)).slice(0, frames)
+    assert denoise_causal(motion, tiny_denoiser(), settings=FAST).motion.num_frames == frames
+
+
+def test_nothing_pushed_gives_nothing():
+    assert stream().finish() is None
+
+
+def test_masks_count_from_the_first_frame_of_all():
+    truth = on_rig("daz", 60)
+    given = noisy(truth, 1.0, 0.3)
+    arm = truth.skeleton.index("lForeArm")
+    quats = given.local_quat_xyzw.clone()
+    quats[40:44, arm] = shaken(quats, 2.0, seed=4)[40:44, arm]
+    wild = replace(given, local_quat_xyzw=quats)
+    done = denoise_causal(wild, tiny_denoiser(), settings=FAST, masks=[Mask("lForeArm", 40, 44)])
+    hand = truth.skeleton.index("lHand")
+    away = (done.motion.joint_positions() - truth.joint_positions())[40:44, hand].norm(dim=-1)
+    assert away.max() < 0.1
+    dropouts = {(fault.start, fault.stop) for fault in done.faults if fault.kind == "dropout"}
+    assert min(start for start, _ in dropouts) == 40
+    assert max(stop for _, stop in dropouts) == 44
+
+
+def test_the_past_that_is_kept_does_not_grow():
+    source = stream()
+    motion = noisy(on_rig("canonical", 80))
+    for first in range(0, 80, 5):
+        source.push(motion.slice(first, first + 5))
+        assert source._past is not None
+        assert source._past.num_frames <= (1.0 + 0.2 + 0.1) * 30 + 5
+
+
+@pytest.mark.parametrize("delay", [0.0, -1.0, 0.01, 6.0, math.nan])
+def test_delays_that_make_no_sense_are_refused(delay):
+    with pytest.raises(RequestError, match="the delay must be"):
+        CausalSettings(delay=delay)
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.5])
+def test_what_is_said_of_the_delay_holds(delay):
+    motion = noisy(on_rig("canonical", 45))
+    causal = CausalSettings(delay=delay, past=1.0)
+    given, _ = pushed(motion, causal=causal)
+    assert stream(causal).delay <= 1.5 * delay + 1e-9
+    count = 0
+    for done, come in given:
+        assert come - 1 - count <= math.ceil(stream(causal).delay * 30)
+        count += done.motion.num_frames

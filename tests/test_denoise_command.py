@@ -1,0 +1,229 @@
+"""`mapctl denoise` as a user types it: files, folders, reports, and what is refused."""
+
+import json
+from importlib.util import find_spec
+
+import pytest
+from captures import error_cm, on_rig
+from helpers import walk
+from test_denoise import noisy
+from tiny_denoiser import save_tiny_denoiser
+from tiny_prior import save_tiny_prior
+
+import mapctl
+from mapctl import cli
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> str:
+    return str(save_tiny_denoiser(tmp_path_factory.mktemp("denoiser") / "tiny.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A noisy capture in a file."""
+    path = tmp_path_factory.mktemp("capture") / "in.bvh"
+    noisy(on_rig("bandai", 40)).save(path)
+    return path
+
+
+@pytest.fixture
+def denoise(tiny):
+    """Runs the command; returns the exit status."""
+    return lambda *words: cli.main(["denoise", *map(str, words), "--denoiser", tiny])
+
+
+def test_a_file_comes_back_clean(denoise, recording, tmp_path, capsys):
+    out = tmp_path / "out.bvh"
+    assert denoise(recording, "-o", out) == 0
+    told = capsys.readouterr()
+    on_rig("bandai", 40).save(tmp_path / "truth.bvh")
+    before, after, truth = map(mapctl.load, (recording, out, tmp_path / "truth.bvh"))
+    assert after.skeleton.matches(before.skeleton)
+    assert (after.num_frames, after.fps) == (before.num_frames, before.fps)
+    assert error_cm(truth, after) < 0.9 * error_cm(truth, before)
+    assert f"{out}: 40 frames at 30 a second" in told.out
+    assert "noise: " in told.out
+    assert "and 15 more joints" in told.out
+    assert told.err == ""
+
+
+def test_other_formats_are_written(denoise, recording, tmp_path):
+    assert denoise(recording, "-o", tmp_path / "out.npz", "--quiet") == 0
+    assert mapctl.load(tmp_path / "out.npz").num_frames == 40
+
+
+def test_quiet_says_nothing_and_the_same_bytes_come_twice(denoise, recording, tmp_path, capsys):
+    found = set()
+    for _ in range(2):
+        assert denoise(recording, "-o", tmp_path / "out.bvh", "--quiet") == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_report_mask_and_sigmas(denoise, recording, tmp_path):
+    (tmp_path / "m.csv").write_text("joint,start,stop\nHand_L,10,14\n*,30,31\n")
+    report = tmp_path / "r.json"
+    words = ["--mask", tmp_path / "m.csv", "--report", report, "--sigma-deg", 4, "--sigma-cm", 1.5, "--quiet"]
+    assert denoise(recording, "-o", tmp_path / "out.bvh", *words) == 0
+    told = json.loads(report.read_text())
+    assert told["request"]["command"] == "denoise"
+    assert told["request"]["sigma_deg"] == 4
+    assert {"faults", "correction_cm", "contacts", "ledger", "fallback", "measures", "versions", "notes"} <= set(told)
+    lost = {(f["joint"], f["start"], f["stop"]) for f in told["faults"] if f["kind"] == "dropout"}
+    assert {("Hand_L", 10, 14), ("Hand_L", 30, 31), ("Hips", 30, 31)} <= lost
+
+
+def test_a_plot_is_a_picture(denoise, recording, tmp_path):
+    pytest.importorskip("matplotlib")
+    assert denoise(recording, "-o", tmp_path / "out.bvh", "--plot", tmp_path / "p.png", "--quiet") == 0
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_causal_is_said(denoise, recording, tmp_path, capsys):
+    assert denoise(recording, "-o", tmp_path / "out.bvh", "--causal", "--delay", 0.3) == 0
+    assert "causal: a frame is decided 0.40 s after it came" in capsys.readouterr().out
+    assert mapctl.load(tmp_path / "out.bvh").num_frames == 40
+
+
+def test_a_prior_joins_the_last_stage(denoise, recording, tmp_path):
+    prior, report = save_tiny_prior(tmp_path / "prior.safetensors"), tmp_path / "r.json"
+    assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", prior, "--report", report, "--quiet") == 0
+    assert "likelihood" in json.loads(report.read_text())["ledger"]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two captures of which one lies deeper, and a file that is none."""
+    place = tmp_path / "in"
+    (place / "deep").mkdir(parents=True)
+    noisy(on_rig("bandai", 20)).save(place / "a.bvh")
+    noisy(on_rig("daz", 20)).save(place / "deep" / "b.bvh")
+    (place / "deep" / "notes.txt").write_text("no motion")
+    return place
+
+
+def test_a_folder_becomes_a_folder_of_the_same_names(denoise, folder, tmp_path, capsys):
+    out, reports = tmp_path / "out", tmp_path / "reports"
+    assert denoise(folder, "-o", out, "--report", reports) == 0
+    assert sorted(str(f.relative_to(out)) for f in out.rglob("*.*")) == ["a.bvh", "deep/b.bvh"]
+    assert sorted(str(f.relative_to(reports)) for f in reports.rglob("*.*")) == ["a.json", "deep/b.json"]
+    assert json.loads((reports / "a.json").read_text())["frames"] == 20
+    assert "2 denoised" in capsys.readouterr().out
+
+
+def test_what_is_there_is_not_done_again_unless_asked_for(denoise, folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    (out / "deep").mkdir(parents=True)
+    (out / "deep" / "b.bvh").write_text("done before")
+    assert denoise(folder, "-o", out) == 0
+    assert "1 denoised" in (told := capsys.readouterr().out)
+    assert "1 there already, 0 failed" in told
+    assert (out / "deep" / "b.bvh").read_text() == "done before"
+    assert denoise(folder, "-o", out, "--again", "--quiet") == 0
+    assert mapctl.load(out / "deep" / "b.bvh").num_frames == 20
+
+
+def test_failures_are_listed_and_stop_no_other_file(denoise, folder, tmp_path, capsys):
+    (folder / "0-broken.bvh").write_text("HIERARCHY\nnonsense")
+    walk(20).save(folder / "c.npz")
+    assert denoise(folder, "-o", tmp_path / "out") == 3
+    told = capsys.readouterr().out
+    assert "3 denoised, " in told
+    assert "1 failed" in told
+    assert told.count("failed: ") == 1
+    assert "0-broken.bvh" in told
+    assert (tmp_path / "out" / "a.bvh").exists()
+    assert (tmp_path / "out" / "c.npz").exists()
+    assert not (tmp_path / "out" / "0-broken.bvh").exists()
+
+
+def test_an_output_folder_inside_the_input_is_not_denoised_itself(denoise, folder, capsys):
+    for _ in range(2):
+        assert denoise(folder, "-o", folder / "clean", "--again") == 0
+        assert "2 denoised" in capsys.readouterr().out
+
+
+def test_more_processes_give_the_same_files(denoise, folder, tmp_path):
+    assert denoise(folder, "-o", tmp_path / "one", "--quiet") == 0
+    assert denoise(folder, "-o", tmp_path / "two", "--jobs", 2, "--quiet") == 0
+    for name in ("a.bvh", "deep/b.bvh"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
+def test_a_cluster_of_this_machine_gives_the_same_files(denoise, folder, tmp_path):
+    assert denoise(folder, "-o", tmp_path / "one", "--quiet") == 0
+    assert denoise(folder, "-o", tmp_path / "two", "--cluster", "local", "--jobs", 2, "--quiet") == 0
+    for name in ("a.bvh", "deep/b.bvh"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.mark.skipif(find_spec("ray") is not None, reason="ray is there")
+def test_a_cluster_without_ray_is_refused(denoise, folder, tmp_path, capsys):
+    assert denoise(folder, "-o", tmp_path / "out", "--cluster", "local") == 2
+    assert "pip install 'mapctl[cluster]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["gone.bvh", "-o", "a.bvh"], "gone.bvh"),
+    (["in.bvh", "-o", "a.mp3"], ".mp3"),
+    (["in.bvh", "-o", "gone/a.bvh"], "gone"),
+    (["in.bvh"], "--out"),
+    (["in.bvh", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
+    (["in.bvh", "-o", "a.bvh", "--plot", "p.jpg"], "--plot writes .png, not .jpg"),
+    (["in.bvh", "-o", "a.bvh", "--video", "p.avi"], ".mp4"),
+    (["in.bvh", "-o", "a.bvh", "--mask", "gone.csv"], "gone.csv"),
+    (["in.bvh", "-o", "a.bvh", "--mask", "wrong.csv"], "line 2"),
+    (["in.bvh", "-o", "a.bvh", "--mask", "name.csv"], "no joint 'Hnad_L' to mask; the nearest is Hand_L"),
+    (["in.bvh", "-o", "a.bvh", "--mask", "late.csv"], "ends at 50, the recording at 40"),
+    (["in.bvh", "-o", "a.bvh", "--sigma-deg", "-1"], "sigma_deg must lie between 0 and 100, got -1"),
+    (["in.bvh", "-o", "a.bvh", "--sigma-cm", "nan"], "sigma_cm must lie between 0 and 100"),
+    (["in.bvh", "-o", "a.bvh", "--sigma-deg", "much"], "--sigma-deg: expected a number, got 'much'"),
+    (["in.bvh", "-o", "a.bvh", "--causal", "--delay", "0"], "the delay must be"),
+    (["in.bvh", "-o", "a.bvh", "--causal", "--prior", "locomotion"], "leave --prior out"),
+    (["in.bvh", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
+    (["in.bvh", "-o", "a.bvh", "--cluster", "local"], "--cluster is for folders; in.bvh is a file"),
+    (["in.bvh", "-o", "a.bvh", "--again"], "--again is for folders"),
+    (["broken.bvh", "-o", "a.bvh"], "broken.bvh"),
+    (["folder", "-o", "out", "--mask", "wrong.csv"], "--mask is for single files; folder is a folder"),
+    (["folder", "-o", "out", "--plot", "p.png"], "--plot is for single files"),
+    (["folder", "-o", "out", "--video", "p.mp4"], "--video is for single files"),
+    (["folder", "-o", "out", "--causal"], "--causal is for single files"),
+    (["folder", "-o", "out", "--prior", "locomotion"], "--prior is for single files"),
+    (["folder", "-o", "out", "--jobs", "0"], "--jobs must be at least 1, got 0"),
+    (["folder", "-o", "out", "--sigma-deg", "-3"], "sigma_deg must lie between"),
+    (["folder", "-o", "in.bvh"], "in.bvh"),
+    (["empty", "-o", "out"], "below empty"),
+], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
+    denoise, recording, tmp_path, monkeypatch, capsys, words, said
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in.bvh").write_bytes(recording.read_bytes())
+    (tmp_path / "broken.bvh").write_text("HIERARCHY\nnonsense")
+    (tmp_path / "wrong.csv").write_text("joint,start,stop\nHand_L,4,x\n")
+    (tmp_path / "name.csv").write_text("joint,start,stop\nHnad_L,4,6\n")
+    (tmp_path / "late.csv").write_text("joint,start,stop\nHand_L,4,50\n")
+    for name in ("folder/a.bvh", "empty/a.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(recording.read_bytes())
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert denoise(*words) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("mapctl: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_a_denoiser_that_is_none_is_refused(recording, folder, tmp_path, capsys):
+    prior = save_tiny_prior(tmp_path / "prior.safetensors")
+    for source, out in ((recording, tmp_path / "a.bvh"), (folder, tmp_path / "out")):
+        for name, said in ((prior, "a lstm-gmm is no denoiser"), ("nobody", "no prior 'nobody'")):
+            assert cli.main(["denoise", str(source), "-o", str(out), "--denoiser", str(name)]) == 2
+            assert said in capsys.readouterr().err
+        assert not out.exists()

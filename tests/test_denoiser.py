@@ -1,0 +1,207 @@
+"""The network that proposes: what it does untrained, what it never does with any weights, and its file."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import DEGREE
+from helpers import generator, tiny_density, walk
+from tiny_denoiser import CONFIG, card, network, save_tiny_denoiser, tiny_denoiser
+
+import priors
+from mapctl import rotations
+from mapctl.capture import Capture
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.protocols import Denoiser
+from mapctl.skeleton import CANONICAL
+from priors import checkpoints, denoiser
+from priors.denoiser import DenoiserConfig
+
+JOINTS = CANONICAL.num_joints
+
+
+def capture(frames=90, *, degrees=0.0, centimetres=0.0, seed=0, turn_rate=0.8):
+    """A walk with white noise, everything seen."""
+    motion = walk(frames, turn_rate=turn_rate)
+    seen = torch.ones(frames, JOINTS, dtype=torch.bool)
+    clean = Capture.of_motion(motion, seen=seen, seen_root=seen[:, 0], sigma=torch.full((JOINTS,), degrees * DEGREE),
+                              sigma_root=centimetres / 100)  # fmt: skip
+    draw = generator(seed)
+    quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
+    noise = degrees * DEGREE * torch.randn(1, frames, JOINTS, 3, generator=draw)
+    quats = rotations.multiply(quats, rotations.from_rotation_vector(noise))
+    root = clean.root + centimetres / 100 * torch.randn(1, frames, 3, generator=draw)
+    return replace(clean, root=root, hips=quats[:, :, 0], joints=rotations.to_rotation_vector(quats[:, :, 1:]))
+
+
+def errors(cleaned, truth):
+    """Root mean square: of the place in cm, of the angles in degrees."""
+    angles = torch.cat([truth.tilt, truth.joints.flatten(2)], dim=-1)
+    return (100 * float((cleaned.root - truth.root).square().mean().sqrt()),
+            float(torch.rad2deg((cleaned.angles - angles).square().mean().sqrt())))  # fmt: skip
+
+
+def test_untrained_it_smooths():
+    noisy, truth = capture(degrees=5, centimetres=3), capture()
+    cleaned = network()(noisy)
+    place, angle = errors(cleaned, truth)
+    assert place < 0.6 * 3
+    assert angle < 0.6 * 5
+    assert float(torch.rad2deg((cleaned.heading - truth.heading).square().mean().sqrt())) < 0.6 * 5
+
+
+@pytest.mark.parametrize("drawn", [0.0, 0.3])
+def test_without_noise_what_was_seen_is_what_comes_back(drawn):
+    """Whatever the weights are."""
+    seen = capture()
+    cleaned = network(drawn=drawn)(seen)
+    place, angle = errors(cleaned, seen)
+    assert place < 1e-3
+    assert angle < 1e-3
+    assert torch.allclose(cleaned.heading, seen.heading, atol=1e-5)
+
+
+def test_little_noise_changes_little():
+    clean = capture()
+    changes = []
+    for degrees in (0.01, 0.1, 1.0):
+        told = replace(clean, sigma=clean.sigma + degrees * DEGREE)
+        changes.append(errors(network(drawn=0.3)(told), clean)[1])
+    assert changes[0] < 0.1 * changes[1] < 0.1 * changes[2]
+
+
+def test_drawn_weights_do_something():
+    """Or the tests with them would say nothing."""
+    noisy = capture(degrees=5, centimetres=3)
+    plain, other = network()(noisy), network(drawn=0.3)(noisy)
+    assert (plain.angles - other.angles).abs().max() > 0.01
+    assert (plain.root - other.root).abs().max() > 0.001
+    assert other.contacts.std() > 0.01
+
+
+def moved(given, angle, offset):
+    """The same capture elsewhere on the ground, facing elsewhere."""
+    turn = torch.tensor(angle).expand(given.root.shape[:2])
+    ground = rotations.rotate_ground(given.root[..., ::2], turn)
+    root = torch.stack([ground[..., 0], given.root[..., 1], ground[..., 1]], dim=-1) + torch.tensor(offset)
+    return replace(given, root=root, hips=rotations.multiply(rotations.about_y(turn), given.hips))
+
+
+@pytest.mark.parametrize("drawn", [0.0, 0.3])
+def test_it_does_not_matter_where_the_capture_stands_and_faces(drawn):
+    noisy = capture(degrees=5, centimetres=3)
+    noisy = replace(noisy, seen=torch.rand(noisy.seen.shape, generator=generator(1)) > 0.1)
+    here, there = network(drawn=drawn)(noisy), network(drawn=drawn)(moved(noisy, 2.2, (5.0, 0.0, -3.0)))
+    turn = torch.full_like(here.heading, 2.2)
+    ground = rotations.rotate_ground(here.root[..., ::2], turn) + torch.tensor([5.0, -3.0])
+    assert torch.allclose(there.root[..., ::2], ground, atol=1e-4)
+    assert torch.allclose(there.root[..., 1], here.root[..., 1], atol=1e-5)
+    off = rotations.wrap_angle(there.heading - here.heading - 2.2)
+    assert off.abs().max() < 1e-4
+    assert torch.allclose(there.angles, here.angles, atol=1e-4)
+    assert torch.allclose(there.contacts, here.contacts, atol=1e-3)
+
+
+def test_what_was_not_seen_does_not_matter():
+    noisy = capture(degrees=5, centimetres=3)
+    noisy.seen[:, 30:40, 4] = False
+    noisy.seen[:, 50:55] = False
+    noisy.seen_root[:, 50:55] = False
+    wild = replace(noisy, root=torch.where(noisy.seen_root[..., None], noisy.root, 7.0),
+                   joints=torch.where(noisy.seen[..., 1:, None], noisy.joints, 2.0))  # fmt: skip
+    first, second = network(drawn=0.3)(noisy), network(drawn=0.3)(wild)
+    for name in ("root", "heading", "angles", "contacts"):
+        assert torch.equal(getattr(first, name), getattr(second, name))
+
+
+def test_a_batch_is_its_members():
+    first, second = capture(degrees=5, seed=1), capture(degrees=2, seed=2)
+    names = ("root", "hips", "joints", "seen_root", "seen", "sigma_root", "sigma")
+    both = Capture(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
+    together, alone = network(drawn=0.3)(both), network(drawn=0.3)(second)
+    assert torch.allclose(together.angles[1:], alone.angles, atol=1e-5)
+    assert torch.allclose(together.root[1:], alone.root, atol=1e-5)
+
+
+def test_gaps_are_filled_with_something_finite():
+    noisy = capture(degrees=5, centimetres=3)
+    noisy.seen[:] = False
+    noisy.seen_root[:] = False
+    assert all(bool(value.isfinite().all()) for value in vars(network(drawn=0.3)(noisy)).values())
+
+
+@pytest.mark.parametrize("frames", [1, 2, 9])
+def test_short_captures_break_nothing(frames):
+    cleaned = tiny_denoiser(drawn=0.3).clean(capture(frames, degrees=5))
+    assert cleaned.root.shape == (1, frames, 3)
+    assert cleaned.local_quat_xyzw.shape == (1, frames, JOINTS, 4)
+
+
+def test_a_long_capture_in_pieces_is_one_pass(monkeypatch):
+    """Beside the margin; whole turns of the heading are counted on."""
+    noisy = capture(400, degrees=5, centimetres=3, turn_rate=2.0)
+    whole = tiny_denoiser(drawn=0.1).clean(noisy)
+    monkeypatch.setattr(denoiser, "_PIECE", 100)
+    pieces = tiny_denoiser(drawn=0.1).clean(noisy)
+    assert whole.root.shape == pieces.root.shape
+    assert torch.allclose(pieces.root, whole.root, atol=1e-3)
+    assert torch.allclose(pieces.angles, whole.angles, atol=1e-3)
+    assert torch.allclose(pieces.contacts, whole.contacts, atol=1e-2)
+    assert torch.diff(pieces.heading, dim=1).abs().max() < 1.0
+    apart = (pieces.heading - whole.heading)[0]
+    assert (apart - apart.mean()).abs().max() < 1e-2
+    assert pieces.heading[0, -1] - pieces.heading[0, 0] > 2 * 2 * math.pi
+
+
+def test_rotations_of_a_proposal_are_its_heading_tilt_and_joints():
+    cleaned = network()(capture(20))
+    motion = walk(20, turn_rate=0.8)
+    dots = (cleaned.local_quat_xyzw[0].double() * motion.local_quat_xyzw).sum(-1).abs()
+    assert (dots > 1 - 1e-5).all()
+
+
+def test_a_saved_denoiser_loads_as_it_was(tmp_path):
+    path = save_tiny_denoiser(tmp_path / "run" / "model.safetensors", drawn=0.3)
+    wanted = network(drawn=0.3)
+    for name in (path, path.parent):
+        loaded = priors.load_denoiser(str(name))
+        assert isinstance(loaded, Denoiser)
+        assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "denoiser")
+        noisy = capture(degrees=5)
+        assert torch.allclose(loaded.clean(noisy).angles, wanted(noisy).angles, atol=1e-3)  # float16 in the file
+
+
+def test_what_is_no_denoiser_is_refused(tmp_path):
+    density, wrong = tiny_density(), tmp_path / "density.safetensors"
+    tensors = density.reference.state_dict()
+    checkpoints.save(tensors, density.card, wrong)
+    with pytest.raises(CheckpointError, match="a lstm-gmm is no denoiser"):
+        priors.load_denoiser(str(wrong))
+    with pytest.raises(CheckpointError, match="no prior 'nobody'"):
+        priors.load_denoiser("nobody")
+    path = save_tiny_denoiser(tmp_path / "tiny.safetensors")
+    with pytest.raises(CheckpointError):
+        priors.load(str(path))
+    with pytest.raises(CheckpointError, match="a denoiser is no refiner"):
+        priors.load_refiner(str(path))
+
+
+@pytest.mark.parametrize("config", [{"width": 9}, {"dilations": [1]}, {"kernel": 4}, {"depth": 3}, {"dilations": 3}])
+def test_tensors_that_do_not_fit_their_card_are_refused(tmp_path, config):
+    path = tmp_path / "broken.safetensors"
+    broken = replace(card(), config={**CONFIG.as_card(), **config})
+    checkpoints.save(network().state_dict(), broken, path)
+    with pytest.raises(CheckpointError, match="do not fit its card"):
+        priors.load_denoiser(str(path))
+
+
+@pytest.mark.parametrize("wrong", [{"width": 0}, {"kernel": 2}, {"kernel": -1}, {"dilations": ()}, {"dilations": (0,)}])
+def test_shapes_that_cannot_be_are_refused(wrong):
+    with pytest.raises(RequestError, match="a denoiser needs"):
+        DenoiserConfig(**wrong)
+
+
+def test_the_card_gives_the_shape_back():
+    config = DenoiserConfig(width=5, kernel=3, dilations=(1, 7))
+    assert DenoiserConfig.of_card(config.as_card()) == config

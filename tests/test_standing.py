@@ -1,0 +1,203 @@
+"""The MAP stage: near the proposal, on feet that stand."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import apart_deg
+from helpers import finite_difference, generator, walk
+
+from controllers import standing
+from controllers.standing import StandingSettings, guide_of, rest_height, stand, steady
+from mapctl import rotations
+from mapctl.capture import Capture
+from mapctl.capture.faults import runs
+from mapctl.features import PRIOR_FPS, Place
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.solver.objective import Objective
+from mapctl.solver.poses import Guide, Poses
+from mapctl.terms import Footing, Noise
+from mapctl.terms.footing import TOES
+
+TOE = [CANONICAL.index(name) for name in TOES]
+QUICK = StandingSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
+
+
+def standing_still(frames=60, *, drift=0.0):
+    """One pose, sliding sideways by so many metres a second."""
+    pose = walk(1)
+    seconds = torch.arange(frames, dtype=torch.float64) / PRIOR_FPS
+    root = pose.root_position + torch.stack([drift * seconds, 0 * seconds, 0 * seconds], dim=-1)
+    return Motion(CANONICAL, pose.fps, root, pose.local_quat_xyzw.expand(frames, -1, -1).clone())
+
+
+def told(motion, *, degrees=3.0, centimetres=2.0):
+    """A capture of it, everything seen."""
+    seen = torch.ones(motion.num_frames, CANONICAL.num_joints, dtype=torch.bool)
+    sigma = torch.full((CANONICAL.num_joints,), math.radians(degrees))
+    return Capture.of_motion(motion, seen=seen, seen_root=seen[:, 0], sigma=sigma, sigma_root=centimetres / 100)
+
+
+def odds(motion, left=5.0, right=5.0):
+    return torch.tensor([left, right]).expand(motion.num_frames, 2).contiguous()
+
+
+def speeds(motion):
+    """Of the toes over the ground, m/s (frames - 1, 2)."""
+    toes = motion.joint_positions()[:, TOE][..., ::2]
+    return torch.diff(toes, dim=0).norm(dim=-1) * PRIOR_FPS
+
+
+def poses_of(motion, contacts, dtype=torch.float32, sigma=0.05):
+    guide = guide_of(motion, contacts)
+    guide = Guide(guide.root.to(dtype), guide.heading.to(dtype), guide.angles.to(dtype), guide.contacts)
+    width = guide.packed().shape[1]
+    return Poses(
+        guide, torch.full((len(guide.root), width), sigma, dtype=dtype), Place(guide.root[0, ::2], guide.heading[0]),
+        torch.zeros(0, CANONICAL.num_joints, 3, dtype=dtype), torch.zeros(2, dtype=torch.bool), CANONICAL,
+    )  # fmt: skip
+
+
+def test_without_unknowns_the_poses_are_the_guides():
+    motion = walk(20, turn_rate=1.0)
+    poses = poses_of(motion, torch.ones(20, 2, dtype=torch.bool), torch.float64)
+    trial = poses.build(torch.zeros(2, poses.sigma.numel(), dtype=torch.float64))
+    assert trial.joints_world.shape == (2, 20, CANONICAL.num_joints, 3)
+    assert (trial.joints_world[1] - motion.joint_positions()).abs().max() < 1e-5
+    heading, _ = rotations.split_heading(motion.local_quat_xyzw[:, 0])
+    assert (trial.heading[0] - rotations.unwrap_angle(heading)).abs().max() < 1e-5
+    assert trial.contacts.all()
+
+
+def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
+    poses = poses_of(walk(60), torch.zeros(60, 2, dtype=torch.bool), torch.float64)
+    white = torch.randn(400, poses.sigma.numel(), generator=generator(), dtype=torch.float64)
+    heights = poses.build(white).joints_world[:, :, 0, 1] - poses.guide.root[:, 1]
+    assert float(heights.square().mean().sqrt()) == pytest.approx(0.05, rel=0.05)
+    step = torch.diff(heights, dim=1).square().mean().sqrt()
+    assert step < 0.6 * heights.square().mean().sqrt()  # white ones would differ by 1.4 times
+
+
+def test_the_gradient_is_that_of_finite_differences():
+    motion = walk(12, turn_rate=0.5)
+    poses = poses_of(motion, torch.tensor([True, False]).expand(12, 2).contiguous(), torch.float64)
+    objective = Objective(poses.build, [Noise(1.0), Footing(sigma_speed=0.1, sigma_height=0.03)])
+    at = 0.3 * torch.randn(1, poses.sigma.numel(), generator=generator(1), dtype=torch.float64)
+    _, gradient = objective.energy_and_gradient(at)
+    for seed in range(3):
+        direction = torch.randn(at.shape, generator=generator(seed), dtype=torch.float64)
+        wanted = finite_difference(lambda x: objective.energy(x).sum(), at, direction)
+        assert float((gradient * direction).sum()) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_planted_toes_that_slide_slow_down_and_joints_stay_near():
+    motion = standing_still(60, drift=0.2)
+    stood = stand(motion, odds(motion), told(motion), QUICK)
+    before, after = speeds(motion), speeds(stood.motion)
+    assert after[2:].mean() < 0.6 * before[2:].mean()
+    assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).mean() < 0.15
+    assert stood.contacts.all()
+
+
+def test_feet_in_the_air_may_move():
+    motion = standing_still(60, drift=0.2)
+    stood = stand(motion, odds(motion, -5.0, -5.0), told(motion), QUICK)
+    assert not stood.contacts.any()
+    assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.01
+
+
+def test_a_capture_without_noise_stays_but_for_half_millimetres():
+    motion = walk(60)
+    stood = stand(motion, odds(motion), told(motion, degrees=0.0, centimetres=0.0), QUICK)
+    assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.005
+
+
+def test_what_was_not_seen_moves_before_what_was():
+    motion = standing_still(40, drift=0.2)
+    capture = told(motion, degrees=0.5, centimetres=0.1)
+    lost = replace(capture, seen_root=torch.zeros(1, 40, dtype=torch.bool))
+    held, free = (speeds(stand(motion, odds(motion), given, QUICK).motion)[2:].mean() for given in (capture, lost))
+    assert free < 0.5 * held
+
+
+def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):
+    motion = walk(70, turn_rate=0.6)
+    for frames, ahead in ((96, 24), (70, 8), (20, 8), (16, 15), (33, 1)):
+        settings = replace(QUICK, frames=frames, ahead=ahead, budget=Budget(evaluations=2))
+        stood = stand(motion, odds(motion, -5.0, -5.0), told(motion), settings)
+        assert stood.motion.num_frames == len(stood.contacts) == 70
+        assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.03
+        assert all(len(entry.energy) == 70 for entry in stood.ledger.entries)
+
+
+def test_windows_meet_without_a_jump():
+    """A slide that many windows work on: the hips' accelerations where two meet are as elsewhere."""
+    motion = standing_still(120, drift=0.2)
+    settings = replace(QUICK, frames=40, ahead=16)
+    out = stand(motion, odds(motion), told(motion), settings).motion
+    jump = torch.diff(out.joint_positions(), n=2, dim=0).norm(dim=-1).amax(dim=-1)
+    seams = torch.zeros(len(jump), dtype=torch.bool)
+    for seam in (24, 48, 72):
+        seams[seam - 3 : seam + 2] = True
+    assert jump[seams].max() < 0.02
+    assert torch.diff(out.joint_positions(), dim=0).norm(dim=-1).max() < 0.03
+
+
+def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
+    motion = standing_still(50, drift=0.2)
+    found = standing.minimise
+
+    def lost(*args, **kwargs):
+        result = found(*args, **kwargs)
+        return replace(result, x=torch.full_like(result.x, math.nan), energy=torch.full_like(result.energy, math.nan))
+
+    monkeypatch.setattr(standing, "minimise", lost)
+    stood = stand(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10))
+    assert stood.motion.num_frames == 50
+    assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-4
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_short_proposals_break_nothing(frames):
+    motion = walk(frames)
+    stood = stand(motion, odds(motion), told(motion), QUICK)
+    assert stood.motion.num_frames == frames
+    assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.1
+
+
+def test_a_guide_is_its_motion():
+    motion = walk(30, turn_rate=4.0)
+    guide = guide_of(motion, torch.zeros(30, 2, dtype=torch.bool))
+    assert torch.diff(guide.heading).abs().max() < 0.3
+    part = guide.slice(5, 9)
+    assert torch.equal(part.packed(), guide.packed()[5:9])
+    tilt = torch.stack([guide.angles[:, 0], 0 * guide.heading, guide.angles[:, 1]], dim=-1)
+    hips = rotations.multiply(rotations.about_y(guide.heading), rotations.from_rotation_vector(tilt))
+    assert apart_deg(hips.double(), motion.local_quat_xyzw[:, 0]).max() < 0.1
+
+
+def test_no_contact_and_no_gap_in_one_is_short():
+    bits = torch.rand(200, 40, generator=generator()) < torch.linspace(0.1, 0.9, 40)
+    for pair in bits.split(2, dim=1):
+        found = steady(pair)
+        for mask in (found, ~found):
+            assert all(stop - start >= 3 for _, start, stop in runs(mask))
+        assert torch.equal(steady(found), found)
+
+
+def test_long_contacts_stay():
+    bits = torch.zeros(30, 2, dtype=torch.bool)
+    bits[3:9, 0] = True
+    bits[20:, 1] = True
+    assert torch.equal(steady(bits), bits)
+
+
+def test_the_rest_height_is_that_of_planted_toes():
+    motion = walk(90)
+    planted = motion.joint_positions()[:, TOE, 1] < TOE_REST_HEIGHT + 0.01
+    assert rest_height(motion, planted) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
+    assert rest_height(motion, torch.zeros_like(planted)) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)

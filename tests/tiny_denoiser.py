@@ -1,0 +1,39 @@
+"""A denoiser of a few kilobytes: untrained it smooths, with drawn weights it does something else with what it sees."""
+
+from pathlib import Path
+
+import torch
+
+from priors import checkpoints
+from priors.denoiser import ConvDenoiser, DenoiserConfig, DenoiserNetwork
+
+CONFIG = DenoiserConfig(width=8, dilations=(1, 2))
+
+
+def network(*, drawn: float = 0.0, seed: int = 0, config: DenoiserConfig = CONFIG) -> DenoiserNetwork:
+    """Weights of the last layers are drawn with this spread; untrained they are nil."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        made = DenoiserNetwork(config)
+        if drawn:
+            for layer in (made.last, *(block.across for block in made.blocks)):
+                for parameter in layer.parameters():
+                    torch.nn.init.normal_(parameter, std=drawn)
+    return made.eval().requires_grad_(False)
+
+
+def card() -> checkpoints.Card:
+    """Of the tiny denoiser."""
+    return checkpoints.Card("denoiser", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.of_layout())
+
+
+def tiny_denoiser(*, drawn: float = 0.0, seed: int = 0) -> ConvDenoiser:
+    """As the controllers take it."""
+    return ConvDenoiser("tiny", network(drawn=drawn, seed=seed), card())
+
+
+def save_tiny_denoiser(path: Path, *, drawn: float = 0.0) -> Path:
+    """Write the weights and the card; returns the path for --denoiser."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
+    return path
