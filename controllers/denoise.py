@@ -22,13 +22,15 @@ from mapctl.capture.examine import examine
 from mapctl.capture.masks import Mask, masked, part_of
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
-from mapctl.retarget import from_canonical, map_rig, to_canonical
+from mapctl.retarget import RigMap, from_canonical, settled, to_canonical
+from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.result import Ledger
 
 __all__ = ["DenoiseSettings", "Denoised", "begins_with_tpose", "denoise"]
 
 _SHORTEST = 8  # frames of a capture that noise can be told in
+_TELLING = 3000  # frames that show what rig a capture is on
 _NEAR_REST = 5.0  # times the noise of one angle, that a resting joint is turned by at most
 _NOISY_DEG, _SPIKE_DEG = 1.0, 60.0
 _PIECE, _SHARED = 60.0, 2.0  # seconds of a long capture that are cleaned at once, and that two pieces share
@@ -36,9 +38,10 @@ _PIECE, _SHARED = 60.0, 2.0  # seconds of a long capture that are cleaned at onc
 
 def denoise(
     motion: Motion, denoiser: Denoiser, *, masks: Sequence[Mask] = (), settings: DenoiseSettings | None = None,
-    density: Any = None, progress: Callable[[int, int], None] | None = None,
+    density: Any = None, rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Denoised:  # fmt: skip
-    """Denoise a motion on any rig that `mapctl.rigs` can tell; RequestError for others and for masks that do not fit.
+    """Denoise a motion on any rig that `mapctl.rigs` can tell, or on a given one; RequestError for others and for masks
+    that do not fit.
 
     `denoiser` proposes (see priors.load_denoiser); a `density` adds its likelihood to the MAP stage. A T-pose in frame
     0, as many captures begin with, stays. A long capture is cleaned in pieces that fade into each other, so
@@ -46,7 +49,10 @@ def denoise(
     """
     settings = settings or DenoiseSettings()
     masked(motion, masks)  # whole: of a piece they are cut to its frames
-    lead = 1 if begins_with_tpose(motion) else 0
+    # Told once: a piece may lack what shows the rig's T-pose.
+    rigmap = to_canonical(_beginning(motion), rig)[1]
+    rig = settled(rigmap)
+    lead = 1 if begins_with_tpose(motion, rig) else 0
     frames = motion.num_frames - lead
     long, shared = (max(_SHORTEST, round(seconds * float(motion.fps))) for seconds in (_PIECE, _SHARED))
     pieces: list[tuple[Denoised, int]] = []
@@ -54,28 +60,33 @@ def denoise(
     while True:
         stop = frames if frames - start <= long + shared else start + long
         part = motion.slice(lead + start, lead + stop)
-        piece = _cleaned(part, denoiser, part_of(masks, lead + start, lead + stop), settings, density)
+        piece = _cleaned(part, denoiser, part_of(masks, lead + start, lead + stop), settings, density, rig)
         pieces = [(joined([*pieces, (piece, start)]), 0)]
         if progress is not None:
             progress(lead + stop, motion.num_frames)
         if stop == frames:
             break
         start = stop - shared
-    done = pieces[0][0]
-    return _led_by(motion, done) if lead else done
+    done = replace(pieces[0][0], rig=rig)
+    return _led_by(motion, done, rigmap) if lead else done
 
 
-def begins_with_tpose(motion: Motion) -> bool:
+def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:
     """Whether frame 0 is a T-pose and the motion is not: arms out, everything straight, and then not."""
-    canonical, _ = to_canonical(motion.slice(0, min(motion.num_frames, 600)))
+    canonical, _ = to_canonical(_beginning(motion), rig)
     turned = torch.rad2deg(rotations.to_rotation_vector(canonical.local_quat_xyzw[:, 1:]).norm(dim=-1))
     arms = turned[:, [CANONICAL.index(name) - 1 for name in ("leftUpperArm", "rightUpperArm")]].amin(dim=-1)
     straight = bool(arms[0] < 25) and bool(turned[0].mean() < 15)
     return straight and motion.num_frames > 1 and bool(arms[1:].median() > 40)
 
 
+def _beginning(motion: Motion) -> Motion:
+    """As much as is looked at to tell a rig."""
+    return motion.slice(0, min(motion.num_frames, _TELLING))
+
+
 def _cleaned(
-    motion: Motion, denoiser: Denoiser, masks: Sequence[Mask], settings: DenoiseSettings, density: Any
+    motion: Motion, denoiser: Denoiser, masks: Sequence[Mask], settings: DenoiseSettings, density: Any, rig: Rig
 ) -> Denoised:
     began = time.perf_counter()
     examined = examine(motion, masks)
@@ -85,14 +96,14 @@ def _cleaned(
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
         return Denoised(motion, motion, examined.noise, examined.noise_root, (), nothing, believed, Ledger(),
                         notes=(note,))  # fmt: skip
-    done = Piece(examined, denoiser, settings).run(density)
+    done = Piece(examined, denoiser, settings, rig).run(density)
     return replace(done, seconds=time.perf_counter() - began)
 
 
-def _led_by(motion: Motion, done: Denoised) -> Denoised:
+def _led_by(motion: Motion, done: Denoised, rigmap: RigMap) -> Denoised:
     """With frame 0 before it: a T-pose, from which joints go back to rest that are there but for the noise."""
     first = motion.slice(0, 1)
-    rest = min(_rests(motion), key=lambda quats: float(_apart(quats, first.local_quat_xyzw).mean()))
+    rest = min(_rests(motion, rigmap), key=lambda quats: float(_apart(quats, first.local_quat_xyzw).mean()))
     # In a noisy capture a joint that is further off has been hit by a spike.
     reach = torch.where(done.noise > math.radians(_NOISY_DEG), math.radians(_SPIKE_DEG), _NEAR_REST * done.noise)
     at_rest = _apart(rest, first.local_quat_xyzw) < reach
@@ -102,9 +113,8 @@ def _led_by(motion: Motion, done: Denoised) -> Denoised:
     return replace(done, motion=first.join(done.motion), capture=motion, faults=faults, notes=(note, *done.notes))
 
 
-def _rests(motion: Motion) -> list[Float[Tensor, "1 joints 4"]]:
+def _rests(motion: Motion, rigmap: RigMap) -> list[Float[Tensor, "1 joints 4"]]:
     """Local rotations that a T-pose may be meant to have: none, as in CMU's takes, and those of the rig's T-pose."""
-    rigmap = map_rig(motion.skeleton)
     none = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     tpose = Motion(rigmap.skeleton, motion.fps, torch.zeros(1, 3, dtype=torch.float64),
                    none.expand(1, CANONICAL.num_joints, 4))  # fmt: skip

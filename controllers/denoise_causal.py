@@ -16,8 +16,10 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
+from mapctl.rigs import Rig
 
 _LONGEST_DELAY = 5.0
+_TELLING = 1.0  # seconds that show what rig a capture is on
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,12 @@ class CausalDenoiser:
     """Takes the frames of one capture as they come, gives back clean ones."""
 
     def __init__(
-        self, denoiser: Denoiser, *, settings: DenoiseSettings | None = None, causal: CausalSettings | None = None
-    ):
-        self._denoiser, self._settings = denoiser, settings or DenoiseSettings()
+        self, denoiser: Denoiser, *, settings: DenoiseSettings | None = None, causal: CausalSettings | None = None,
+        rig: Rig | None = None,
+    ):  # fmt: skip
+        """`rig` wins over what would be recognised."""
+        self._denoiser, self._settings, self._rig = denoiser, settings or DenoiseSettings(), rig
+        self._told = False  # whether the rig was told from the capture's beginning, which later passes do not see
         self._causal = causal or CausalSettings()
         self._past: Motion | None = None  # what a pass sees
         self._first = 0  # the frame of the capture that it begins with
@@ -76,7 +81,9 @@ class CausalDenoiser:
     def _pass(self, due: int) -> Denoised:
         assert self._past is not None
         masks = part_of(self._masks, self._first, self._first + self._past.num_frames)
-        done = denoise(self._past, self._denoiser, masks=masks, settings=self._settings)
+        done = denoise(self._past, self._denoiser, masks=masks, settings=self._settings, rig=self._rig)
+        if not self._told and self._past.seconds >= _TELLING:
+            self._rig, self._told = done.rig, True
         start, count = self._given - self._first, due - self._given
         given = done.slice(start, start + count)
         if self._foreseen is not None:
@@ -100,11 +107,12 @@ class CausalDenoiser:
 
 def denoise_causal(
     motion: Motion, denoiser: Denoiser, *, masks: Sequence[Mask] = (), settings: DenoiseSettings | None = None,
-    delay: float = CausalSettings.delay, progress: Callable[[int, int], None] | None = None,
+    delay: float = CausalSettings.delay, rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Denoised:  # fmt: skip
     """A whole motion through a CausalDenoiser, a frame at a time."""
     began = time.perf_counter()
-    stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay))
+    stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay), rig=rig)
     whole: Denoised | None = None
     for frame in range(motion.num_frames):
         new = stream.push(motion.slice(frame, frame + 1), masks=masks if frame == 0 else ())

@@ -13,6 +13,7 @@ from controllers.denoised import Denoised
 from mapctl import formats
 from mapctl.errors import MapctlError, RequestError
 from mapctl.protocols import Denoiser
+from mapctl.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class Cleaner:
     """Makes the denoiser: `functools.partial(priors.load_denoiser, "denoiser")`."""
     settings: DenoiseSettings
     """What is known of the captures."""
+    rig: Rig | None = None
+    """Of all files, where it is not the one that would be recognised."""
     after: Callable[[Job, Denoised], None] | None = None
     """Called with each result, in that process: to write a report."""
 
@@ -54,7 +57,8 @@ class Cleaner:
         """Denoise one file and write the result; what goes wrong with it is said in what is returned."""
         torch.set_num_threads(1)
         try:
-            done = denoise(formats.load(job.source), _loaded(self.load), settings=self.settings)
+            motion = formats.load(job.source, metres_per_unit=None if self.rig is None else self.rig.metres_per_unit)
+            done = denoise(motion, _loaded(self.load), settings=self.settings, rig=self.rig)
             job.out.parent.mkdir(parents=True, exist_ok=True)
             if self.after is not None:
                 self.after(job, done)

@@ -22,6 +22,7 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
 from mapctl.retarget import RigMap, to_canonical
+from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.footing import TOES
 
@@ -49,10 +50,10 @@ class DenoiseSettings:
 class Piece:
     """From an examined capture to a clean motion."""
 
-    def __init__(self, examined: Examined, denoiser: Denoiser, settings: DenoiseSettings):
+    def __init__(self, examined: Examined, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
         self.examined, self.denoiser, self.settings = examined, denoiser, settings
-        self.repaired = _others_smoothed(examined)
-        canonical, self.rigmap = to_canonical(self.repaired)
+        self.repaired = _others_smoothed(examined, rig)
+        canonical, self.rigmap = to_canonical(self.repaired, rig)
         seen = _on_canonical(examined.seen, self.rigmap)
         self.hidden_root = examined.dropouts_root | ~_above_hips(~examined.dropouts, self.rigmap)
         self.seen_root = examined.seen_root & _above_hips(examined.seen, self.rigmap)
@@ -60,7 +61,7 @@ class Piece:
         self.bands = split(canonical)
         if self.bands.exact:
             # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
-            self.bands = split(_signed_like(to_canonical(examined.motion)[0], canonical))
+            self.bands = split(_signed_like(to_canonical(examined.motion, rig)[0], canonical))
         self.shown = self.bands.at_prior_rate()
         self.capture = self._capture(seen)
 
@@ -184,10 +185,10 @@ def _signed_like(motion: Motion, other: Motion) -> Motion:
     return replace(motion, local_quat_xyzw=torch.where(dots < 0, -1.0, 1.0) * motion.local_quat_xyzw)
 
 
-def _others_smoothed(examined: Examined) -> Motion:
+def _others_smoothed(examined: Examined, rig: Rig | None) -> Motion:
     """The repaired capture; joints that the canonical skeleton lacks, as fingers, are smoothed as their noise asks."""
     motion = examined.repaired()
-    used = set(retarget.map_rig(motion.skeleton).joint_of)
+    used = set(retarget.map_rig(motion.skeleton, rig).joint_of)
     others = [j for j in range(motion.num_joints) if j not in used and examined.noise[j] > 0]
     if not others:
         return motion

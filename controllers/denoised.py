@@ -13,6 +13,7 @@ from mapctl import rotations
 from mapctl.capture.faults import Fault
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
+from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.result import Ledger
 
@@ -40,6 +41,8 @@ class Denoised:
     smoothed, took its place."""
     ledger: Ledger
     """Of the MAP stage, by term and frame at the prior's rate."""
+    rig: Rig | None = None
+    """The rig as it was told."""
     seconds: float = 0.0
     """Compute, wall clock."""
     notes: tuple[str, ...] = ()
@@ -61,6 +64,7 @@ class Denoised:
         names = self.motion.skeleton.names
         moved, turned = self.correction()
         return {
+            "rig": None if self.rig is None else self.rig.name,
             "frames": self.motion.num_frames, "fps": float(self.motion.fps),
             "noise_deg": dict(zip(names, torch.rad2deg(self.noise).tolist(), strict=True)),
             "noise_root_cm": 100 * self.noise_root,

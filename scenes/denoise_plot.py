@@ -11,6 +11,7 @@ from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
 from mapctl.motion import Motion
+from mapctl.rigs import Rig
 from scenes.film import film
 
 _JOINTS = ("leftUpperArm", "rightLowerArm", "leftUpperLeg", "rightLowerLeg", "chest")
@@ -18,14 +19,14 @@ _BEFORE, _AFTER = "#bbbbbb", "#4c78a8"
 _APART = 1.4  # metres between the two of a film
 
 
-def plot(capture: Motion, clean: Motion, path: str | PathLike[str]) -> None:
+def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig | None = None) -> None:
     """Write a PNG: angles of some joints, and height and speed of the toes. RequestError without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RequestError(f"plots need matplotlib ({error}): pip install 'mapctl[render]'") from error
-    before, after = (retarget.to_canonical(motion)[0] for motion in (capture, clean))
+    before, after = (retarget.to_canonical(motion, rig)[0] for motion in (capture, clean))
     seconds = np.arange(clean.num_frames) / float(clean.fps)
     figure = Figure(figsize=(12, 2.1 * (len(_JOINTS) + 4)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -50,10 +51,11 @@ def plot(capture: Motion, clean: Motion, path: str | PathLike[str]) -> None:
 
 
 def side_by_side(
-    capture: Motion, clean: Motion, path: str | PathLike[str], *, progress: Callable[[int, int], None] | None = None
-) -> None:
+    capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:  # fmt: skip
     """Film the capture, grey, and the result beside it."""
-    before, after = (retarget.to_canonical(motion)[0] for motion in (capture, clean))
+    before, after = (retarget.to_canonical(motion, rig)[0] for motion in (capture, clean))
     aside = torch.tensor([_APART, 0.0, 0.0], dtype=torch.float64)
     film([(after, None), (replace(before, root_position=before.root_position + aside), None, "#999999")], path,
          progress=progress)  # fmt: skip

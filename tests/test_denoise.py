@@ -18,7 +18,8 @@ from controllers.standing import StandingSettings
 from mapctl import retarget, rotations
 from mapctl.capture.masks import ALL, ROOT, Mask
 from mapctl.errors import RequestError
-from mapctl.skeleton import CANONICAL
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 
@@ -277,10 +278,11 @@ def test_the_noise_may_be_said():
 
 
 def test_unknown_rigs_are_refused():
-    motion = on_rig("canonical", 20)
-    skeleton = replace(motion.skeleton, names=tuple(f"j{k}" for k in range(motion.num_joints)))
+    whole = on_rig("canonical", 20)
+    chain = Skeleton(("a", "b", "c"), (-1, 0, 1), whole.skeleton.offsets[:3])
+    motion = Motion(chain, whole.fps, whole.root_position, whole.local_quat_xyzw[:, :3])
     with pytest.raises(RequestError):
-        cleaned(replace(motion, skeleton=skeleton))
+        cleaned(motion)
 
 
 @pytest.mark.parametrize("rig", ["canonical", "bandai"])

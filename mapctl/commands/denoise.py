@@ -26,6 +26,8 @@ class Denoise:
     """A motion file; or a folder, every motion below it."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="OUT|FOLDER")]
     """Where the clean motion goes; of a folder, another one, which gets the same names."""
+    rig: options.MaybeRig = None
+    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is not to be
     believed. `*` stands for everything, `root position` for where it is."""
@@ -108,21 +110,22 @@ class Denoise:
 
     def _denoised(self) -> "Denoised":
         import priors
-        from mapctl import formats
 
-        settings, masks = self.settings(), self._masks()
+        settings, masks, rig = self.settings(), self._masks(), options.read_rig(self.rig)
         density = None if self.prior is None else priors.load(self.prior)
-        denoiser, motion = priors.load_denoiser(self.denoiser), formats.load(self.source)
+        denoiser, motion = priors.load_denoiser(self.denoiser), options.read_motion(self.source, rig)
         with bar("denoising", quiet=self.quiet) as progress:
             if self.causal:
                 from controllers.denoise_causal import denoise_causal
 
                 return denoise_causal(
-                    motion, denoiser, masks=masks, settings=settings, delay=self.delay, progress=progress
+                    motion, denoiser, masks=masks, settings=settings, delay=self.delay, rig=rig, progress=progress
                 )
             from controllers.denoise import denoise
 
-            return denoise(motion, denoiser, masks=masks, settings=settings, density=density, progress=progress)
+            return denoise(
+                motion, denoiser, masks=masks, settings=settings, density=density, rig=rig, progress=progress
+            )
 
     def settings(self):
         """What is known of the capture; RequestError for numbers that make no sense."""
@@ -141,12 +144,12 @@ class Denoise:
         if self.plot is not None:
             from scenes.denoise_plot import plot
 
-            plot(done.capture, done.motion, self.plot)
+            plot(done.capture, done.motion, self.plot, rig=done.rig)
         if self.video is not None:
             from scenes.denoise_plot import side_by_side
 
             with bar("filming", quiet=self.quiet) as progress:
-                side_by_side(done.capture, done.motion, self.video, progress=progress)
+                side_by_side(done.capture, done.motion, self.video, rig=done.rig, progress=progress)
 
     def _tell(self, done: "Denoised") -> None:
         summary = done.summary()

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapctl.commands import outputs
+from mapctl.commands import options, outputs
 from mapctl.errors import RequestError
 from mapctl.progress import bar
 
@@ -26,7 +26,7 @@ def run(given: "Denoise") -> int:
     priors.load_denoiser(given.denoiser)  # a typing error is said once, now
     load = partial(priors.load_denoiser, given.denoiser)
     after = None if given.report is None else WriteReport(given, given.report)
-    cleaner = Cleaner(load, given.settings(), after)
+    cleaner = Cleaner(load, given.settings(), options.read_rig(given.rig), after)
     if given.cluster is not None:
         ended = over_cluster(jobs, cleaner, address=given.cluster, workers=given.jobs)
     else:
