@@ -145,6 +145,7 @@ def test_an_output_folder_inside_the_input_is_not_denoised_itself(denoise, folde
         assert "2 denoised" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_more_processes_give_the_same_files(denoise, folder, tmp_path):
     assert denoise(folder, "-o", tmp_path / "one", "--quiet") == 0
     assert denoise(folder, "-o", tmp_path / "two", "--jobs", 2, "--quiet") == 0
