@@ -19,7 +19,7 @@ from controllers.denoise_piece import DenoiseSettings, Piece
 from controllers.denoised import Denoised, joined
 from mapctl import rotations
 from mapctl.capture.examine import examine
-from mapctl.capture.masks import Mask, masked, part_of
+from mapctl.capture.masks import Mask, after, masked, part_of, written_back
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
 from mapctl.retarget import RigMap, from_canonical, settled, to_canonical
@@ -55,19 +55,20 @@ def denoise(
     lead = 1 if begins_with_tpose(motion, rig) else 0
     frames = motion.num_frames - lead
     long, shared = (max(_SHORTEST, round(seconds * float(motion.fps))) for seconds in (_PIECE, _SHARED))
-    pieces: list[tuple[Denoised, int]] = []
-    start = 0
-    while True:
-        stop = frames if frames - start <= long + shared else start + long
-        part = motion.slice(lead + start, lead + stop)
-        piece = _cleaned(part, denoiser, part_of(masks, lead + start, lead + stop), settings, density, rig)
-        pieces = [(joined([*pieces, (piece, start)]), 0)]
+    done, start, stop = None, 0, 0
+    while stop < frames:
+        before, stop = stop, frames if frames - start <= long + shared else start + long
+        part, hidden = motion.slice(lead + start, lead + stop), part_of(masks, lead + start, lead + stop)
+        if done is not None:  # what the piece before made of lost joints is all that is known of them
+            part = written_back(part, done.motion.slice(start, before), hidden)
+            hidden = after(hidden, before - start)
+        piece = _cleaned(part, denoiser, hidden, settings, density, rig)
+        done = piece if done is None else joined([(done, 0), (piece, start)])
+        start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
-        if stop == frames:
-            break
-        start = stop - shared
-    done = replace(pieces[0][0], rig=rig)
+    assert done is not None, "a motion has a frame"
+    done = replace(done, capture=motion.slice(lead, motion.num_frames), rig=rig)
     return _led_by(motion, done, rigmap) if lead else done
 
 

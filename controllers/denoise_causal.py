@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from controllers.denoise import denoise
 from controllers.denoise_piece import DenoiseSettings
 from controllers.denoised import Denoised, faded, joined
-from mapctl.capture.masks import Mask, part_of
+from mapctl.capture.masks import Mask, after, part_of, written_back
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
@@ -80,7 +80,8 @@ class CausalDenoiser:
 
     def _pass(self, due: int) -> Denoised:
         assert self._past is not None
-        masks = part_of(self._masks, self._first, self._first + self._past.num_frames)
+        # What was given back of a lost joint is written into the past: later passes may see nothing else of it.
+        masks = part_of(after(self._masks, self._given), self._first, self._first + self._past.num_frames)
         done = denoise(self._past, self._denoiser, masks=masks, settings=self._settings, rig=self._rig)
         if not self._told and self._past.seconds >= _TELLING:
             self._rig, self._told = done.rig, True
@@ -92,6 +93,10 @@ class CausalDenoiser:
             if shared > 0:
                 before = old.slice(self._given - first, self._given - first + shared)
                 given = replace(given, motion=faded(before, given.motion, shared))
+        old = self._past.slice(start, self._past.num_frames)
+        lost = part_of(self._masks, self._given, self._given + old.num_frames)
+        renewed = written_back(old, given.motion, lost)
+        self._past = self._past.slice(0, start).join(renewed) if start else renewed
         self._foreseen, self._given = (done.motion, self._first), due
         self._forget()
         return given

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import error_cm, on_rig, shaken
+from captures import apart_deg, error_cm, on_rig, shaken
 from test_denoise import QUICK, noisy
 from tiny_denoiser import tiny_denoiser
 
@@ -142,3 +142,16 @@ def test_what_is_said_of_the_delay_holds(delay):
     for done, come in given:
         assert come - 1 - count <= math.ceil(stream(causal).delay * 30)
         count += done.motion.num_frames
+
+
+def test_a_joint_that_is_lost_for_longer_than_a_pass_looks_back_is_made_up_from_what_was_given():
+    truth = on_rig("daz", 130, fps=30)
+    joint = truth.skeleton.index("lForeArm")
+    garbage = truth.local_quat_xyzw.clone()
+    garbage[30:125, joint] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    lost = replace(truth, local_quat_xyzw=garbage)
+    done = denoise_causal(lost, tiny_denoiser(), masks=[Mask("lForeArm", 30, 125)])
+    assert done.motion.num_frames == 130
+    assert bool(done.motion.local_quat_xyzw.isfinite().all())
+    turned = apart_deg(done.motion.local_quat_xyzw[30:125, joint], garbage[30:125, joint])
+    assert turned.min() > 60  # nothing of the garbage comes through

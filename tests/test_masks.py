@@ -35,10 +35,10 @@ def test_a_header_alone_masks_nothing(read):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("joint,start\nlHand,0\n", "needs the columns joint, start, stop; stop missing"),
-    ("joint,start,stop\nlHand,0,12\nrHand,x,4\n", "line 3: start and stop are whole frames"),
-    ("joint,start,stop\nlHand,1.5,4\n", "line 2: start and stop are whole frames"),
-    ("joint,start,stop\nlHand,1\n", "line 2: start and stop are whole frames"),
+    ("joint,start\nlHand,0\n", "needs the columns joint, start, stop, each once; found joint,start"),
+    ("joint,start,stop\nlHand,0,12\nrHand,x,4\n", "line 3: expected a joint and two whole frames"),
+    ("joint,start,stop\nlHand,1.5,4\n", "line 2: expected a joint and two whole frames"),
+    ("joint,start,stop\nlHand,1\n", "line 2: found 2 values where 3 belong"),
     ("joint,start,stop\nlHand,4,4\n", "line 2: needs 0 <= start < stop, got 4 and 4"),
     ("joint,start,stop\nlHand,-1,4\n", "line 2: needs 0 <= start < stop, got -1 and 4"),
 ])  # fmt: skip
@@ -48,10 +48,10 @@ def test_errors_name_the_line(read, text, message):
 
 
 def test_what_is_no_csv_is_said(tmp_path):
-    with pytest.raises(FileFormatError, match="no readable CSV"):
+    with pytest.raises(FileFormatError, match="gone"):
         load_masks(tmp_path / "gone.csv")
     (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
-    with pytest.raises(FileFormatError, match="no readable CSV"):
+    with pytest.raises(FileFormatError, match="binary"):
         load_masks(tmp_path / "binary.csv")
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from os import PathLike
 
@@ -60,21 +60,28 @@ def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     RequestError for joints that the rig has not (with the nearest that it has), frames beyond the end, and joints of
     which nothing would be left.
     """
+    for mask in masks:
+        if mask.stop > motion.num_frames:
+            raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
+    joints, root = _hidden(motion, masks)
+    if root.all() or joints.all(dim=0).any():
+        gone = "root position" if root.all() else motion.skeleton.names[int(joints.all(dim=0).nonzero()[0])]
+        raise RequestError(f"the masks leave nothing of {gone} in {motion.num_frames} frames")
+    return joints, root
+
+
+def _hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
+    """Masked joints (frames, joints) and root places (frames,)."""
     names = motion.skeleton.names
     joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
     root = torch.zeros(motion.num_frames, dtype=torch.bool)
     for mask in masks:
-        if mask.stop > motion.num_frames:
-            raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
         if mask.joint in (ALL, ROOT):
             root[mask.start : mask.stop] = True
         if mask.joint == ALL:
             joints[mask.start : mask.stop] = True
         elif mask.joint != ROOT:
             joints[mask.start : mask.stop, _index(names, mask.joint)] = True
-    if root.all() or joints.all(dim=0).any():
-        gone = "root position" if root.all() else names[int(joints.all(dim=0).nonzero()[0])]
-        raise RequestError(f"the masks leave nothing of {gone}")
     return joints, root
 
 
@@ -82,6 +89,32 @@ def part_of(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
     """The masks of frames start to stop, counted from there."""
     clipped = [Mask(m.joint, max(m.start, start) - start, min(m.stop, stop) - start) for m in masks]
     return tuple(mask for mask in clipped if mask.start < mask.stop)
+
+
+def after(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
+    """The masks as far as they hold from that frame on."""
+    cut = [Mask(m.joint, max(m.start, frame), m.stop) for m in masks]
+    return tuple(mask for mask in cut if mask.start < mask.stop)
+
+
+def written_back(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
+    """The motion with what is masked of its first frames taken from a clean version of them.
+
+    So that a joint which is lost for long is known by what was made of it before.
+    """
+    shared = clean.num_frames
+    joints, root = _hidden(motion, masks)
+    joints, root = joints[:shared], root[:shared]
+    if not bool(joints.any() | root.any()):
+        return motion
+    quats, place = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    quats[:shared] = torch.where(joints[..., None], clean.local_quat_xyzw, quats[:shared])
+    place[:shared] = torch.where(root[:, None], clean.root_position, place[:shared])
+    moving = dict(motion.moving_offsets)
+    for joint, values in moving.items():
+        kept = torch.where(root[:, None], clean.moving_offsets[joint], values[:shared])
+        moving[joint] = torch.cat([kept, values[shared:]])
+    return replace(motion, local_quat_xyzw=quats, root_position=place, moving_offsets=moving)
 
 
 def _index(names: Sequence[str], wanted: str) -> int:
