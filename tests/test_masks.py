@@ -35,7 +35,7 @@ def test_a_header_alone_masks_nothing(read):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("joint,start\nlHand,0\n", "needs the columns joint, start, stop, each once; found joint,start"),
+    ("joint,start\nlHand,0\n", "needs the columns joint, start, stop, each once; found 'joint,start'"),
     ("joint,start,stop\nlHand,0,12\nrHand,x,4\n", "line 3: expected a joint and two whole frames"),
     ("joint,start,stop\nlHand,1.5,4\n", "line 2: expected a joint and two whole frames"),
     ("joint,start,stop\nlHand,1\n", "line 2: found 2 values where 3 belong"),

@@ -80,8 +80,8 @@ def filled(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batc
     start = torch.take_along_dim(values, before[..., None], dim=1)
     stop = torch.take_along_dim(values, after[..., None], dim=1)
     frame = torch.arange(values.shape[1], device=values.device)
-    weight = ((frame - before) / (after - before).clamp_min(1)).clamp(0, 1)
-    return torch.lerp(start, stop, weight[..., None].to(values))
+    weight = ((frame - before).to(values) / (after - before).clamp_min(1)).clamp(0, 1)
+    return torch.lerp(start, stop, weight[..., None])
 
 
 def last_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
