@@ -279,10 +279,12 @@ def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
-def test_a_clip_that_cannot_be_used_is_named(tmp_path, data):
-    text = (data / "walk-0.bvh").read_text().replace("Spine", "Trunk")
-    (tmp_path / "odd.bvh").write_text(text)
-    with pytest.raises(MapctlError, match=r"odd\.bvh: no known rig"):
+def test_a_clip_that_cannot_be_used_is_named(tmp_path):
+    # One joint that moves is a motion, but nobody's.
+    head = ["HIERARCHY", "ROOT Ball", "{", "OFFSET 0 0 0", "CHANNELS 3 Xposition Yposition Zposition", "End Site", "{",
+            "OFFSET 0 10 0", "}", "}", "MOTION", "Frames: 2", "Frame Time: 0.033333", "0 0 0", "1 0 0"]  # fmt: skip
+    (tmp_path / "odd.bvh").write_text("\n".join(head) + "\n")
+    with pytest.raises(MapctlError, match=r"odd\.bvh: "):
         corpora.read(tmp_path, match="", cache=tmp_path / "cache")
 
 
