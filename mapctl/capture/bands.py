@@ -73,14 +73,26 @@ class Bands:
         turned = rotations.multiply(rotations.inverse(shown.local_quat_xyzw), cleaned.local_quat_xyzw)
         angles = self._carried(rotations.to_rotation_vector(turned))
         moved = self._carried(cleaned.root_position - shown.root_position)
+        base, fast_angles, fast_root = self._beside(shown)
         frames_a_moment = _MOMENT * float(self.slow.fps)
         high = 0.0 if self.whole else 1 - EDGE_HZ / (float(self.slow.fps) / 2)  # share of the noise's power
-        fast = _more_than_noise(self.fast_angles, high * sigma.square()[None, :, None], frames_a_moment)
-        root = _more_than_noise(self.fast_root[:, None], torch.tensor(high * sigma_root**2), frames_a_moment)[:, 0]
-        quats = rotations.multiply(self.slow.local_quat_xyzw, rotations.from_rotation_vector(angles))
+        fast = _more_than_noise(fast_angles, high * sigma.square()[None, :, None], frames_a_moment)
+        root = _more_than_noise(fast_root[:, None], torch.tensor(high * sigma_root**2), frames_a_moment)[:, 0]
+        quats = rotations.multiply(base.local_quat_xyzw, rotations.from_rotation_vector(angles))
         quats = rotations.multiply(quats, rotations.from_rotation_vector(fast))
-        return Motion(self.slow.skeleton, self.slow.fps, self.slow.root_position + moved + root,
-                      rotations.sign_continuous(quats))  # fmt: skip
+        return Motion(base.skeleton, base.fps, base.root_position + moved + root, rotations.sign_continuous(quats))
+
+    def _beside(self, shown: Motion) -> tuple[Motion, Float[Tensor, "frames joints 3"], Float[Tensor, "frames 3"]]:
+        """What was shown, at the recording's rate, and how the recording differs from it: not from the slow band, of
+        whose noise near the edge a spline through fewer frames would leave some.
+        """
+        if self.whole or shown.num_frames < 2:
+            return self.slow, self.fast_angles, self.fast_root
+        quats = torch.nn.functional.normalize(self._carried(shown.local_quat_xyzw), dim=-1)
+        base = Motion(self.slow.skeleton, self.slow.fps, self._carried(shown.root_position), quats)
+        whole = rotations.multiply(self.slow.local_quat_xyzw, rotations.from_rotation_vector(self.fast_angles))
+        angles = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats), whole))
+        return base, angles, self.slow.root_position + self.fast_root - base.root_position
 
     def _carried(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
         """From the prior's rate to the recording's."""
