@@ -82,6 +82,9 @@ def examine(motion: Motion, masks: Sequence[Mask] = ()) -> Examined:
     noise, noise_root = angle_noise(quats, ~dropouts), place_noise(place, ~dropouts_root)
     spikes = angle_spikes(quats, noise) & ~dropouts
     spikes_root = place_spikes(place, noise_root) & ~dropouts_root
+    # Each spike spoils the differences of the frames around it.
+    noise = angle_noise(quats, ~(dropouts | spikes))
+    noise_root = place_noise(place, ~(dropouts_root | spikes_root))
     return Examined(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
 
 

@@ -31,7 +31,7 @@ class Bench:
     spoilt in several ways, beside filters tuned on the truth."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
-    `live`, if not given."""
+    `live`, if not given; for `denoise` a density whose likelihood joins the last stage, none if not given."""
     data: options.MaybeFile = None
     """For `generation` and `denoise`: the folder that was trained on; its held-out clips are looked up there."""
     count: options.Count = 48
@@ -91,8 +91,9 @@ class Bench:
             for path in paths.get(kind, [])[: max(1, self.count // len(KINDS))]:
                 motion = formats.load(path)
                 clips.append(Clip(kind, shortened(motion, skip_first=begins_with_tpose(motion))))
+        density = None if self.prior is None else priors.load(self.prior)
         with bar("denoising") as progress:
-            return table(clips, denoiser, progress=progress)
+            return table(clips, denoiser, density=density, progress=progress)
 
     def _held_out(self, card: Any) -> list[Path]:
         """The clips that were kept from training; RequestError where they are not all there."""
