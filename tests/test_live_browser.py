@@ -162,6 +162,7 @@ def test_a_drawn_path_is_walked(page, tmp_path):
     page.get_by_role("button", name="Clear").click()
 
 
+@pytest.mark.slow
 def test_two_browsers_see_the_same_and_one_may_go_and_come_back(page, browser, live):
     other = browser.new_page(viewport=SIZE)
     other.goto(live.url)

@@ -202,6 +202,7 @@ def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
     assert timing(records)["evaluations_per_frame"] == pytest.approx(4 / 3)
 
 
+@pytest.mark.slow
 def test_the_bench_sorts_changes_by_kind_and_counts_them_all():
     rows = steering(DENSITY, SteeringSettings(commands=6, shortest=0.2, longest=0.3, seed=2))
     *kinds, whole = rows
