@@ -107,6 +107,11 @@ def _led_by(motion: Motion, done: Denoised, rigmap: RigMap) -> Denoised:
     rest = min(_rests(motion, rigmap), key=lambda quats: float(_apart(quats, first.local_quat_xyzw).mean()))
     # In a noisy capture a joint that is further off has been hit by a spike.
     reach = torch.where(done.noise > math.radians(_NOISY_DEG), math.radians(_SPIKE_DEG), _NEAR_REST * done.noise)
+    # But for the hips and what carries them: a T-pose may face another way than the rig's.
+    carriers = [joint := rigmap.joint_of[0] or 0]
+    while (joint := motion.skeleton.parents[joint]) >= 0:
+        carriers.append(joint)
+    reach[carriers] = _NEAR_REST * done.noise[carriers]
     at_rest = _apart(rest, first.local_quat_xyzw) < reach
     first = replace(first, local_quat_xyzw=torch.where(at_rest[..., None], rest, first.local_quat_xyzw))
     faults = tuple(replace(fault, start=fault.start + 1, stop=fault.stop + 1) for fault in done.faults)

@@ -90,15 +90,19 @@ class Denoised:
         scale = float(self.motion.fps) / PRIOR_FPS
         found: dict[str, list[list[int]]] = {"left": [], "right": []}
         for foot, start, stop in runs(self.contacts):
-            found[("left", "right")[foot]].append([round(start * scale), round(stop * scale)])
+            found[("left", "right")[foot]].append([round(start * scale), self._last(stop, scale)])
         return found
+
+    def _last(self, stop: int, scale: float) -> int:
+        """One past the last frame of the capture, for one at the prior's rate."""
+        return min(self.motion.num_frames, round(stop * scale))
 
     def fallback(self) -> list[dict[str, Any]]:
         """Joints, and frames of the capture, in which the network was out of its depth."""
         from mapctl.capture.faults import runs
 
         scale = float(self.motion.fps) / PRIOR_FPS
-        return [{"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": round(stop * scale)}
+        return [{"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": self._last(stop, scale)}
                 for joint, start, stop in runs(self.believed < _DOUBTED)]  # fmt: skip
 
 
