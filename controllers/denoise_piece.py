@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.denoised import Denoised
-from controllers.standing import StandingSettings, Stood, anchored, rest_height, stand, steady
+from controllers.standing import StandingSettings, Stood, anchored, rest_height, stand
 from mapctl import retarget, rotations
 from mapctl.capture import Capture, faults
 from mapctl.capture.bands import split
@@ -18,12 +18,13 @@ from mapctl.capture.noise import angle_noise, place_noise
 from mapctl.capture.residuals import returned
 from mapctl.capture.smoothing import smoothed_angles
 from mapctl.capture.spikes import leaps
+from mapctl.contacts import steadied
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.rigs import Rig
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, leg_length
 from mapctl.terms.footing import TOES
 
 
@@ -73,7 +74,7 @@ class Piece:
             proposal, contacts = self._propose()
         proposal, share = self._given_back(proposal)
         if self.settings.anchor:
-            proposal = anchored(proposal, steady(contacts > 0))
+            proposal = anchored(proposal, steadied(contacts > 0))
         stood = stand(proposal, contacts, self.capture, self.settings.standing, density=density)
         joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
@@ -88,11 +89,13 @@ class Piece:
         examined, names = self.examined, motion.skeleton.names
         turn = rotations.multiply(rotations.inverse(examined.motion.local_quat_xyzw), motion.local_quat_xyzw)
         away = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
-        hips = [examined.travels]
+        traveller = names[examined.travels]
         apart = 100 * (examined.place(motion) - examined.place(examined.motion)).norm(dim=-1)
-        found = faults.noise(names, examined.noise, examined.noise_root, travels=hips[0], frames=motion.num_frames)
+        found = faults.noise(
+            names, examined.noise, examined.noise_root, travels=examined.travels, frames=motion.num_frames
+        )
         found += faults.leaping(names, self._spikes_on_rig(), away, "deg")
-        found += faults.leaping([names[hips[0]]], self._spikes_of_root(), apart[:, None], "cm")
+        found += faults.leaping([traveller], self._spikes_of_root(), apart[:, None], "cm")
         found += faults.lost(names, examined.dropouts)
         toes = [proposal.skeleton.index(name) for name in TOES]
         feet = [self.rigmap.joint_of[toe] for toe in toes]
@@ -148,7 +151,7 @@ class Piece:
 
     def _propose(self) -> tuple[Motion, Float[Tensor, "frames 2"]]:
         """The network's motion on the performer's bones, and the log odds of contacts."""
-        scale = _leg(CANONICAL.offsets) / _leg(self.rigmap.skeleton.offsets)
+        scale = leg_length(CANONICAL) / leg_length(self.rigmap.skeleton)
         asked = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
         cleaned = self.denoiser.clean(asked)
         quats = rotations.sign_continuous(cleaned.local_quat_xyzw[0].double())
@@ -217,9 +220,3 @@ def _above_hips(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Ten
     while joint is not None and (joint := rigmap.rig_skeleton.parents[joint]) >= 0:
         column = column & seen[:, joint]
     return column
-
-
-def _leg(offsets: Float[Tensor, "joints 3"]) -> float:
-    """From hip to ankle along the bones, metres."""
-    bones = [CANONICAL.index(name) for name in ("leftLowerLeg", "leftFoot")]
-    return float(offsets[bones].norm(dim=-1).sum())

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.stature import Stature
-from mapctl.contacts import without_short_runs
+from mapctl.contacts import STEADY, steadied
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -21,8 +21,6 @@ from mapctl.solver.methods import GuidedMethod
 from mapctl.solver.result import Ledger
 from mapctl.solver.window import Committed, WindowSettings, WindowSolver
 from mapctl.terms import Closeness, Footing, Noise, Term
-
-_SHORTEST = 3  # frames that a contact, or a gap in one, must last: the rule of mapctl.contacts
 
 
 @dataclass(frozen=True)
@@ -94,15 +92,14 @@ def _forgetting(done: Committed) -> Committed:
     """Without all that no later window looks at, and moved to the origin, where single precision is finest."""
     here = done.place.position_xz
     joints = done.joints_world - torch.stack([here[0], here.new_zeros(()), here[1]])
-    return replace(done, features=done.features[-_SHORTEST:], ledger=Ledger(), windows=(), joints_world=joints,
+    return replace(done, features=done.features[-STEADY:], ledger=Ledger(), windows=(), joints_world=joints,
                    place=Place(torch.zeros_like(here), done.place.heading))  # fmt: skip
 
 
 def _with_steady_contacts(
     before: Float[Tensor, "past size"], window: Float[Tensor, "frames size"]
 ) -> Float[Tensor, "frames size"]:
-    """The window with contacts, and gaps in them, of less than `_SHORTEST` frames gone."""
+    """The window with contacts, and gaps in them, of less than STEADY frames gone."""
     bits = LAYOUT.pick(torch.cat([before, window]), "contacts") > 0.5
-    filled = ~without_short_runs(~bits, _SHORTEST)
-    steady = without_short_runs(filled, _SHORTEST)[len(before) :]
+    steady = steadied(bits)[len(before) :]
     return torch.cat([window[:, : LAYOUT.continuous], steady.to(window.dtype)], dim=-1)

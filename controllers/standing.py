@@ -15,8 +15,8 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.capture import Capture
-from mapctl.contacts import without_short_runs
-from mapctl.features import LAYOUT, Place, local_rotations, root_places
+from mapctl.contacts import steadied
+from mapctl.features import LAYOUT, Place, decode, root_places
 from mapctl.motion import Motion
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, minimise
@@ -27,7 +27,6 @@ from mapctl.terms import Footing, Likelihood, Noise, Term
 from mapctl.terms.footing import TOES
 
 _DRIFT = 3.0  # frames, sigma, over which the travel of planted toes is averaged
-_SHORTEST = 3  # frames that a contact, or a gap in one, lasts: the rule of mapctl.contacts
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def stand(
     density: Any = None,
 ) -> Stood:  # fmt: skip
     """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was."""
-    guide = guide_of(proposal, steady(contacts > 0))
+    guide = guide_of(proposal, steadied(contacts > 0))
     sigma = _doubt(capture, settings)
     footing = replace(settings.footing, rest_height=rest_height(proposal, guide.contacts))
     terms: list[Term] = [Noise(1.0), footing]
@@ -93,7 +92,8 @@ def stand(
         features, used, entries, done = _window(poses, terms, count, settings, density)
         pieces.append(features)
         spent, first, ledger = spent + used, first + count, ledger.join(entries)
-    return Stood(_motion(torch.cat(pieces), place, proposal), guide.contacts, ledger, spent)
+    motion = decode(torch.cat(pieces), place, skeleton=proposal.skeleton)
+    return Stood(motion, guide.contacts, ledger, spent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +161,6 @@ def anchored(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Motion:
     return replace(motion, root_position=motion.root_position - moved)
 
 
-def steady(contacts: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
-    """Without contacts, and gaps in them, of less than `_SHORTEST` frames."""
-    filled = ~without_short_runs(~contacts, _SHORTEST)
-    return without_short_runs(filled, _SHORTEST)
-
-
 def rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> float:
     """Of the performer's planted toes, metres; where none is planted, of low ones."""
     toes = [motion.skeleton.index(name) for name in TOES]
@@ -184,12 +178,3 @@ def _doubt(capture: Capture, settings: StandingSettings) -> Float[Tensor, "frame
     # Feet are put down even in a capture without noise, if only by half a millimetre.
     root = root.clamp_min(5e-4)[:, None]
     return torch.cat([root.expand(-1, 3), hips.expand(-1, 3), angle[:, 1:].repeat_interleave(3, dim=-1)], dim=-1)
-
-
-def _motion(features: Float[Tensor, "frames size"], place: Place, proposal: Motion) -> Motion:
-    """Back to a motion in double precision."""
-    features = features.double()
-    ground, heading = root_places(features, Place(place.position_xz.double(), place.heading.double()))
-    root = torch.cat([ground[:, :1], LAYOUT.pick(features, "root_height"), ground[:, 1:]], dim=-1)
-    quats = rotations.sign_continuous(local_rotations(features, heading))
-    return Motion(proposal.skeleton, proposal.fps, root, quats)

@@ -61,3 +61,12 @@ def without_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bo
     whole = stands.T.unfold(-1, shortest, 1).all(dim=-1)  # windows that are true throughout
     spread = torch.nn.functional.pad(whole, (shortest - 1, shortest - 1))
     return spread.unfold(-1, shortest, 1).any(dim=-1).T
+
+
+STEADY = 3
+"""Frames at the prior's rate that a contact, or a gap in one, lasts at least: `ContactSettings.shortest`."""
+
+
+def steadied(stands: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
+    """Contacts at the prior's rate without gaps, and then without contacts, of less than STEADY frames."""
+    return without_short_runs(~without_short_runs(~stands, STEADY), STEADY)

@@ -100,6 +100,12 @@ TOE_REST_HEIGHT = 0.0425
 """Height of the canonical toe joints over the floor while the foot stands flat, metres."""
 
 
+def leg_length(skeleton: Skeleton) -> float:
+    """Of canonical joints, along the bones from the left hip to the ankle, metres."""
+    bones = [skeleton.index(name) for name in ("leftLowerLeg", "leftFoot")]
+    return float(skeleton.offsets[bones].norm(dim=-1).sum())
+
+
 def mirrored_name(name: str) -> str:
     """The joint of the other side: `leftHand` for `rightHand`; other names are their own mirror image."""
     for side, other in (("left", "right"), ("right", "left")):

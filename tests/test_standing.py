@@ -9,10 +9,11 @@ from captures import apart_deg
 from helpers import finite_difference, generator, walk
 
 from controllers import standing
-from controllers.standing import StandingSettings, guide_of, rest_height, stand, steady
+from controllers.standing import StandingSettings, guide_of, rest_height, stand
 from mapctl import rotations
 from mapctl.capture import Capture
 from mapctl.capture.faults import runs
+from mapctl.contacts import steadied
 from mapctl.features import PRIOR_FPS, Place
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
@@ -183,17 +184,17 @@ def test_a_guide_is_its_motion():
 def test_no_contact_and_no_gap_in_one_is_short():
     bits = torch.rand(200, 40, generator=generator()) < torch.linspace(0.1, 0.9, 40)
     for pair in bits.split(2, dim=1):
-        found = steady(pair)
+        found = steadied(pair)
         for mask in (found, ~found):
             assert all(stop - start >= 3 for _, start, stop in runs(mask))
-        assert torch.equal(steady(found), found)
+        assert torch.equal(steadied(found), found)
 
 
 def test_long_contacts_stay():
     bits = torch.zeros(30, 2, dtype=torch.bool)
     bits[3:9, 0] = True
     bits[20:, 1] = True
-    assert torch.equal(steady(bits), bits)
+    assert torch.equal(steadied(bits), bits)
 
 
 def test_the_rest_height_is_that_of_planted_toes():

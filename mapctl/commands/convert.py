@@ -12,7 +12,6 @@ from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from mapctl.motion import Motion
-    from mapctl.retarget import RigMap
     from mapctl.rigs import Rig
 
 
@@ -71,6 +70,7 @@ def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Moti
     Rotations stay. On other bones the hips' way is scaled by the legs' length, so that feet reach the ground.
     """
     from mapctl import formats, retarget, rigs
+    from mapctl.skeleton import leg_length
 
     canonical, own = retarget.to_canonical(motion, source_rig)
     if rig == "canonical":
@@ -78,12 +78,6 @@ def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Moti
     if rig in {known.name for known in rigs.known()}:
         raise RequestError(f"the bones of {rig} differ from performer to performer: name a clip of that rig")
     wanted = retarget.to_canonical(formats.load(rig))[1]
-    scale = _leg_length(wanted) / _leg_length(own)
+    scale = leg_length(wanted.skeleton) / leg_length(own.skeleton)
     canonical = replace(canonical, skeleton=wanted.skeleton, root_position=canonical.root_position * scale)
     return retarget.from_canonical(canonical, wanted)
-
-
-def _leg_length(rigmap: "RigMap") -> float:
-    """From hip to ankle along the left leg, metres."""
-    bones = [rigmap.skeleton.index(name) for name in ("leftLowerLeg", "leftFoot")]
-    return float(rigmap.skeleton.offsets[bones].norm(dim=-1).sum())

@@ -61,9 +61,7 @@ def read(text: str) -> Wearer:
 
 def _rest_height(seen: float, skeleton: "Skeleton") -> float:
     """What a clip shows, if its floor is at 0; else the canonical toes' in scale."""
-    from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+    from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
-    bones = [CANONICAL.index(name) for name in ("leftLowerLeg", "leftFoot")]
-    leg = float(skeleton.offsets[bones].norm(dim=-1).sum())
-    usual = float(CANONICAL.offsets[bones].norm(dim=-1).sum())
-    return seen if 0 <= seen < _HIGHEST_TOES * leg else TOE_REST_HEIGHT * leg / usual
+    leg = leg_length(skeleton)
+    return seen if 0 <= seen < _HIGHEST_TOES * leg else TOE_REST_HEIGHT * leg / leg_length(CANONICAL)

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from mapctl.errors import CheckpointError, MapctlError, RequestError
-from mapctl.formats.atomic import check_folder
+from mapctl.errors import MapctlError, RequestError
 from priors import checkpoints
 from priors.denoiser import DenoiserConfig
 from priors.training import corpus as corpora
@@ -151,9 +150,4 @@ def _check(request: DenoiserRequest) -> None:
     """Before anything is read."""
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
-    check_folder(request.out)
-    present = run_files.exists(request.out)
-    if request.resume and not present:
-        raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
-    if present and not request.resume:
-        raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
+    run_files.check_begin(request.out, resume=request.resume)

@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.features import Place, decode
-from mapctl.formats.atomic import check_folder
 from mapctl.metrics import measure
 from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows
 from mapctl.metrics.realism.classifier import held_out_accuracy
@@ -278,12 +277,7 @@ def _check(request: RefinerRequest) -> None:
     """Before anything is read."""
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
-    check_folder(request.out)
-    present = run_files.exists(request.out)
-    if request.resume and not present:
-        raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
-    if present and not request.resume:
-        raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
+    run_files.check_begin(request.out, resume=request.resume)
 
 
 def _means(clips: list[Tensor]) -> dict[str, float]:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import torch
 
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.features import Place, decode
-from mapctl.formats.atomic import check_folder
 from mapctl.metrics import reference
 from mapctl.metrics.states import state_summary
 from priors import checkpoints, density, labels
@@ -77,7 +76,7 @@ def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path
     device = _device(request.device)
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
-    _check_run(request)
+    run_files.check_begin(request.out, resume=request.resume)
     corpus = corpora.read(request.data, match=request.match, cache=request.out / "cache",
                           skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
     parts = corpora.split(corpus, request.settings.seed)
@@ -185,16 +184,6 @@ def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float | None]
     row |= free_run(trainer.model, parts.validation)
     trainer.model.train()
     return {name: value if math.isfinite(value) else None for name, value in row.items()}
-
-
-def _check_run(request: TrainRequest) -> None:
-    """Before anything is read: the folder can be written, and holds a run if and only if it is to be resumed."""
-    check_folder(request.out)
-    present = run_files.exists(request.out)
-    if request.resume and not present:
-        raise CheckpointError(f"{request.out} holds no checkpoint to resume from")
-    if present and not request.resume:
-        raise RequestError(f"{request.out} already holds a run; pass --resume to continue it, or choose another folder")
 
 
 def _resume(request: TrainRequest, trainer: Trainer, data: dict[str, str], progress: Progress) -> resume.Curve:

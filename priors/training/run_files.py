@@ -9,8 +9,8 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from mapctl.errors import CheckpointError
-from mapctl.formats.atomic import atomic_path
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.formats.atomic import atomic_path, check_folder
 from priors.checkpoints import as_json
 
 _TENSORS, _INDEX = "checkpoint.safetensors", "checkpoint.json"
@@ -22,6 +22,16 @@ BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, 
 def exists(run: Path) -> bool:
     """Whether the run folder holds a checkpoint."""
     return (run / _INDEX).exists()
+
+
+def check_begin(run: Path, *, resume: bool) -> None:
+    """Before anything is read: the folder can be written, and holds a checkpoint if and only if it is to be resumed."""
+    check_folder(run)
+    present = exists(run)
+    if resume and not present:
+        raise CheckpointError(f"{run} holds no checkpoint to resume from")
+    if present and not resume:
+        raise RequestError(f"{run} already holds a run; pass --resume to continue it, or choose another folder")
 
 
 def write(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor], index: Mapping[str, Any]) -> None:
