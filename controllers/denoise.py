@@ -50,35 +50,38 @@ def denoise(
     settings = settings or DenoiseSettings()
     masked(motion, masks)  # whole: of a piece they are cut to its frames
     # Told once: a piece may lack what shows the rig's T-pose.
-    rigmap = to_canonical(_beginning(motion), rig)[1]
+    beginning, rigmap = to_canonical(_beginning(motion), rig)
     rig = settled(rigmap)
-    lead = 1 if begins_with_tpose(motion, rig) else 0
+    lead = 1 if _shows_tpose(beginning) else 0
     frames = motion.num_frames - lead
     long, shared = (max(_SHORTEST, round(seconds * float(motion.fps))) for seconds in (_PIECE, _SHARED))
-    done, start, stop = None, 0, 0
+    pieces: list[tuple[Denoised, int]] = []
+    start = stop = 0
     while stop < frames:
         before, stop = stop, frames if frames - start <= long + shared else start + long
         part, hidden = motion.slice(lead + start, lead + stop), part_of(masks, lead + start, lead + stop)
-        if done is not None:  # what the piece before made of lost joints is all that is known of them
-            part = written_back(part, done.motion.slice(start, before), hidden)
+        if pieces:  # what the piece before made of lost joints is all that is known of them
+            last, first = pieces[-1]
+            part = written_back(part, last.motion.slice(start - first, before - first), hidden)
             hidden = after(hidden, before - start)
-        piece = _cleaned(part, denoiser, hidden, settings, density, rig)
-        done = piece if done is None else joined([(done, 0), (piece, start)])
+        pieces.append((_cleaned(part, denoiser, hidden, settings, density, rig), start))
         start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
-    assert done is not None, "a motion has a frame"
-    done = replace(done, capture=motion.slice(lead, motion.num_frames), rig=rig)
+    done = replace(joined(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
     return _led_by(motion, done, rigmap) if lead else done
 
 
 def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:
     """Whether frame 0 is a T-pose and the motion is not: arms out, everything straight, and then not."""
-    canonical, _ = to_canonical(_beginning(motion), rig)
+    return _shows_tpose(to_canonical(_beginning(motion), rig)[0])
+
+
+def _shows_tpose(canonical: Motion) -> bool:
     turned = torch.rad2deg(rotations.to_rotation_vector(canonical.local_quat_xyzw[:, 1:]).norm(dim=-1))
     arms = turned[:, [CANONICAL.index(name) - 1 for name in ("leftUpperArm", "rightUpperArm")]].amin(dim=-1)
     straight = bool(arms[0] < 25) and bool(turned[0].mean() < 15)
-    return straight and motion.num_frames > 1 and bool(arms[1:].median() > 40)
+    return straight and canonical.num_frames > 1 and bool(arms[1:].median() > 40)
 
 
 def _beginning(motion: Motion) -> Motion:

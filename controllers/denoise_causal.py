@@ -118,16 +118,24 @@ def denoise_causal(
     """A whole motion through a CausalDenoiser, a frame at a time."""
     began = time.perf_counter()
     stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay), rig=rig)
-    whole: Denoised | None = None
+    pieces: list[tuple[Denoised, int]] = []
+    given = 0
     for frame in range(motion.num_frames):
         new = stream.push(motion.slice(frame, frame + 1), masks=masks if frame == 0 else ())
+        if frame + 1 == motion.num_frames:
+            new = _both(new, stream.finish())
         if new is not None:
-            whole = new if whole is None else joined([(whole, 0), (new, whole.motion.num_frames)])
+            pieces.append((new, given))
+            given += new.motion.num_frames
             if progress is not None:
-                progress(whole.motion.num_frames, motion.num_frames)
-    rest = stream.finish()
-    if rest is not None:
-        whole = rest if whole is None else joined([(whole, 0), (rest, whole.motion.num_frames)])
-    assert whole is not None, "a motion has a frame"
+                progress(given, motion.num_frames)
+    whole = joined(pieces)
     note = f"causal: a frame is decided {stream.delay:.2f} s after it came"
     return replace(whole, seconds=time.perf_counter() - began, notes=(note, *whole.notes))
+
+
+def _both(first: Denoised | None, second: Denoised | None) -> Denoised | None:
+    """One after the other, as far as they are there."""
+    if first is None or second is None:
+        return first or second
+    return joined([(first, 0), (second, first.motion.num_frames)])

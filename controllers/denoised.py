@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.capture.faults import Fault
+from mapctl.capture.faults import Fault, runs
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.rigs import Rig
@@ -85,8 +85,6 @@ class Denoised:
 
     def contact_frames(self) -> dict[str, list[list[int]]]:
         """By foot, first frame and one past the last of each contact, in frames of the capture."""
-        from mapctl.capture.faults import runs
-
         scale = float(self.motion.fps) / PRIOR_FPS
         found: dict[str, list[list[int]]] = {"left": [], "right": []}
         for foot, start, stop in runs(self.contacts):
@@ -99,19 +97,20 @@ class Denoised:
 
     def fallback(self) -> list[dict[str, Any]]:
         """Joints, and frames of the capture, in which the network was out of its depth."""
-        from mapctl.capture.faults import runs
-
         scale = float(self.motion.fps) / PRIOR_FPS
         return [{"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": self._last(stop, scale)}
                 for joint, start, stop in runs(self.believed < _DOUBTED)]  # fmt: skip
 
 
 def joined(pieces: Sequence[tuple[Denoised, int]]) -> Denoised:
-    """Pieces of one capture, each with the frame that it begins at; where two overlap the second fades in."""
-    whole = pieces[0][0]
-    for piece, start in pieces[1:]:
-        whole = _after(whole, piece, start)
-    return whole
+    """Pieces of one capture, each with the frame that it begins at; where two overlap the second fades in.
+
+    By halves: one after the other each frame would be copied once for every piece.
+    """
+    if len(pieces) == 1:
+        return pieces[0][0]
+    middle = len(pieces) // 2
+    return _after(joined(pieces[:middle]), joined(pieces[middle:]), pieces[middle][1] - pieces[0][1])
 
 
 def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:

@@ -12,6 +12,7 @@ from mapctl import retarget, rotations
 from mapctl.capture.masks import Mask
 from mapctl.contacts import planted
 from mapctl.errors import RequestError
+from mapctl.kinematics import local_from_world
 from mapctl.motion import Motion
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.skeleton import CANONICAL
@@ -58,8 +59,6 @@ def misplaced(motion: Motion, generator: torch.Generator, *, centimetres: float)
             child = below[0]
             turn = _shortest(places[:, child] - places[:, joint], wrong[:, child] - wrong[:, joint])
             world[:, joint] = rotations.multiply(turn, world[:, joint])
-    from mapctl.kinematics import local_from_world
-
     local = rotations.sign_continuous(local_from_world(CANONICAL.parents, world))
     spoilt = replace(canonical, root_position=wrong[:, 0], local_quat_xyzw=local)
     return Spoilt(from_canonical(spoilt, rigmap, motion))
