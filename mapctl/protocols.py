@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl.capture import Capture, Cleaned
+from mapctl.gaps import PositionImage, Proposed
 
 State = TypeVar("State")
 
@@ -62,15 +63,10 @@ class Density(Protocol[State]):
 
 @runtime_checkable
 class Inbetweener(Protocol):
-    """Proposes the frames between known ones."""
+    """Proposes the frames and joints that a motion lacks."""
 
-    def propose(
-        self,
-        features: Float[Tensor, "batch frames size"],
-        known: Bool[Tensor, "batch frames"],
-        generator: torch.Generator,
-    ) -> Float[Tensor, "batch frames size"]:
-        """The frames with unknown ones filled in; known ones may move."""
+    def propose(self, image: PositionImage) -> Proposed:
+        """All joints in all frames; known ones may move."""
         ...
 
 

@@ -96,11 +96,16 @@ class Bands:
 
     def _carried(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
         """From the prior's rate to the recording's."""
-        times = np.arange(len(change)) / PRIOR_FPS
-        wanted = np.clip(np.arange(self.slow.num_frames) / float(self.slow.fps), 0, times[-1])
-        if len(change) < 2:
-            return change.expand(self.slow.num_frames, *change.shape[1:])
-        return torch.as_tensor(CubicSpline(times, change.double().numpy(), axis=0)(wanted))
+        return upsampled(change, fps=float(self.slow.fps), frames=self.slow.num_frames)
+
+
+def upsampled(values: Float[Tensor, "shown *width"], *, fps: float, frames: int) -> Float[Tensor, "frames *width"]:
+    """From the prior's rate to another one, by a cubic spline; held beyond the last frame."""
+    if len(values) < 2:
+        return values.expand(frames, *values.shape[1:])
+    times = np.arange(len(values)) / PRIOR_FPS
+    wanted = np.clip(np.arange(frames) / fps, 0, times[-1])
+    return torch.as_tensor(CubicSpline(times, values.double().numpy(), axis=0)(wanted))
 
 
 def split(motion: Motion) -> Bands:

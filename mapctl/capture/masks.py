@@ -63,14 +63,14 @@ def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     for mask in masks:
         if mask.stop > motion.num_frames:
             raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
-    joints, root = _hidden(motion, masks)
+    joints, root = hidden(motion, masks)
     if root.all() or joints.all(dim=0).any():
         gone = "root position" if root.all() else motion.skeleton.names[int(joints.all(dim=0).nonzero()[0])]
         raise RequestError(f"the masks leave nothing of {gone} in {motion.num_frames} frames")
     return joints, root
 
 
-def _hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
+def hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     """Masked joints (frames, joints) and root places (frames,)."""
     names = motion.skeleton.names
     joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
@@ -103,7 +103,7 @@ def written_back(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion
     So that a joint which is lost for long is known by what was made of it before.
     """
     shared = clean.num_frames
-    joints, root = _hidden(motion, masks)
+    joints, root = hidden(motion, masks)
     joints, root = joints[:shared], root[:shared]
     if not bool(joints.any() | root.any()):
         return motion

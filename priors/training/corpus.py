@@ -141,6 +141,13 @@ def window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts
     return starts
 
 
+def folder_of_clips(corpus: Corpus) -> Int[Tensor, " clips"]:
+    """By clip the number of the top folder that it lies in."""
+    folders = [name.split("/")[0] for name in corpus.names]
+    number = {folder: index for index, folder in enumerate(sorted(set(folders)))}
+    return torch.tensor([number[folder] for folder in folders])
+
+
 def _fingerprint(data: Path, files: list[Path], skip_first: bool) -> str:
     """Of everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
     parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known()), repr(ContactSettings()), str(skip_first)]

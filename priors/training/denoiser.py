@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
@@ -15,12 +15,11 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
 from mapctl.skeleton import CANONICAL
 from priors.denoiser import DenoiserConfig, DenoiserNetwork
-from priors.training import run_files
-from priors.training.corpus import Corpus, window_starts
+from priors.training.corpus import Corpus, folder_of_clips, window_starts
 from priors.training.corruption import CorruptionSettings, clean_capture, corrupted
+from priors.training.trainer import Trainer
 
 _TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
-_WARM_UP = 0.05  # share of the steps in which the learning rate rises
 
 
 @dataclass(frozen=True)
@@ -63,44 +62,18 @@ class DenoiserSettings:
             raise RequestError(f"window must be at least 16 frames, got {self.window}")
 
 
-class DenoiserTrainer:
-    """Network, optimiser and generator, one step at a time."""
+class DenoiserTrainer(Trainer[DenoiserNetwork]):
+    """Draws windows, spoils them, and brings the network nearer to cleaning them."""
 
     def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
-        self.settings, self.step = settings, 0
-        self.generator = torch.Generator().manual_seed(settings.seed)
-        self.windows = Windows(corpus, settings)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(settings.seed)
-            self.network = DenoiserNetwork(config, bfloat16=settings.bfloat16)
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=settings.learning_rate, weight_decay=1e-4)
+        """RequestError where no clip is as long as a window."""
+        self.settings, self.windows = settings, Windows(corpus, settings)
+        super().__init__(lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16), steps=settings.steps,
+                         learning_rate=settings.learning_rate, seed=settings.seed)  # fmt: skip
 
-    def train_step(self) -> dict[str, float]:
-        """One update; the parts of its loss."""
-        windows = self.windows.draw(self.generator)
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.settings.learning_rate * _rate(self.step, self.settings.steps)
-        parts = losses(self.network, windows, self.settings, self.generator)
-        self.optimiser.zero_grad()
-        parts["loss"].backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
-        self.step += 1
-        return {name: float(value.detach()) for name, value in parts.items()}
-
-    def state(self) -> dict[str, Tensor]:
-        """Everything that a bit-exact continuation needs, but the step."""
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= run_files.optimiser_tensors(self.optimiser, "optimiser")
-        return tensors | {"generator": self.generator.get_state()}
-
-    def load_state(self, tensors: dict[str, Tensor], step: int) -> None:
-        """Inverse of `state`; KeyError or RuntimeError for tensors that are not its."""
-        own = {n.removeprefix("network."): t for n, t in tensors.items() if n.startswith("network.")}
-        self.network.load_state_dict(own)
-        self.optimiser.load_state_dict(run_files.optimiser_state(self.optimiser, "optimiser", tensors))
-        self.generator.set_state(tensors["generator"])
-        self.step = step
+    def losses(self) -> dict[str, Tensor]:
+        """Of a batch drawn anew."""
+        return losses(self.network, self.windows.draw(self.generator), self.settings, self.generator)
 
 
 class Windows:
@@ -109,7 +82,8 @@ class Windows:
     def __init__(self, corpus: Corpus, settings: DenoiserSettings):
         """RequestError where no clip is as long as a window."""
         self.corpus, self.settings = corpus, settings
-        starts, folder = window_starts(corpus.lengths, settings.window), _folder_of_frames(corpus)
+        starts = window_starts(corpus.lengths, settings.window)
+        folder = folder_of_clips(corpus).repeat_interleave(torch.tensor(corpus.lengths))
         # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
         self.groups = [starts[folder[starts] == number] for number in folder.unique()]
         self.groups = [group for group in self.groups if len(group)]
@@ -130,13 +104,6 @@ class Windows:
             windows[..., LAYOUT.slices[block]] *= size
         windows[..., LAYOUT.slices["joint_rotations"]] = _calibrated(windows, settings.calibration_deg, generator)
         return windows
-
-
-def _folder_of_frames(corpus: Corpus) -> Int[Tensor, " frames"]:
-    """By frame the number of the top folder that its clip lies in."""
-    folders = [name.split("/")[0] for name in corpus.names]
-    number = {folder: index for index, folder in enumerate(sorted(set(folders)))}
-    return torch.tensor([number[folder] for folder in folders]).repeat_interleave(torch.tensor(corpus.lengths))
 
 
 def _calibrated(
@@ -206,11 +173,3 @@ def validate(network: DenoiserNetwork, corpus: Corpus, settings: DenoiserSetting
 def _length(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """With a gradient at zero."""
     return torch.sqrt(vector.square().sum(dim=-1) + 1e-8)
-
-
-def _rate(step: int, steps: int) -> float:
-    """Of the highest learning rate: rising, then along a cosine to nothing."""
-    rise = max(1, round(_WARM_UP * steps))
-    if step < rise:
-        return (step + 1) / rise
-    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))

@@ -1,0 +1,104 @@
+"""Closing the seams of a gap: what was put into it is moved, by as little as possible and smoothly, until the motion
+runs on across both of its edges without a leap or a kink.
+
+The offset o of a gap's frames solves  min |D o + e|^2 + eps |o|^2,  D the second differences, e those of the motion as
+it is where they reach across an edge, as far as they are more than the motion's usual, and 0 within: leaps and kinks at
+the edges go, what is within keeps its shape, and a seam without any is left alone.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.capture.faults import runs
+
+_SECOND = (1.0, -2.0, 1.0)
+_REACH = 0.12  # seconds over which an offset fades away from its edge
+
+
+def closed_places(
+    values: Float[Tensor, "frames width"], put: Bool[Tensor, " frames"], *, fps: float
+) -> Float[Tensor, "frames width"]:
+    """Places whose frames `put` were put in; all others stay."""
+    values = values.clone()
+    usual = _usual(torch.diff(values, n=2, dim=0)[:, None], put[:, None])
+    for _, start, stop in runs(put[:, None]):
+        rows = _rows(start, stop, len(values))
+        bends = torch.diff(values[rows.start : rows.stop + 2], n=2, dim=0)[:, None] if len(rows) else values[:0, None]
+        beyond = _beyond(bends, usual, start, stop, len(values))
+        values[start:stop] += _offset(beyond.flatten(1), start, stop, frames=len(values), fps=fps)
+    return values
+
+
+def closed_rotations(
+    quats: Float[Tensor, "frames joints 4"], put: Bool[Tensor, "frames joints"], *, fps: float
+) -> Float[Tensor, "frames joints 4"]:
+    """Local rotations (xyzw) whose frames `put` were put in, joint by joint; all others stay."""
+    quats = rotations.sign_continuous(quats)
+    usual = _usual(_turning_bends(quats), put)
+    spans: dict[tuple[int, int], list[int]] = {}
+    for joint, start, stop in runs(put):
+        spans.setdefault((start, stop), []).append(joint)
+    for (start, stop), joints in spans.items():
+        rows = _rows(start, stop, len(quats))
+        if not len(rows):
+            continue
+        bends = _turning_bends(quats[rows.start : rows.stop + 2, joints])
+        beyond = _beyond(bends, usual[joints], start, stop, len(quats))
+        moved = _offset(beyond.flatten(1), start, stop, frames=len(quats), fps=fps).unflatten(1, (-1, 3))
+        turned = rotations.multiply(quats[start:stop, joints], rotations.from_rotation_vector(moved))
+        quats[start:stop, joints] = turned
+    return rotations.sign_continuous(quats)
+
+
+def _turning_bends(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "bends joints 3"]:
+    """Second differences of rotations: how one frame's turn differs from the one before it, in the middle's frame."""
+    turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
+    return torch.diff(turns, dim=0)
+
+
+def _usual(bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"]) -> Float[Tensor, " joints"]:
+    """By joint, the bend that one in twenty exceeds where nothing was put in."""
+    sizes = bends.norm(dim=-1)
+    own = ~(put[:-2] | put[1:-1] | put[2:])
+    whole = [sizes[own[:, joint], joint] for joint in range(sizes.shape[1])]
+    return torch.stack([part.quantile(0.95) if len(part) else sizes.new_tensor(torch.inf) for part in whole])
+
+
+def _rows(start: int, stop: int, frames: int) -> range:
+    """First frames of the second differences that touch the gap."""
+    return range(max(0, start - 2), min(frames - 2, stop))
+
+
+def _beyond(
+    bends: Float[Tensor, "rows joints width"], usual: Float[Tensor, " joints"], start: int, stop: int, frames: int
+) -> Float[Tensor, "rows joints width"]:
+    """What of the bends that reach across an edge is more than usual; 0 for those within."""
+    across = torch.tensor([not (start <= row and row + 2 < stop) for row in _rows(start, stop, frames)])
+    size = bends.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    rest = bends * (1 - usual[:, None] / size).clamp_min(0)
+    return torch.where(across[:, None, None], rest, 0.0) if len(bends) else bends
+
+
+def _offset(
+    bends: Float[Tensor, "rows width"], start: int, stop: int, *, frames: int, fps: float
+) -> Float[Tensor, "gap width"]:
+    """The offset of the gap's frames that takes these kinks away."""
+    rows, count = _rows(start, stop, frames), stop - start
+    known_before, known_after = start > 0, stop < frames
+    if not len(rows) or not (known_before or known_after):
+        return bends.new_zeros(count, bends.shape[1])
+    bands, right = np.zeros((3, count)), np.zeros((count, bends.shape[1]))
+    errors = bends.double().numpy()
+    for number, row in enumerate(rows):
+        inside = [tap for tap in range(3) if start <= row + tap < stop]
+        for tap in inside:
+            right[row + tap - start] -= _SECOND[tap] * errors[number]
+            for other in inside:
+                if other >= tap:
+                    bands[2 - (other - tap), row + other - start] += _SECOND[tap] * _SECOND[other]
+    bands[2] += 1.0 / max(1.0, _REACH * fps) ** 4
+    return torch.as_tensor(solveh_banded(bands, right)).to(bends)

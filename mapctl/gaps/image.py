@@ -1,0 +1,90 @@
+"""Position images: a motion with gaps as joint positions by frame (infilling paper, section 3.1).
+
+The paper looks at every frame from its own root, and gives the way of the root by its velocities. In a gap the root is
+not known, and the integral of proposed velocities does not end where the motion goes on. So positions here are seen
+from a reference that is the root where it is known, and leads straight from one known root to the next where it is not:
+what is proposed fits both ends.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.capture.observed import filled, last_seen
+
+
+@dataclass(frozen=True, eq=False)
+class PositionImage:
+    """A batch of motions of one length, on canonical joints at the prior's rate. Joint 0 is the hips."""
+
+    places: Float[Tensor, "batch frames joints 3"]
+    """Seen from the reference, metres; unknown ones straight between known ones, 0 for joints that are never known."""
+    contacts: Float[Tensor, "batch frames 2"]
+    """Left and right toe planted, 0 or 1; 0.5 where the toe is not known."""
+    known: Bool[Tensor, "batch frames joints"]
+    """Whether a joint's place is known."""
+    present: Bool[Tensor, "batch frames"]
+    """Whether there is such a frame; others fill up a batch."""
+    ground: Float[Tensor, "batch frames 2"]
+    """Where the reference stands (x, z), world, metres."""
+    heading: Float[Tensor, "batch frames"]
+    """Which way it faces about +Y, radians."""
+
+    @staticmethod
+    def of_world(
+        places_world: Float[Tensor, "batch frames joints 3"], heading: Float[Tensor, "batch frames"],
+        contacts: Float[Tensor, "batch frames 2"], *, known: Bool[Tensor, "batch frames joints"],
+        present: Bool[Tensor, "batch frames"], toes: tuple[int, int],
+    ) -> "PositionImage":  # fmt: skip
+        """From world positions (metres) and the hips' heading (radians); what is not known may hold anything finite."""
+        known = known & present[..., None]
+        rooted = known[..., 0]
+        ground = filled(places_world[..., 0, ::2], rooted)
+        # Whole turns are counted from one known frame to the next: what lies between tells nothing.
+        held = torch.take_along_dim(heading, last_seen(rooted), dim=1)
+        facing = filled(rotations.unwrap_angle(held)[..., None], rooted)[..., 0]
+        bits = torch.where(known[..., list(toes)], contacts, 0.5)
+        empty = torch.zeros_like(places_world)
+        image = PositionImage(empty, bits, known, present, ground, facing)
+        return replace(image, places=_between(image.from_world(places_world), known))
+
+    def from_world(self, places_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
+        """World positions seen from the reference."""
+        ground = places_world[..., ::2] - self.ground[..., None, :]
+        return _with_ground(places_world, rotations.rotate_ground(ground, -self.heading[..., None]))
+
+    def to_world(self, places: Float[Tensor, "batch frames joints 3"]) -> Tensor:
+        """Inverse of `from_world`."""
+        ground = rotations.rotate_ground(places[..., ::2], self.heading[..., None])
+        return _with_ground(places, ground + self.ground[..., None, :])
+
+    @property
+    def ever_known(self) -> Bool[Tensor, "batch joints"]:
+        """Whether a joint is known in any frame."""
+        return self.known.any(dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposed:
+    """What an in-betweener makes of an image."""
+
+    places: Float[Tensor, "batch frames joints 3"]
+    """Of all joints, seen from the image's reference, metres. Bones may have changed their lengths a little."""
+    contacts: Float[Tensor, "batch frames 2"]
+    """Log odds that the left and the right toe are planted."""
+
+
+def _between(places: Float[Tensor, "batch frames joints 3"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
+    """Unknown ones straight between known ones of the same joint."""
+    batch = len(places)
+    rows, seen = places.transpose(1, 2).flatten(0, 1), known.transpose(1, 2).flatten(0, 1)
+    between = filled(rows, seen) * seen.any(dim=1)[:, None, None]
+    return between.unflatten(0, (batch, -1)).transpose(1, 2)
+
+
+def _with_ground(places: Float[Tensor, "batch frames joints 3"], ground: Float[Tensor, "batch frames joints 2"]):
+    """The same heights over other places on the ground."""
+    return torch.stack([ground[..., 0], places[..., 1], ground[..., 1]], dim=-1)

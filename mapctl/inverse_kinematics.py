@@ -1,0 +1,110 @@
+"""From joint positions to rotations on a skeleton whose bones keep their lengths: the one inverse kinematics.
+
+Joint by joint from the root down, each is turned as little as its children's directions ask for, from where its parent
+leaves it. What positions do not tell (how a bone is turned about itself, and joints without children) stays as it is in
+the motion that one starts from, but for the plane in which an elbow or a knee bends: a bent limb shows it.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.skeleton import Skeleton
+
+_BENT = 0.15  # sine of a limb's bend from which its plane is believed rather than not
+_TINY = 1e-9
+
+
+def solve(
+    places_world: Float[Tensor, "frames joints 3"],
+    start_quat_xyzw: Float[Tensor, "frames joints 4"],
+    skeleton: Skeleton,
+    *,
+    free: Bool[Tensor, "frames joints"] | None = None,
+    root_position: Float[Tensor, "frames 3"] | None = None,
+) -> Float[Tensor, "frames joints 4"]:
+    """Local rotations (xyzw) with which the joints come nearest to the given places, metres.
+
+    `start_quat_xyzw` are local rotations; those that are not `free` stay as they are. `root_position` is the first
+    joint's, if it is not its place. A limb that cannot reach points at its place. RequestError for other shapes.
+    """
+    frames, joints = places_world.shape[:2]
+    if start_quat_xyzw.shape[:2] != (frames, joints) or joints != skeleton.num_joints:
+        raise RequestError(f"places {tuple(places_world.shape)} and rotations {tuple(start_quat_xyzw.shape)} must be "
+                           f"of the same frames and of {skeleton.num_joints} joints")  # fmt: skip
+    offsets = skeleton.offsets.to(places_world)
+    start = start_quat_xyzw.to(places_world)
+    at, world, local = [places_world[:, 0] if root_position is None else root_position], [], []
+    for joint, parent in enumerate(skeleton.parents):
+        above = None if parent < 0 else world[parent]
+        if above is not None:
+            at.append(at[parent] + rotations.rotate(above, offsets[joint].expand(frames, 3)))
+        turn = start[:, joint] if above is None else rotations.multiply(above, start[:, joint])
+        children = skeleton.children(joint)
+        if children:
+            aims = [places_world[:, child] - at[joint] for child in children]
+            found = _turned(turn, [offsets[child] for child in children], aims)
+            if len(children) == 1:
+                found = _in_plane(found, start, skeleton, children[0], places_world, at[joint])
+            turn = found if free is None else torch.where(free[:, joint, None], found, turn)
+        world.append(turn)
+        local.append(turn if above is None else rotations.multiply(rotations.inverse(above), turn))
+    return rotations.sign_continuous(torch.stack(local, dim=1))
+
+
+def _turned(
+    turn: Float[Tensor, "frames 4"], bones: Sequence[Float[Tensor, "3"]], aims: Sequence[Float[Tensor, "frames 3"]]
+) -> Float[Tensor, "frames 4"]:
+    """`turn`, turned on so that the bones point along the aims: one bone exactly, several in the least squares."""
+    pointing = [rotations.rotate(turn, bone.expand(len(turn), 3)) for bone in bones]
+    if len(bones) == 1:
+        return rotations.multiply(_shortest(pointing[0], aims[0]), turn)
+    # Kabsch: the rotation that brings one set of vectors nearest to the other.
+    product = sum(torch.einsum("ti,tj->tij", aim, bone) for aim, bone in zip(aims, pointing, strict=True))
+    assert isinstance(product, Tensor)
+    left, _, right = torch.linalg.svd(product)
+    sign = torch.det(left @ right)
+    flip = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], dim=-1))
+    return rotations.multiply(rotations.from_matrix(left @ flip @ right), turn)
+
+
+def _in_plane(
+    turn: Float[Tensor, "frames 4"], start: Float[Tensor, "frames joints 4"], skeleton: Skeleton, child: int,
+    places: Float[Tensor, "frames joints 3"], at: Float[Tensor, "frames 3"],
+) -> Float[Tensor, "frames 4"]:  # fmt: skip
+    """`turn`, turned about its bone so that the child bends in the plane that its own child's place asks for."""
+    below = skeleton.children(child)
+    if len(below) != 1:
+        return turn
+    offsets = skeleton.offsets.to(places)
+    frames = len(turn)
+    bone = rotations.rotate(turn, offsets[child].expand(frames, 3))
+    knee = at + bone
+    would = rotations.rotate(rotations.multiply(turn, start[:, child]), offsets[below[0]].expand(frames, 3))
+    axis = torch.nn.functional.normalize(bone, dim=-1)
+    wanted = places[:, below[0]] - knee
+    would, wanted = (torch.nn.functional.normalize(vector, dim=-1) for vector in (would, wanted))
+    would, wanted = (vector - (vector * axis).sum(-1, keepdim=True) * axis for vector in (would, wanted))
+    angle = torch.atan2((torch.linalg.cross(would, wanted) * axis).sum(-1), (would * wanted).sum(-1) + _TINY)
+    # A straight limb has no plane: the smaller of the two bends says how much is believed.
+    bend = torch.minimum(would.norm(dim=-1), wanted.norm(dim=-1))
+    believed = bend.square() / (bend.square() + _BENT**2)
+    return rotations.multiply(rotations.from_rotation_vector(axis * (angle * believed)[:, None]), turn)
+
+
+def _shortest(start: Float[Tensor, "frames 3"], stop: Float[Tensor, "frames 3"]) -> Float[Tensor, "frames 4"]:
+    """The shortest turn from one direction to the other; none where one of them has no length."""
+    start, stop = (torch.nn.functional.normalize(vector, dim=-1) for vector in (start, stop))
+    cosine = (start * stop).sum(-1, keepdim=True)
+    axis = torch.linalg.cross(start, stop)
+    # Half a turn has no shortest way: any axis across will do.
+    across = torch.linalg.cross(start, start.abs().argmin(dim=-1, keepdim=True).eq(torch.arange(3)).to(start))
+    opposite = cosine < -1 + 1e-9
+    quat = torch.cat([torch.where(opposite, across, axis), torch.where(opposite, 0.0, 1 + cosine)], dim=-1)
+    still = (start.norm(dim=-1, keepdim=True) < 0.5) | (stop.norm(dim=-1, keepdim=True) < 0.5)
+    none = quat.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quat)
+    return torch.nn.functional.normalize(torch.where(still, none, quat), dim=-1)

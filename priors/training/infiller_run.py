@@ -1,0 +1,32 @@
+"""`mapctl train infiller`: what its run trains (see priors.training.window_run)."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from priors.infiller import InfillerConfig
+from priors.training.infiller import InfillerSettings, InfillerTrainer, validate
+from priors.training.window_run import Kind, Progress, WindowRequest
+from priors.training.window_run import train as train_on_windows
+
+
+@dataclass(frozen=True)
+class InfillerRequest(WindowRequest[InfillerConfig, InfillerSettings]):
+    """What to train an infiller on, and how."""
+
+    config: InfillerConfig = field(default_factory=InfillerConfig)
+    """The network."""
+    settings: InfillerSettings = field(default_factory=InfillerSettings)
+    """The recipe."""
+
+
+def _shape(config: InfillerConfig) -> list[str]:
+    usual = InfillerConfig.architecture
+    return [] if config.architecture == usual else [f"--architecture {config.architecture}"]
+
+
+KIND = Kind("infiller", InfillerTrainer, validate, _shape)
+
+
+def train(request: InfillerRequest, progress: Progress = lambda line: None) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path."""
+    return train_on_windows(request, KIND, progress)

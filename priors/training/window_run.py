@@ -1,0 +1,195 @@
+"""Training on windows of a corpus, whatever is learnt: from a folder of BVH to a run folder with a checkpoint, a curve
+and a loadable model.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from mapctl.errors import MapctlError, RequestError
+from priors import checkpoints
+from priors.training import corpus as corpora
+from priors.training import run_files
+from priors.training.trainer import Trainer
+
+Progress = Callable[[str], None]
+"""Called with one line of news."""
+
+
+class Config(Protocol):
+    """Shape of a network."""
+
+    def as_card(self) -> dict[str, Any]:
+        """For a card's JSON."""
+        ...
+
+
+class Settings(Protocol):
+    """A recipe: a frozen dataclass with at least these fields."""
+
+    @property
+    def steps(self) -> int:
+        """Updates."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Of everything random, the split of the clips among it."""
+        ...
+
+
+C, S = TypeVar("C", bound=Config), TypeVar("S", bound=Settings)
+
+
+@dataclass(frozen=True)
+class WindowRequest(Generic[C, S]):
+    """What to train on, and how."""
+
+    data: Path
+    """Folder of BVH files, searched below."""
+    out: Path
+    """Run folder: checkpoint, curve, finished model."""
+    config: C
+    """The network."""
+    settings: S
+    """The recipe."""
+    match: str = ""
+    """Regular expression that a file's path below `data` must contain."""
+    resume: bool = False
+    """Continue from the run folder's last checkpoint."""
+    checkpoint_minutes: float = 3.0
+    """Between checkpoints."""
+    report_steps: int = 100
+    """Between lines of news."""
+    validate_steps: int = 1000
+    """Between validations."""
+    licence: str = "that of the training data"
+    """Of the weights, for the card."""
+    skip_first: bool = False
+    """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+
+
+@dataclass(frozen=True)
+class Kind(Generic[C, S]):
+    """What tells one model's training from another's."""
+
+    name: str
+    """Of the model, in its card and on the command line."""
+    trainer: Callable[[C, S, corpora.Corpus], Trainer]
+    """Begins."""
+    validate: Callable[[Any, corpora.Corpus, S], dict[str, Any]]
+    """Figures of a network on unseen clips."""
+    shape: Callable[[C], list[str]]
+    """Options of the command that the network's shape needs; those that are the defaults are left out."""
+
+
+def train(request: WindowRequest[C, S], kind: Kind[C, S], progress: Progress = lambda line: None) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
+
+    Killed and resumed, a run gives the same weights bit for bit on one machine.
+    """
+    if not request.data.is_dir():
+        raise RequestError(f"{request.data} is not a folder of BVH files")
+    run_files.check_begin(request.out, resume=request.resume)
+    corpus = corpora.read(
+        request.data, match=request.match, cache=request.out / "cache", skip_first=request.skip_first,
+        progress=lambda done, of: progress(f"read {done} of {of} clips") if done % 200 == 0 or done == of else None,
+    )  # fmt: skip
+    run = _Run(request, kind, corpus.identity(), corpora.split(corpus, request.settings.seed), progress)
+    run.go()
+    return run.export()
+
+
+class _Run(Generic[C, S]):
+    """The loop and its checkpoints."""
+
+    def __init__(
+        self, request: WindowRequest[C, S], kind: Kind[C, S], data: dict[str, str], parts: corpora.Split,
+        progress: Progress,
+    ):  # fmt: skip
+        self.request, self.kind, self.data, self.parts, self.progress = request, kind, data, parts, progress
+        self.trainer = kind.trainer(request.config, request.settings, parts.train)
+        self.curve: list[dict[str, float]] = []
+        if request.resume:
+            self._load()
+            progress(f"resumed at step {self.trainer.step}")
+        else:
+            request.out.mkdir(parents=True, exist_ok=True)
+
+    def go(self) -> None:
+        """To the end of the recipe."""
+        request, trainer = self.request, self.trainer
+        saved = began = time.monotonic()
+        news: list[dict[str, float]] = []
+        while trainer.step < request.settings.steps:
+            news.append(trainer.train_step())
+            if not math.isfinite(news[-1]["loss"]):
+                raise MapctlError(f"training diverged at step {trainer.step}; the last checkpoint is as it was")
+            last = trainer.step == request.settings.steps
+            if last or trainer.step % request.report_steps == 0:
+                means = {name: sum(row[name] for row in news) / len(news) for name in news[0]}
+                told = ", ".join(f"{name} {value:.3f}" for name, value in means.items())
+                self.progress(f"step {trainer.step}: {told}, {time.monotonic() - began:.0f} s")
+                news = []
+            if last or trainer.step % request.validate_steps == 0:
+                row = self.kind.validate(trainer.network, self.parts.validation, request.settings)
+                self.curve.append({"step": trainer.step, **row})
+                self.progress(json.dumps(self.curve[-1]))
+            if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
+                self._save()
+                saved = time.monotonic()
+
+    def export(self) -> Path:
+        """Write the model in float16 with its card."""
+        request, path = self.request, self.request.out / "model.safetensors"
+        held = {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
+        card = checkpoints.Card(
+            kind=self.kind.name, config=request.config.as_card(), licence=request.licence,
+            data={**self.data, "match": request.match, "split_seed": request.settings.seed, "held_out": held},
+            training={"settings": _as_dict(request.settings), "curve": self.curve,
+                      "command": command(request, self.kind)},
+            quality={"test": self.kind.validate(self.trainer.network, self.parts.test, request.settings)},
+            **checkpoints.Card.of_layout(),
+        )  # fmt: skip
+        checkpoints.save(self.trainer.network.state_dict(), card, path)
+        return path
+
+    def _save(self) -> None:
+        index = {**self._recipe(), "curve": self.curve}
+        run_files.write(self.request.out, step=self.trainer.step, tensors=self.trainer.state(), index=index)
+
+    def _load(self) -> None:
+        out = self.request.out
+        try:
+            index, tensors = run_files.read(out)
+            for part, now in self._recipe().items():
+                run_files.check_same(out, part, then=index[part], now=now)
+            self.curve = [dict(row) for row in index["curve"]]
+            self.trainer.load_state(tensors, int(index["step"]))
+        except run_files.BROKEN as error:
+            raise run_files.unreadable(out, error) from error
+
+    def _recipe(self) -> dict[str, dict]:
+        """What must not change between a run's parts, as JSON gives it back."""
+        settings = json.loads(json.dumps(_as_dict(self.request.settings)))
+        return {"settings": settings, "network": self.request.config.as_card(), "data": self.data}
+
+
+def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
+    """What to type for the same run, for the card; options that are the defaults are left out."""
+    parts = [f"mapctl train {kind.name} --data DATA -o RUN"]
+    parts += [f"--match '{request.match}'"] if request.match else []
+    parts += ["--skip-first"] * request.skip_first + kind.shape(request.config)
+    given, usual = _as_dict(request.settings), _as_dict(type(request.settings)())
+    for name in ("steps", "batch", "window", "learning_rate", "seed"):
+        if given[name] != usual[name]:
+            parts.append(f"--{name.replace('_', '-')} {given[name]:g}")
+    return " ".join(parts + ["--bfloat16"] * given["bfloat16"])
+
+
+def _as_dict(settings: Any) -> dict[str, Any]:
+    return asdict(settings)
