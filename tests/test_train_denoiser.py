@@ -164,7 +164,8 @@ def test_options_of_other_models_are_refused(words):
 @pytest.mark.parametrize(("words", "message"), [
     (["--steps", "0"], "--steps must be at least 1, got 0"), (["--batch", "-2"], "--batch must be at least 1"),
     (["--window", "0"], "--window must be at least 1"), (["--window", "8"], "window must be at least 16"),
-    (["--width", "0"], "positive width"), (["--seed", "-1"], "seed"), (["--learning-rate", "2"], "learning rate"),
+    (["--width", "0"], "--width must be at least 1"), (["--seed", "-1"], "seed"),
+    (["--learning-rate", "2"], "learning rate"), (["--learning-rate", "0"], "learning rate"),
     (["--minutes-between-checkpoints", "0"], "minutes between"), (["--device", "cuda"], "leave --device out"),
 ], ids=lambda value: value[0] if isinstance(value, list) else "")  # fmt: skip
 def test_numbers_that_make_no_sense_are_refused(words, message):
