@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny_prior import save_tiny_prior
 
 from mapctl import cli
 
@@ -62,11 +61,6 @@ def fails(tmp_path, capsys, monkeypatch):
         return told.err
 
     return check
-
-
-@pytest.fixture(scope="session")
-def prior(tmp_path_factory) -> str:
-    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
 
 
 @pytest.mark.parametrize("kind", MOTIONS)
