@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import gaussian, rotations
 from mapctl.capture import Capture
 from mapctl.contacts import steadied
 from mapctl.features import LAYOUT, Place, decode, root_places
@@ -151,8 +151,7 @@ def anchored(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Motion:
     ground = motion.joint_positions()[:, toes][..., ::2]
     step = torch.diff(ground, dim=0, prepend=ground[:1])
     planted = (contacts & torch.cat([contacts[:1], contacts[:-1]])).to(step)
-    frame = torch.arange(len(step), dtype=step.dtype)
-    weight = torch.exp(-0.5 * ((frame[:, None] - frame) / _DRIFT).square())
+    weight = gaussian.weights(len(step), _DRIFT, step.dtype)
     drift = torch.einsum("ts,sfc,sf->tc", weight, step, planted)
     # Nothing is known far from any contact: the drift fades out there.
     drift = drift / (torch.einsum("ts,sf->t", weight, planted) + 0.5)[:, None]

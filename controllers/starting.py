@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl import gaussian
 from mapctl.curves import Curve
 from mapctl.features import LAYOUT, Place, decode, ground_speed, root_places
 from mapctl.rotations import wrap_angle
@@ -16,7 +17,6 @@ from mapctl.solver.objective import Objective
 from mapctl.solver.variables import Context, Latents
 from mapctl.solver.window import Committed
 from mapctl.terms import Term
-from mapctl.terms.path import gaussian_weights
 
 _CANDIDATES = 24
 _AMONG_BEST = 4
@@ -79,7 +79,7 @@ def _oddness(features: Float[Tensor, "starts frames size"], wanted: float, fps: 
 def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:
     """rms of the root's sideways departure from its own smoothed way, metres (DESIGN's sway, without a curve)."""
     ground, _ = root_places(features, Place.origin())
-    smooth = gaussian_weights(ground.shape[1], _SWAY_SECONDS * fps, ground.dtype) @ ground
+    smooth = gaussian.averaging(ground.shape[1], _SWAY_SECONDS * fps, ground.dtype) @ ground
     way = torch.nn.functional.normalize(torch.gradient(smooth, dim=1)[0], dim=-1)
     apart = ground - smooth
     sideways = apart[..., 0] * way[..., 1] - apart[..., 1] * way[..., 0]

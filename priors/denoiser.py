@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-from mapctl import rotations
+from mapctl import gaussian, rotations
 from mapctl.capture import Capture, Cleaned, filled
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.skeleton import CANONICAL
@@ -28,6 +28,7 @@ _SMOOTH, _SLOW = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the 
 _FAINT, _FAINT_ROOT = 0.0044, 0.001  # radians and metres: noise that is as often true motion
 # One unit of what is seen and of what is changed, about their spread: radians, metres, metres a frame.
 _ANGLE, _PLACE, _PACE = 0.3, 0.02, 0.05
+_HIPS = 0.85  # metres: height of the canonical skeleton's hips while it walks
 _PIECE, _MARGIN = 512, 64  # frames cleaned at once, and beside them
 
 
@@ -133,7 +134,7 @@ class _View:
             self.angles / _ANGLE, _smooth(self.angles, _SMOOTH) / _ANGLE,
             self.turn / _ANGLE, _smooth(self.turn, _SMOOTH) / _ANGLE, rate / _PACE,
             self.off / _PLACE, _smooth(self.off, _SMOOTH) / _PLACE, way[..., ::2] / _PACE,
-            (self.slow_root[..., 1:2] - CANONICAL_HIPS) / _ANGLE,
+            (self.slow_root[..., 1:2] - _HIPS) / _ANGLE,
             known.to(self.angles), level[:, None].expand(-1, capture.frames, -1),
         ], dim=-1)  # fmt: skip
 
@@ -145,10 +146,6 @@ class _View:
         off = self.off + self.root_doubt * (_smooth(self.off, _SMOOTH) - self.off + _PLACE * off)
         root = self.slow_root + _turned(off, self.slow_heading)
         return Cleaned(root, self.slow_heading + turn[..., 0], angles, contacts)
-
-
-CANONICAL_HIPS = 0.85
-"""Height of the canonical skeleton's hips while it walks, metres."""
 
 
 def _rate(values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
@@ -164,9 +161,8 @@ def _turned(vector: Float[Tensor, "batch frames 3"], angle: Float[Tensor, "batch
 
 def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[Tensor, "batch frames width"]:
     """Gaussian along the frames, its weights adding up to one at the ends too."""
-    frame = torch.arange(values.shape[1], device=values.device, dtype=values.dtype)
-    weight = torch.exp(-0.5 * ((frame[:, None] - frame) / sigma).square())
-    return torch.einsum("ts,bsw->btw", weight / weight.sum(dim=-1, keepdim=True), values)
+    weight = gaussian.averaging(values.shape[1], sigma, values.dtype, values.device)
+    return torch.einsum("ts,bsw->btw", weight, values)
 
 
 @dataclass(frozen=True, eq=False)

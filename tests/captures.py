@@ -38,6 +38,23 @@ def shaken(quats: Tensor, sigma: float | Tensor, *, seed: int = 0, axes: int = 3
     return rotations.multiply(quats, rotations.from_rotation_vector(noise))
 
 
+def trembling(motion: Motion, sigma: float | Tensor, *, seed: int = 0) -> Motion:
+    """A motion with white noise of this many radians on all joints, the hips' place left alone."""
+    return replace(motion, local_quat_xyzw=shaken(motion.local_quat_xyzw, sigma, seed=seed))
+
+
+def noisy(motion: Motion, degrees: float = 4.0, centimetres: float = 1.5, seed: int = 0) -> Motion:
+    """White noise on all joints and on the place of the hips."""
+    quats = shaken(motion.local_quat_xyzw, degrees * DEGREE, seed=seed)
+    shift = centimetres / 100 * torch.randn(motion.num_frames, 3, generator=generator(seed + 1), dtype=torch.float64)
+    if motion.moving_offsets:
+        moving = {joint: values + shift for joint, values in motion.moving_offsets.items()}
+        # The static root is static.
+        quats[:, 0] = motion.local_quat_xyzw[:, 0]
+        return replace(motion, local_quat_xyzw=quats, moving_offsets=moving)
+    return replace(motion, local_quat_xyzw=quats, root_position=motion.root_position + shift)
+
+
 def apart_deg(first: Tensor, second: Tensor) -> Tensor:
     """Angles between rotations, degrees."""
     turn = rotations.multiply(rotations.inverse(first), second)

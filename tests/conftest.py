@@ -8,6 +8,7 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 from pathlib import Path
 
+import pytest
 import torch
 from beartype import BeartypeConf, beartype
 from jaxtyping import install_import_hook
@@ -29,3 +30,20 @@ def _annotated_modules() -> list[str]:
 
 
 install_import_hook(_annotated_modules(), "conftest.checked")
+
+
+# Their modules are imported late: the hook above must come first.
+@pytest.fixture(scope="session")
+def prior(tmp_path_factory) -> str:
+    """A tiny density, for --prior."""
+    from tiny_prior import save_tiny_prior
+
+    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory) -> Path:
+    """A folder of five walks to train on; no test changes it."""
+    from helpers import write_corpus
+
+    return write_corpus(tmp_path_factory.mktemp("data"))

@@ -1,16 +1,19 @@
 """Tiny synthetic motions, rigs, densities and corpora, so that no test needs a data set."""
 
 import math
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from fractions import Fraction
 from pathlib import Path
 
+import pytest
 import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mapctl import retarget, rigs
+from mapctl import cli, retarget, rigs, rotations
 from mapctl.features import LAYOUT, encode
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
@@ -88,6 +91,15 @@ def random_motion(skeleton: Skeleton, frames: int = 5, *, seed: int = 0, fps: Fr
     local = torch.from_numpy(Rotation.random(frames * skeleton.num_joints, rng=seed).as_quat())
     root = torch.randn(frames, 3, generator=generator(seed), dtype=torch.float64)
     return Motion(skeleton, fps, root, local.reshape(frames, -1, 4))
+
+
+def moved(motion: Motion, *, turn: float, shift: tuple[float, float]) -> Motion:
+    """The whole motion turned about the vertical through the origin, then shifted along x and z."""
+    about = quat_xyzw(torch.tensor([0.0, turn, 0.0], dtype=torch.float64)).expand(motion.num_frames, 4)
+    local = motion.local_quat_xyzw.clone()
+    local[:, 0] = rotations.multiply(about, local[:, 0])
+    root = rotations.rotate(about, motion.root_position) + torch.tensor([shift[0], 0.0, shift[1]]).double()
+    return replace(motion, root_position=root, local_quat_xyzw=local)
 
 
 def turn_between(a_xyzw: Tensor, b_xyzw: Tensor) -> float:
@@ -180,3 +192,28 @@ def noise(batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.
 def finite_difference(function, at: Tensor, direction: Tensor, *, step: float = 1e-6) -> float:
     """Central difference of a scalar function along a direction."""
     return float((function(at + step * direction) - function(at - step * direction)) / (2 * step))
+
+
+def run(*words: object) -> int:
+    """The command line in this process; its exit status."""
+    return cli.main([str(word) for word in words])
+
+
+class Killed(Exception):
+    """What ends a training run between two steps."""
+
+
+@contextmanager
+def killing(trainer: type, step: str, number: int, *, counter: str) -> Iterator[None]:
+    """Kills the training within when a trainer's method `step` is begun with its `counter` at this number."""
+    whole = getattr(trainer, step)
+
+    def stopping(self):
+        if getattr(self, counter) == number:
+            raise Killed
+        return whole(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer, step, stopping)
+        with pytest.raises(Killed):
+            yield

@@ -23,15 +23,6 @@ def walk(frames: int = 12, *, fps: int = 12, speed: float = 1.0, skeleton: Skele
     return Motion(skeleton, Fraction(fps), root, rotations.from_rotation_vector(angles))
 
 
-def moved(motion: Motion, *, turn: float, shift: tuple[float, float]) -> Motion:
-    """The whole motion turned about the vertical through the origin, then shifted along x and z."""
-    quat = motion.local_quat_xyzw.clone()
-    by = rotations.about_y(torch.tensor(turn, dtype=torch.float64))
-    quat[:, 0] = rotations.multiply(by.expand(motion.num_frames, 4), quat[:, 0])
-    root = rotations.rotate(by.expand(motion.num_frames, 4), motion.root_position)
-    return replace(motion, root_position=root + torch.tensor([shift[0], 0.0, shift[1]]), local_quat_xyzw=quat)
-
-
 def scaled(motion: Motion, factor: float) -> Motion:
     """The motion of someone `factor` times as large."""
     bones = motion.skeleton

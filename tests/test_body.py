@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers import moved
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes_walks import moved, renamed, scaled, walk
+from scenes_walks import renamed, scaled, walk
 
 from mapctl.body import colours
 from mapctl.body.anatomy import Anatomy

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from captures import DEGREE, apart_deg, shaken, vectors
+from captures import DEGREE, apart_deg, shaken, trembling, vectors
 from helpers import generator, quat_xyzw
 
 from mapctl import rotations
@@ -86,7 +86,7 @@ def test_the_noise_that_the_prior_is_told_is_that_which_the_slow_band_has():
     still = replace(
         recording(120, 30.0), local_quat_xyzw=torch.tensor([0.0, 0, 0, 1.0]).double().expand(3600, JOINTS, 4)
     )
-    bands = split(replace(still, local_quat_xyzw=shaken(still.local_quat_xyzw, 3 * DEGREE)))
+    bands = split(trembling(still, 3 * DEGREE))
     spread = torch.rad2deg(rotations.to_rotation_vector(bands.slow.local_quat_xyzw).std(dim=0)).mean()
     assert float(spread) == pytest.approx(3 * math.sqrt(1 / 6), rel=0.1)
     told = bands.noise_at_prior_rate(torch.tensor(3.0))
@@ -162,7 +162,7 @@ def test_the_ends_of_a_noisy_recording_are_no_noisier_than_the_rest():
     motion = recording(120, 2.0)
     first, rest = [], []
     for seed in range(12):
-        noisy = replace(motion, local_quat_xyzw=shaken(motion.local_quat_xyzw, 3 * DEGREE, seed=seed))
+        noisy = trembling(motion, 3 * DEGREE, seed=seed)
         away = apart_deg(split(noisy).slow.local_quat_xyzw, motion.local_quat_xyzw)
         first.append(away[0].mean())
         rest.append(away[60:-60].mean())

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import DEGREE, apart_deg, on_rig, shaken
+from captures import DEGREE, apart_deg, on_rig, shaken, trembling
 
 from mapctl import rotations
 from mapctl.capture.examine import examine
@@ -99,7 +99,7 @@ def test_gaps_are_filled_between_the_frames_around_them(motion):
 
 def test_what_masked_frames_show_changes_nothing(motion):
     name = motion.skeleton.names[moving_joint(motion)]
-    noisy = replace(motion, local_quat_xyzw=shaken(motion.local_quat_xyzw, 2 * DEGREE))
+    noisy = trembling(motion, 2 * DEGREE)
     found = []
     for seed in (1, 2):
         wild = shaken(motion.local_quat_xyzw, 2.0, seed=seed)[50:60, moving_joint(motion)]

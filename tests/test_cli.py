@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from tiny_prior import save_tiny_prior
+from helpers import run
 
 import mapctl
 from mapctl import cli
@@ -32,21 +32,12 @@ HEAVY = (
 
 
 @pytest.fixture(scope="session")
-def prior(tmp_path_factory) -> str:
-    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
-
-
-@pytest.fixture(scope="session")
 def walk(prior, tmp_path_factory) -> Path:
     """Two seconds on a circle, with its report beside it."""
     path = tmp_path_factory.mktemp("walk") / "walk.bvh"
     report = str(path.with_suffix(".json"))
     assert run("follow", "circle:3", "-o", path, "--seconds", 2, "--prior", prior, "--report", report) == 0
     return path
-
-
-def run(*words: object) -> int:
-    return cli.main([str(word) for word in words])
 
 
 def python(*words: object, **more) -> subprocess.CompletedProcess[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from acclaim import pair
-from helpers import walk
+from helpers import run, walk
 
 import mapctl
 from mapctl import cli, formats
@@ -29,10 +29,6 @@ def here(tmp_path, monkeypatch):
     motion.save("in.npz")
     pair(6).write(tmp_path, subject="01", take="in")
     return tmp_path
-
-
-def run(*words):
-    return cli.main([*map(str, words)])
 
 
 @pytest.mark.parametrize("source", formats.READERS)

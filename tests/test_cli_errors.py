@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny_prior import save_tiny_prior
 
 from mapctl import cli
 
@@ -62,11 +61,6 @@ def fails(tmp_path, capsys, monkeypatch):
         return told.err
 
     return check
-
-
-@pytest.fixture(scope="session")
-def prior(tmp_path_factory) -> str:
-    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
 
 
 @pytest.mark.parametrize("kind", MOTIONS)
@@ -174,12 +168,12 @@ def test_broken_curves(fails, prior, kind):
         (["train", "refiner", "--data", ".", "-o", "run", "--batch", "1"], "batch of 2 or more"),
         (["train", "refiner", "--data", ".", "-o", "run", "--batch", "9999"], "got 320 for 9999"),
         (["train", "refiner", "--data", ".", "-o", "run", "--seed", "-1"], "seed"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--width", "0"], "--width is for lstm-gmm"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--learning-rate", "0"], "--learning-rate is for lstm-gmm"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--components", "4"], "--components is for lstm-gmm"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--labels", "(?P<a>b)"], "--labels is for lstm-gmm"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--init", "locomotion"], "--init is for lstm-gmm"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--skip-first"], "--skip-first is for lstm-gmm"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--width", "0"], "--width is for other models"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--learning-rate", "0"], "is for other models"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--components", "4"], "--components is for other models"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--labels", "(?P<a>b)"], "--labels is for other models"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--init", "locomotion"], "--init is for other models"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--skip-first"], "--skip-first is for other models"),
         (["train", "refiner", "--data", ".", "-o", "run", "--device", "cuda"], "leave --device out"),
         (["train", "refiner", "--data", ".", "-o", "run", "--minutes-between-checkpoints", "0"], "must be positive"),
         (["train", "gan", "--data", ".", "-o", "run"], "lstm-gmm"),

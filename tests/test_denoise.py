@@ -7,8 +7,7 @@ from importlib import import_module
 
 import pytest
 import torch
-from captures import DEGREE, apart_deg, error_cm, on_rig, shaken
-from helpers import generator
+from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from tiny_denoiser import tiny_denoiser
 
 import mapctl
@@ -25,18 +24,6 @@ from mapctl.solver.lbfgs import LbfgsSettings
 
 RIGS = ("canonical", "bandai", "daz")
 QUICK = DenoiseSettings(standing=StandingSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4)))
-
-
-def noisy(motion, degrees=4.0, centimetres=1.5, seed=0):
-    """White noise on all joints and on the place of the hips."""
-    quats = shaken(motion.local_quat_xyzw, degrees * DEGREE, seed=seed)
-    shift = centimetres / 100 * torch.randn(motion.num_frames, 3, generator=generator(seed + 1), dtype=torch.float64)
-    if motion.moving_offsets:
-        moving = {joint: values + shift for joint, values in motion.moving_offsets.items()}
-        # The static root is static.
-        quats[:, 0] = motion.local_quat_xyzw[:, 0]
-        return replace(motion, local_quat_xyzw=quats, moving_offsets=moving)
-    return replace(motion, local_quat_xyzw=quats, root_position=motion.root_position + shift)
 
 
 def cleaned(motion, **changes):

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import apart_deg, error_cm, on_rig, shaken
-from test_denoise import QUICK, noisy
+from captures import apart_deg, error_cm, noisy, on_rig, shaken
+from test_denoise import QUICK
 from tiny_denoiser import tiny_denoiser
 
 from controllers.denoise_causal import CausalDenoiser, CausalSettings, denoise_causal

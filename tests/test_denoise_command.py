@@ -4,9 +4,8 @@ import json
 from importlib.util import find_spec
 
 import pytest
-from captures import error_cm, on_rig
+from captures import error_cm, noisy, on_rig
 from helpers import walk
-from test_denoise import noisy
 from tiny_denoiser import save_tiny_denoiser
 from tiny_prior import save_tiny_prior
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import finite_difference, generator, quat_xyzw, random_motion, turn_between, walk
+from helpers import finite_difference, generator, moved, random_motion, turn_between, walk
 
 from mapctl import features, rotations
 from mapctl.errors import MapctlError
@@ -15,15 +15,6 @@ from mapctl.skeleton import CANONICAL
 
 MOTIONS = {"walk": walk(40, turn_rate=1.0), "anything": random_motion(CANONICAL, 30)}
 each_motion = pytest.mark.parametrize("kind", MOTIONS)
-
-
-def moved(motion, *, turn, shift):
-    """The whole scene turned about +Y, then shifted over the ground."""
-    about = quat_xyzw(torch.tensor([0.0, turn, 0.0], dtype=torch.float64))
-    local = motion.local_quat_xyzw.clone()
-    local[:, 0] = rotations.multiply(about.expand(motion.num_frames, 4), local[:, 0])
-    root = rotations.rotate(about.expand(motion.num_frames, 4), motion.root_position)
-    return replace(motion, root_position=root + torch.tensor([shift[0], 0, shift[1]]).double(), local_quat_xyzw=local)
 
 
 @each_motion

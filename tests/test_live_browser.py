@@ -10,7 +10,6 @@ import sys
 import time
 
 import pytest
-from tiny_prior import save_tiny_prior
 
 import mapctl
 
@@ -55,11 +54,6 @@ class Live:
             return self.process.wait(timeout=20)
         finally:
             self.process.kill()
-
-
-@pytest.fixture(scope="module")
-def prior(tmp_path_factory) -> str:
-    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
 
 
 @pytest.fixture(scope="module")

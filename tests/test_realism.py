@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from helpers import bandai_skeleton, generator, walk
+from captures import trembling
+from helpers import bandai_skeleton, generator, moved, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapctl import retarget, rotations
+from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.metrics import body, realism
 from mapctl.metrics.realism import classifier, frechet, gait, windows
@@ -24,15 +25,6 @@ QUICK = realism.RealismSettings(classifier=realism.ClassifierSettings(steps=100,
 SMALL = QUICK.classifier
 
 
-def moved(motion: Motion, *, angle: float, x: float, z: float) -> Motion:
-    """The motion turned about the vertical axis through the origin, then shifted over the ground."""
-    turn = rotations.about_y(torch.tensor(angle, dtype=torch.float64))
-    root = rotations.rotate(turn.expand(motion.num_frames, 4), motion.root_position)
-    local = motion.local_quat_xyzw.clone()
-    local[:, 0] = rotations.multiply(turn.expand(motion.num_frames, 4), local[:, 0])
-    return replace(motion, root_position=root + torch.tensor([x, 0.0, z]).double(), local_quat_xyzw=local)
-
-
 def clip_set(count: int, frames: int = 61, *, seed: int = 0) -> list[Motion]:
     """Different walks; sets of different seeds share no clip and are drawn alike."""
     drawn = torch.rand(count, 2, generator=generator(seed)).tolist()
@@ -40,12 +32,6 @@ def clip_set(count: int, frames: int = 61, *, seed: int = 0) -> list[Motion]:
         walk(frames, turn_rate=0.6 * turn - 0.3, cadence=0.7 + 0.4 * cadence, seed=1000 * seed + k)
         for k, (turn, cadence) in enumerate(drawn)
     ]
-
-
-def shaken(motion: Motion, radians: float, seed: int) -> Motion:
-    noise = radians * torch.randn(motion.num_frames, 21, 3, generator=generator(seed), dtype=torch.float64)
-    trembling = rotations.multiply(motion.local_quat_xyzw, rotations.from_rotation_vector(noise))
-    return replace(motion, local_quat_xyzw=trembling)
 
 
 def windows_of(motions):
@@ -72,7 +58,7 @@ def test_windows_are_positions_from_the_first_frame_and_velocities():
 @given(angle=st.floats(-3, 3), x=st.floats(-20, 20), z=st.floats(-20, 20))
 def test_windows_forget_where_a_clip_stands_and_faces(angle, x, z):
     clip = walk(45, turn_rate=0.3)
-    torch.testing.assert_close(*windows_of([clip, moved(clip, angle=angle, x=x, z=z)]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(*windows_of([clip, moved(clip, turn=angle, shift=(x, z))]), atol=1e-4, rtol=0)
 
 
 def test_windows_know_the_height():
@@ -134,8 +120,8 @@ def test_basis_holds_the_largest_variances(count):
 
 def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
     mocap, alike = clip_set(24), clip_set(24, seed=1)
-    trembling = [shaken(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
-    same, other = (realism.realism(made, mocap, generator=generator(4), settings=QUICK) for made in (alike, trembling))
+    shaky = [trembling(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
+    same, other = (realism.realism(made, mocap, generator=generator(4), settings=QUICK) for made in (alike, shaky))
     assert 0.2 < same.accuracy < 0.8
     assert 0.2 < same.floor_accuracy < 0.8
     assert other.accuracy > 0.9
@@ -208,10 +194,10 @@ def test_average_pairwise_distance_is_the_mean_over_pairs():
 def test_diversity_parts_places_from_poses():
     """Copies that stand apart differ in the world alone; joints that swing otherwise differ in both."""
     clip = walk(45)
-    apart = sample_diversity([clip, moved(clip, angle=0.0, x=0.3, z=0.4)])
+    apart = sample_diversity([clip, moved(clip, turn=0.0, shift=(0.3, 0.4))])
     assert apart.world_cm == pytest.approx(50, rel=1e-6)
     assert apart.root_aligned_cm == pytest.approx(0, abs=1e-4)
-    turned = sample_diversity([clip, moved(clip, angle=1.0, x=0.0, z=0.0)])
+    turned = sample_diversity([clip, moved(clip, turn=1.0, shift=(0.0, 0.0))])
     assert turned.world_cm > 10
     assert turned.root_aligned_cm == pytest.approx(0, abs=1e-4)
     assert sample_diversity([clip, walk(45, seed=5)]).root_aligned_cm > 0.5
@@ -225,7 +211,7 @@ def test_diversity_needs_samples_of_one_length():
 
 
 def test_from_own_start_stands_at_the_origin_and_faces_ahead():
-    seen = from_own_start(moved(walk(40, turn_rate=0.5), angle=2.0, x=3.0, z=-1.0).joint_positions())
+    seen = from_own_start(moved(walk(40, turn_rate=0.5), turn=2.0, shift=(3.0, -1.0)).joint_positions())
     torch.testing.assert_close(seen[0, windows.HIPS, ::2], torch.zeros(2).double(), atol=1e-9, rtol=0)
     assert float(windows.facing_angle(seen)[0]) == pytest.approx(0, abs=1e-9)
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from helpers import tiny_density, write_corpus
+from helpers import killing, tiny_density, write_corpus
 from safetensors.torch import load_file, save_file
 from tiny_prior import save_tiny_prior
 
@@ -27,11 +27,6 @@ from priors.training.refiner_run import RefinerRequest, command, score, train
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
 SETTINGS = AdversarialSettings(rounds=6, window=10, batch=4, warm_up=1, head_start=1, critic_updates=1, history=8,
                                critic_width=6, critic_around=1)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_corpus(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")
@@ -60,31 +55,13 @@ def request_in(data, density):
     return made
 
 
-class Killed(Exception):
-    pass
-
-
-@pytest.fixture
-def killed_in(monkeypatch):
+def killed_in(request, number):
     """Runs until a round is begun."""
-
-    def run(request, number):
-        step = AdversarialTrainer.train_round
-
-        def stopping(trainer):
-            if trainer.round == number:
-                raise Killed
-            return step(trainer)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(AdversarialTrainer, "train_round", stopping)
-            with pytest.raises(Killed):
-                train(request)
-
-    return run
+    with killing(AdversarialTrainer, "train_round", number, counter="round"):
+        train(request)
 
 
-def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, request_in, killed_in):
+def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, request_in):
     """Killed between two lines of news, and just after one."""
     whole = train(request_in(tmp_path / "whole"))
     killed_in(request_in(tmp_path / "parts"), 3)
@@ -261,7 +238,7 @@ def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_
     assert first == again
 
 
-def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, data, request_in, killed_in):
+def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, data, request_in):
     out = tmp_path / "run"
     with pytest.raises(CheckpointError, match="no checkpoint to resume"):
         train(request_in(out, resume=True))

@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import bandai_skeleton, generator, tiny_density
+from helpers import bandai_skeleton, generator, run, tiny_density
 from rig_maker import Make, make, names_of, person
-from tiny_prior import save_tiny_prior
 
 import controllers
 import mapctl
@@ -15,7 +14,7 @@ from controllers import steer
 from controllers.follow import FollowSettings
 from controllers.generate import GenerateSettings, generate
 from controllers.stature import Stature
-from mapctl import cli, curves, retarget
+from mapctl import curves, retarget
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
@@ -30,21 +29,12 @@ SIZE = 1.3
 
 
 @pytest.fixture(scope="module")
-def prior(tmp_path_factory) -> str:
-    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
-
-
-@pytest.fixture(scope="module")
 def clip(tmp_path_factory):
     """Somebody tall, on a Z-up rig whose root travels and whose rest pose is an A."""
     made = make(Make(names_of("mixamo"), size=SIZE, zup=True, arms_down_deg=40, root="Reference"))
     path = tmp_path_factory.mktemp("rig") / "tall.bvh"
     made.motion(person(SIZE, 45)).save(path)
     return path
-
-
-def run(*words: object) -> int:
-    return cli.main([str(word) for word in words])
 
 
 def taller() -> Skeleton:

@@ -6,7 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from scenes_walks import moved, walk
+from helpers import moved
+from scenes_walks import walk
 
 from mapctl import curves
 from mapctl.body import colours

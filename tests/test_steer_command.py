@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import walk
-from tiny_prior import save_tiny_prior
 
 import mapctl
 from mapctl import cli
@@ -15,11 +14,6 @@ from mapctl.metrics.travel import by_command, travelled
 from mapctl.steering import Command, CommandTrack
 
 SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
-
-
-@pytest.fixture(scope="module")
-def prior(tmp_path_factory) -> str:
-    return str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors"))
 
 
 @pytest.fixture

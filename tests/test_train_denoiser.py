@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import corpus, generator, write_corpus
+from helpers import corpus, generator, killing
 
 import priors
 from mapctl import cli
@@ -26,11 +26,6 @@ TINY = DenoiserConfig(width=8, dilations=(1, 2))
 SETTINGS = DenoiserSettings(steps=6, batch=3, window=16)
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_corpus(tmp_path_factory.mktemp("data"))
-
-
 @pytest.fixture
 def request_in(data):
     """Checkpoints in every step, so that a kill can come anywhere."""
@@ -43,31 +38,13 @@ def request_in(data):
     return made
 
 
-class Killed(Exception):
-    pass
-
-
-@pytest.fixture
-def killed_in(monkeypatch):
+def killed_in(request, number):
     """Runs until a step is begun."""
-
-    def run(request, number):
-        step = DenoiserTrainer.train_step
-
-        def stopping(trainer):
-            if trainer.step == number:
-                raise Killed
-            return step(trainer)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(DenoiserTrainer, "train_step", stopping)
-            with pytest.raises(Killed):
-                train(request)
-
-    return run
+    with killing(DenoiserTrainer, "train_step", number, counter="step"):
+        train(request)
 
 
-def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, request_in, killed_in):
+def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, request_in):
     whole = train(request_in(tmp_path / "whole"))
     killed_in(request_in(tmp_path / "parts"), 3)
     killed_in(request_in(tmp_path / "parts", resume=True), 4)
@@ -93,7 +70,7 @@ def test_a_finished_run_loads_with_a_complete_card(tmp_path, request_in):
     assert [line.split(":")[0] for line in news if line.startswith("step")] == ["step 2", "step 4", "step 6"]
 
 
-def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, request_in, killed_in):
+def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, request_in):
     out = tmp_path / "run"
     with pytest.raises(CheckpointError, match="no checkpoint to resume"):
         train(request_in(out, resume=True))
@@ -164,7 +141,8 @@ def test_options_of_other_models_are_refused(words):
 @pytest.mark.parametrize(("words", "message"), [
     (["--steps", "0"], "--steps must be at least 1, got 0"), (["--batch", "-2"], "--batch must be at least 1"),
     (["--window", "0"], "--window must be at least 1"), (["--window", "8"], "window must be at least 16"),
-    (["--width", "0"], "positive width"), (["--seed", "-1"], "seed"), (["--learning-rate", "2"], "learning rate"),
+    (["--width", "0"], "--width must be at least 1"), (["--seed", "-1"], "seed"),
+    (["--learning-rate", "2"], "learning rate"), (["--learning-rate", "0"], "learning rate"),
     (["--minutes-between-checkpoints", "0"], "minutes between"), (["--device", "cuda"], "leave --device out"),
 ], ids=lambda value: value[0] if isinstance(value, list) else "")  # fmt: skip
 def test_numbers_that_make_no_sense_are_refused(words, message):

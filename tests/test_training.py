@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import corpus, generator, walk, write_corpus
+from helpers import Killed, corpus, generator, walk, write_corpus
 from safetensors.torch import load_file, save_file
 
 import priors
@@ -25,11 +25,6 @@ TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_corpus(tmp_path_factory.mktemp("data"))
-
-
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
     monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
@@ -40,10 +35,6 @@ def request_in(out, data, **changes):
     settings = replace(SETTINGS, **changes.pop("settings", {}))
     return TrainRequest(data, out, config=TINY, settings=settings, device="cpu", checkpoint_minutes=0.0,
                         report_steps=1, validate_steps=2, starts=4, **changes)  # fmt: skip
-
-
-class Killed(Exception):
-    pass
 
 
 def killer(step):

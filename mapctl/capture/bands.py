@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import gaussian, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 
@@ -152,13 +152,7 @@ def _more_than_noise(values: Float[Tensor, "frames joints 3"], noise: Tensor, mo
     """Values by the share of their power, about each frame, that noise of this variance does not explain."""
     power = values.square().mean(dim=-1, keepdim=True)
     side = max(1, round(moment / 2))
-    frame = torch.arange(-2 * side, 2 * side + 1, dtype=values.dtype)
-    weight = torch.exp(-0.5 * (frame / side).square())
-    weight = (weight / weight.sum())[None, None]
-    channels = power.flatten(1).T[:, None]
-    near = torch.nn.functional.conv1d(
-        torch.nn.functional.pad(channels, (2 * side, 2 * side), mode="replicate"), weight
-    )[:, 0].T.unflatten(1, power.shape[1:])
+    near = gaussian.convolved(power, gaussian.kernel(side, 2 * side), "repeated")
     # Wiener's gain on what exceeds the noise by far: its own power varies within a moment too.
     excess = (near - _CERTAIN * noise).clamp_min(0)
     return values * torch.where(near > 0, excess / near.clamp_min(1e-30), 1.0)

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl import gaussian
+
 _WIDTHS = (0.6, 0.8, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)  # frames, sigma of the smoothing
 _MOMENT = 20.0  # frames, sigma, over which the risk is told
 _PENALTY = 0.1  # of the noise's power, that a return must gain: the risk itself is told with an error
@@ -29,9 +31,9 @@ def returned(
     trusted = _local_mean(rest.square().sum(-1, keepdim=True), known)[..., 0] / noise - 1
     risks, smooth = [trusted], [torch.zeros_like(rest)]
     for width in _WIDTHS:
-        kernel = _gaussian(width, 3 * width).to(rest)
-        weight = _along(known, kernel)
-        wide = _along(rest, kernel) / weight.clamp_min(1e-6)
+        kernel = gaussian.kernel(width, max(1, round(3 * width)))
+        weight = gaussian.convolved(known, kernel, "nothing")
+        wide = gaussian.convolved(rest, kernel, "nothing") / weight.clamp_min(1e-6)
         change = ((wide - rest) * known).square().sum(-1, keepdim=True)
         own = kernel.max() / weight[..., 0].clamp_min(0.1)
         risks.append(_local_mean(change, known)[..., 0] / noise + (2 + _CAUTION) * own - 1 + _PENALTY)
@@ -44,18 +46,6 @@ def returned(
 
 def _local_mean(values: Float[Tensor, "frames joints 1"], known: Float[Tensor, "frames joints 1"]) -> Tensor:
     """Over about a moment, of what is known."""
-    kernel = _gaussian(_MOMENT, 2 * _MOMENT).to(values)
-    return _along(values * known, kernel) / _along(known, kernel).clamp_min(1e-6)
-
-
-def _gaussian(width: float, reach: float) -> Float[Tensor, " taps"]:
-    side = max(1, round(reach))
-    weight = torch.exp(-0.5 * (torch.arange(-side, side + 1, dtype=torch.float64) / width).square())
-    return weight / weight.sum()
-
-
-def _along(values: Float[Tensor, "frames joints width"], kernel: Float[Tensor, " taps"]) -> Tensor:
-    """Convolved along the frames; nothing is known beyond the ends."""
-    channels = values.flatten(1).T[:, None]
-    out = torch.nn.functional.conv1d(channels, kernel[None, None], padding=len(kernel) // 2)[:, 0].T
-    return out.unflatten(1, values.shape[1:])
+    kernel = gaussian.kernel(_MOMENT, round(2 * _MOMENT))
+    weight = gaussian.convolved(known, kernel, "nothing")
+    return gaussian.convolved(values * known, kernel, "nothing") / weight.clamp_min(1e-6)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import gaussian, rotations
 
 _WIDTHS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 12.0, 16.0, 24.0, 32.0)  # frames, sigma
 _REACH = 3.0  # sigmas that a kernel has on either side
@@ -28,27 +28,11 @@ def smoothed_angles(
     for width in _WIDTHS[1:]:
         if _REACH * width >= len(quats):
             break
-        kernel = _kernel(width).to(quats)
-        wide = _convolved(quats, kernel)
+        kernel = gaussian.kernel(width, max(1, round(_REACH * width)))
+        wide = gaussian.convolved(quats, kernel, "repeated")
         change = (wide - quats).square().sum(dim=-1).mean(dim=0)
         wide_risk = change + 2 * noise * kernel.max() - 2 * noise
         better = (wide_risk < risk) & (sigma > 0)
         best = torch.where(better[None, :, None], wide, best)
         risk = torch.where(better, wide_risk, risk)
     return torch.nn.functional.normalize(best, dim=-1)
-
-
-def _kernel(width: float) -> Float[Tensor, " taps"]:
-    """Adds up to one; its middle is its greatest."""
-    side = max(1, round(_REACH * width))
-    weight = torch.exp(-0.5 * (torch.arange(-side, side + 1, dtype=torch.float64) / width).square())
-    return weight / weight.sum()
-
-
-def _convolved(values: Float[Tensor, "frames joints width"], kernel: Float[Tensor, " taps"]) -> Tensor:
-    """Along the frames; beyond the ends the outermost frame is repeated."""
-    side = len(kernel) // 2
-    channels = values.flatten(1).T[:, None]
-    padded = torch.nn.functional.pad(channels, (side, side), mode="replicate")
-    out = torch.nn.functional.conv1d(padded, kernel[None, None])[:, 0].T
-    return out.unflatten(1, values.shape[1:])

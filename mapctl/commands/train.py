@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import options, outputs, training
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
@@ -90,11 +90,8 @@ class Train:
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.training.run import TrainRequest
 
+        training.check(self, model="a density", on_gpu=True)
         config, settings = self._recipe()
-        if not self.minutes_between_checkpoints > 0:
-            raise RequestError(
-                f"minutes between checkpoints must be positive, got {self.minutes_between_checkpoints:g}"
-            )
         return TrainRequest(
             data=self.data, out=self.out, match=self.match or "", config=config, settings=settings,
             resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
@@ -106,22 +103,13 @@ class Train:
         from priors.training.lstm_gmm import PAPER, TrainingSettings
 
         config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
-        shape = {"width": self.width, "components": self.components}
-        if self.init is not None and (self.paper or any(value is not None for value in shape.values())):
+        shape = training.asked(self, "width", "components")
+        if self.init is not None and (self.paper or shape):
             raise RequestError(
                 "with --init the network is that prior's; --width, --components and --paper do not apply"
             )
-        recipe = {"steps": self.steps, "batch": self.batch, "window": self.window}
-        if self.learning_rate is not None and not 0 < self.learning_rate < 1:
-            raise RequestError(f"the learning rate must lie between 0 and 1, got {self.learning_rate:g}")
-        for name, value in (shape | recipe).items():
-            if value is not None and value < 1:
-                raise RequestError(f"--{name} must be at least 1, got {value}")
-        if self.seed is not None:
-            options.check_seed(self.seed)
-        settings = replace(settings, bfloat16=self.bfloat16, learning_rate=self.learning_rate or settings.learning_rate)
-        given = {name: value for name, value in (recipe | {"seed": self.seed}).items() if value is not None}
-        return replace(config, **{k: v for k, v in shape.items() if v is not None}), replace(settings, **given)
+        recipe = training.asked(self, "steps", "batch", "window", "learning_rate", "seed")
+        return replace(config, **shape), replace(settings, bfloat16=self.bfloat16, **recipe)
 
 
 def _say(line: str) -> None:

@@ -1,13 +1,12 @@
 """`mapctl train denoiser`: the options of `mapctl train` that a denoiser has, and the run."""
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapctl.commands import options, outputs
+from mapctl.commands import outputs, training
 from mapctl.commands.threads import compute_on_one
-from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from mapctl.commands.train import Train
@@ -30,27 +29,12 @@ def request(given: "Train") -> "DenoiserRequest":
     """The options as the trainer takes them; RequestError for those that a denoiser has not."""
     from priors.training.denoiser_run import DenoiserConfig, DenoiserRequest, DenoiserSettings
 
-    defaults = {option.name: option.default for option in fields(given)}
-    for name in _OF_OTHERS:
-        if getattr(given, name) != defaults[name]:
-            raise RequestError(f"--{name} is for other models; a denoiser has no such option")
-    if given.device == "cuda":
-        raise RequestError("a denoiser is trained on the processor; leave --device out")
-    numbers = {"steps": given.steps, "batch": given.batch, "window": given.window, "seed": given.seed}
-    for name, value in numbers.items():
-        if name == "seed" and value is not None:
-            options.check_seed(value)
-        elif value is not None and value < 1:
-            raise RequestError(f"--{name} must be at least 1, got {value}")
-    if given.learning_rate is not None and not 0 < given.learning_rate < 1:
-        raise RequestError(f"the learning rate must lie between 0 and 1, got {given.learning_rate:g}")
-    if not given.minutes_between_checkpoints > 0:
-        raise RequestError(f"minutes between checkpoints must be positive, got {given.minutes_between_checkpoints:g}")
-    config = DenoiserConfig() if given.width is None else DenoiserConfig(width=given.width)
-    changed = {name: value for name, value in (numbers | {"learning_rate": given.learning_rate}).items() if value}
-    changed |= {"seed": given.seed} if given.seed is not None else {}
+    training.check(given, model="a denoiser", foreign=_OF_OTHERS)
+    config = replace(DenoiserConfig(), **training.asked(given, "width"))
+    recipe = training.asked(given, "steps", "batch", "window", "seed", "learning_rate")
+    settings = replace(DenoiserSettings(), bfloat16=given.bfloat16, **recipe)
     return DenoiserRequest(
-        data=given.data, out=given.out, match=given.match or "", config=config,
-        settings=replace(DenoiserSettings(), bfloat16=given.bfloat16, **changed), resume=given.resume,
-        checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence, skip_first=given.skip_first,
+        data=given.data, out=given.out, match=given.match or "", config=config, settings=settings,
+        resume=given.resume, checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence,
+        skip_first=given.skip_first,
     )  # fmt: skip

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl import gaussian
 from mapctl.curve import Curve
-from mapctl.metrics.smoothing import gaussian_kernel, slow_part, slow_part_inside
+from mapctl.metrics.smoothing import gaussian_kernel, slow_part
 
 LOW_PASS_SECONDS = 0.5
 """Standard deviation of the Gaussian that takes natural sway out of the path error."""
@@ -37,7 +38,9 @@ def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECO
     reach = len(kernel) // 2
     if len(offset) <= 2 * reach + 4:
         return math.nan
-    return float((offset[reach:-reach] - slow_part_inside(offset, kernel)).square().mean().sqrt())
+    # Inside, where the whole kernel lies on the walk.
+    quick = (offset - gaussian.convolved(offset, kernel, "nothing"))[reach:-reach]
+    return float(quick.square().mean().sqrt())
 
 
 def straight_offset(ground: Float[Tensor, "frames 2"]) -> Float[Tensor, "frames"]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import gaussian, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, Place
 from mapctl.skeleton import Skeleton
 from mapctl.trial import Trial
@@ -67,8 +67,7 @@ class Poses:
 
     @cached_property
     def _smoothing(self) -> Float[Tensor, "frames frames"]:
-        frame = torch.arange(len(self.sigma), dtype=self.sigma.dtype)
-        weight = torch.exp(-0.5 * ((frame[:, None] - frame) / self.smooth).square())
+        weight = gaussian.weights(len(self.sigma), self.smooth, self.sigma.dtype)
         return weight / weight.square().sum(dim=-1, keepdim=True).sqrt()
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl import gaussian
 from mapctl.curve_axes import CurveAxes, axes_near
 from mapctl.curves import Curve
 from mapctl.trial import Trial
@@ -99,13 +100,6 @@ def _smoother(
     The same at every evaluation of a window; tensors are compared by identity.
     """
     past = before[-round(3 * sigma_frames) :, joint].detach().to(dtype)
-    weights = gaussian_weights(len(past) + len(path.arcs), sigma_frames, dtype)[len(past) :].T.contiguous()
+    weights = gaussian.averaging(len(past) + len(path.arcs), sigma_frames, dtype)[len(past) :].T.contiguous()
     known = path._sideways_before(past) @ weights[: len(past)] if len(past) else weights.new_zeros(len(path.arcs))
     return known, weights[len(past) :]
-
-
-def gaussian_weights(count: int, sigma_frames: float, dtype: torch.dtype) -> Float[Tensor, "count count"]:
-    """Row t averages the frames around t with a Gaussian, normalised over the frames there are."""
-    at = torch.arange(count, dtype=dtype)
-    weights = torch.exp(-0.5 * ((at[:, None] - at[None]) / sigma_frames).square())
-    return weights / weights.sum(-1, keepdim=True)

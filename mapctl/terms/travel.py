@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.terms.path import gaussian_weights
+from mapctl import gaussian
 from mapctl.trial import Trial
 
 
@@ -78,5 +78,5 @@ def _smoother(
     sigma_frames = term.slow_seconds * fps
     past = min(len(steps), len(term.velocities_before), round(3 * sigma_frames))
     owed = (steps[len(steps) - past :] - term.velocities_before[len(term.velocities_before) - past :]).to(dtype)
-    weights = gaussian_weights(past + len(term.velocities), sigma_frames, dtype)[past:]
+    weights = gaussian.averaging(past + len(term.velocities), sigma_frames, dtype)[past:]
     return weights[:, :past] @ owed, weights[:, past:].contiguous()
