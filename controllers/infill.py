@@ -63,6 +63,18 @@ class Infilled:
     notes: tuple[str, ...] = ()
     """What the user should know."""
 
+    def summary(self) -> dict[str, Any]:
+        """For a report, in plain numbers."""
+        filled = int(self.lost.frames.sum())
+        gaps = [{"start": start, "stop": stop, "joints": int(self.lost.joints[start:stop].any(dim=0).sum()),
+                 "root": bool(self.lost.root[start:stop].any())}
+                for _, start, stop in runs(self.lost.frames[:, None])]  # fmt: skip
+        return {
+            "frames": self.motion.num_frames, "fps": float(self.motion.fps), "gaps": gaps,
+            "ledger": self.ledger.summary(), "seconds": self.seconds,
+            "frame_ms": 1000 * self.seconds / max(1, filled), "notes": list(self.notes),
+        }  # fmt: skip
+
 
 def infill(
     motion: Motion, infiller: Inbetweener | None, masks: Sequence[Mask], *,

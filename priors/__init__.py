@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from priors.denoiser import ConvDenoiser
     from priors.density import LstmGmmDensity
+    from priors.infiller import ConvInfiller
     from priors.refiner import LstmRefiner
 
 
@@ -27,6 +28,13 @@ def load_denoiser(name: str = "denoiser") -> "ConvDenoiser":
     from priors import denoiser
 
     return denoiser.load(name)
+
+
+def load_infiller(name: str = "infiller") -> "ConvInfiller":
+    """The bundled infiller, or a trained one by its file or run folder."""
+    from priors import infiller
+
+    return infiller.load(name)
 
 
 def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":

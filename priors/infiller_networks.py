@@ -31,8 +31,7 @@ class Skips(nn.Module):
         self.narrower = nn.ModuleList(nn.ConvTranspose1d(wide, narrow, 2, stride=2) for wide, narrow in ups)
         self.up = nn.ModuleList(_Unit(width, kernel) for width in widths)
         self.last = nn.Conv1d(widths[0], outputs, 1)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        _silence(self.last)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch outputs frames"]:
         """Changes of the rows, in their own units; nothing before training."""
@@ -59,8 +58,7 @@ class _Unit(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.one = nn.Conv1d(width, width, kernel, padding=kernel // 2)
         self.two = nn.Conv1d(width, width, kernel, padding=kernel // 2)
-        nn.init.zeros_(self.two.weight)
-        nn.init.zeros_(self.two.bias)
+        _silence(self.two)
 
     def forward(self, hidden: Float[Tensor, "batch width frames"]) -> Float[Tensor, "batch width frames"]:
         # Over channels alone: a frame must not depend on how long the motion is.
@@ -90,9 +88,7 @@ class Picture(nn.Module):
             if vanilla
             else nn.ModuleList(nn.Conv2d(b, a, 3, padding=1) for b, a in zip(reversed(widths), outs, strict=True))
         )
-        for layer in (*self.down, *self.down_two, *self.up, *self.up_two):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
+        _begin_as_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
         """The rows anew."""
@@ -118,14 +114,27 @@ class Manifold(nn.Module):
         super().__init__()
         self.encode = nn.Conv1d(rows, width, kernel, padding=kernel // 2)
         self.decode = nn.Conv1d(width, rows, kernel, padding=kernel // 2)
-        for layer in (self.encode, self.decode):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
+        _begin_as_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
         """The rows anew."""
         hidden = max_pool1d(relu(self.encode(rows)), 2, ceil_mode=True)
         return self.decode(hidden.repeat_interleave(2, dim=-1)[..., : rows.shape[-1]])
+
+
+def _silence(layer: nn.Module) -> None:
+    """Its output is nothing, until training."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+
+
+def _begin_as_glorot(network: nn.Module) -> None:
+    """Glorot and Bengio's weights, no biases (section 3.3)."""
+    for parameter in network.parameters():
+        if parameter.dim() > 1:
+            nn.init.xavier_uniform_(parameter)
+        else:
+            nn.init.zeros_(parameter)
 
 
 PAPER_WIDTHS = (32, 64, 128, 256, 256)

@@ -12,6 +12,7 @@ from mapctl.commands.demo import Demo
 from mapctl.commands.denoise import Denoise
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.generate import Generate
+from mapctl.commands.infill import Infill
 from mapctl.commands.info import Info
 from mapctl.commands.live import Live
 from mapctl.commands.measure import Measure
@@ -38,6 +39,7 @@ COMMANDS: dict[str, type[Command]] = {
     "steer": Steer,
     "live": Live,
     "denoise": Denoise,
+    "infill": Infill,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

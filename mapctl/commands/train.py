@@ -14,13 +14,17 @@ if TYPE_CHECKING:
     from priors.training.run import TrainRequest
 
 
+_Models = Literal["lstm-gmm", "refiner", "denoiser", "infiller"]
+_Architectures = Literal["skips", "image", "vanilla", "manifold"]
+
+
 @dataclass(frozen=True)
 class Train:
     """Train a prior on a folder of BVH; killed and resumed, a run gives the same weights."""
 
-    model: Positional[Annotated[Literal["lstm-gmm", "refiner", "denoiser"], arg(metavar="lstm-gmm|refiner|denoiser")]]
+    model: Positional[Annotated[_Models, arg(metavar="lstm-gmm|refiner|denoiser|infiller")]]
     """What to train: lstm-gmm is the density that follow and generate use; refiner makes its samples look captured;
-    denoiser is what denoise begins with."""
+    denoiser is what denoise begins with, infiller what infill does."""
     data: options.DataFolder
     """Folder of .bvh files, searched with everything below it."""
     out: options.OutFolder
@@ -42,6 +46,8 @@ class Train:
     """Frames a window."""
     learning_rate: options.MaybeNumber = None
     """At the start; 0.001 from scratch, less to fine-tune."""
+    architecture: Annotated[_Architectures | None, arg(metavar="skips|image|vanilla|manifold")] = None
+    """Of an infiller: skips is the bundled one's, image the paper's, vanilla and manifold its baselines."""
     paper: bool = False
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
@@ -76,6 +82,10 @@ class Train:
             from mapctl.commands import train_denoiser
 
             path, use = train_denoiser.run(self, say), "--denoiser"
+        elif self.model == "infiller":
+            from mapctl.commands import train_infiller
+
+            path, use = train_infiller.run(self, say), "--infiller"
         else:
             request = self.request()
             outputs.check_folder(self.out)
@@ -90,7 +100,7 @@ class Train:
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.training.run import TrainRequest
 
-        training.check(self, model="a density", on_gpu=True)
+        training.check(self, model="a density", foreign=("architecture",), on_gpu=True)
         config, settings = self._recipe()
         return TrainRequest(
             data=self.data, out=self.out, match=self.match or "", config=config, settings=settings,

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mapctl.commands.train import Train
     from priors.training.denoiser_run import DenoiserRequest
 
-_OF_OTHERS = ("density", "components", "labels", "init", "paper")
+_OF_OTHERS = ("density", "components", "labels", "init", "paper", "architecture")
 
 
 def run(given: "Train", say: Callable[[str], None]) -> Path:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mapctl.commands.train import Train
     from priors.training.refiner_run import RefinerRequest
 
-_OF_OTHERS = ("width", "components", "learning_rate", "labels", "init", "skip_first")
+_OF_OTHERS = ("width", "components", "learning_rate", "labels", "init", "skip_first", "architecture")
 
 
 def run(given: "Train", say: Callable[[str], None]) -> Path:

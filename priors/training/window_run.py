@@ -42,7 +42,8 @@ class Settings(Protocol):
         ...
 
 
-C, S = TypeVar("C", bound=Config), TypeVar("S", bound=Settings)
+C = TypeVar("C", bound=Config)
+S = TypeVar("S", bound=Settings)
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ class _Run(Generic[C, S]):
         card = checkpoints.Card(
             kind=self.kind.name, config=request.config.as_card(), licence=request.licence,
             data={**self.data, "match": request.match, "split_seed": request.settings.seed, "held_out": held},
-            training={"settings": _as_dict(request.settings), "curve": self.curve,
+            training={"settings": _fields(request.settings), "curve": self.curve,
                       "command": command(request, self.kind)},
             quality={"test": self.kind.validate(self.trainer.network, self.parts.test, request.settings)},
             **checkpoints.Card.of_layout(),
@@ -175,7 +176,7 @@ class _Run(Generic[C, S]):
 
     def _recipe(self) -> dict[str, dict]:
         """What must not change between a run's parts, as JSON gives it back."""
-        settings = json.loads(json.dumps(_as_dict(self.request.settings)))
+        settings = json.loads(json.dumps(_fields(self.request.settings)))
         return {"settings": settings, "network": self.request.config.as_card(), "data": self.data}
 
 
@@ -184,12 +185,13 @@ def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
     parts = [f"mapctl train {kind.name} --data DATA -o RUN"]
     parts += [f"--match '{request.match}'"] if request.match else []
     parts += ["--skip-first"] * request.skip_first + kind.shape(request.config)
-    given, usual = _as_dict(request.settings), _as_dict(type(request.settings)())
+    given, usual = _fields(request.settings), _fields(type(request.settings)())
     for name in ("steps", "batch", "window", "learning_rate", "seed"):
         if given[name] != usual[name]:
             parts.append(f"--{name.replace('_', '-')} {given[name]:g}")
     return " ".join(parts + ["--bfloat16"] * given["bfloat16"])
 
 
-def _as_dict(settings: Any) -> dict[str, Any]:
+def _fields(settings: Any) -> dict[str, Any]:
+    """Of a recipe, which a protocol cannot tell to be a dataclass."""
     return asdict(settings)

@@ -1,0 +1,115 @@
+"""`mapctl infill`: gaps and lost joints of a motion are filled in."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.frames import parse_ranges
+from mapctl.commands.threads import compute_on_one
+
+if TYPE_CHECKING:
+    from controllers.infill import Infilled
+    from mapctl.capture.masks import Mask
+    from mapctl.motion import Motion
+
+
+@dataclass(frozen=True)
+class Infill:
+    """What a motion lacks is filled in: frames, or joints; all else stays as it was. On any known rig."""
+
+    source: options.InFile
+    """A motion file."""
+    out: options.OutFile
+    """Where the whole motion goes."""
+    gap: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
+    """Frames from A up to B (exclusive), or seconds as in 2s:4s; may be given several times. What stands in them does
+    not matter. Without gaps and joints, frozen and leaping frames are looked for."""
+    joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    """Only these joints of the rig are lost: in the gaps, or throughout if there are none."""
+    method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
+    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
+    rig: options.MaybeRig = None
+    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
+    infiller: options.Name = "infiller"
+    """The bundled infiller, or the file or run folder of a trained one."""
+    prior: options.MaybeName = None
+    """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder."""
+    report: options.MaybeFile = None
+    """JSON with the gaps, contacts, ledger, measures and timing."""
+    video: options.MaybeFile = None
+    """Film of the given motion and the whole one side by side: .mp4, .gif or .png."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, fill, write, tell."""
+        compute_on_one()
+        self._check()
+        rig = options.read_rig(self.rig)
+        motion = options.read_motion(self.source, rig)
+        masks = self._masks(motion)
+        done = self._infilled(motion, masks)
+        from mapctl import formats
+
+        formats.save(done.motion, self.out)
+        if self.report is not None:
+            from mapctl import report
+
+            report.write(self.as_report(done), self.report)
+        if self.video is not None:
+            from mapctl.progress import bar
+            from scenes.denoise_plot import side_by_side
+
+            with bar("filming", quiet=self.quiet) as progress:
+                side_by_side(motion, done.motion, self.video, rig=rig, progress=progress)
+        if not self.quiet:
+            self._tell(done)
+        return 0
+
+    def as_report(self, done: "Infilled") -> dict[str, object]:
+        """The request, versions, and what the result says of itself."""
+        from mapctl import __version__, metrics, report
+
+        request = {key: value for key, value in options.as_request("infill", self).items() if value is not None}
+        return {"mapctl": __version__, "request": request, "versions": report.versions(), **done.summary(),
+                "measures": metrics.measure(done.motion)}  # fmt: skip
+
+    def _check(self) -> None:
+        from mapctl import formats
+
+        formats.check_ending(self.out)
+        outputs.check_files(options.given(self.out, self.report, self.video))
+        if self.video is not None:
+            outputs.check_film(self.video, (1280, 720))
+
+    def _masks(self, motion: "Motion") -> Sequence["Mask"]:
+        """What is lost; RequestError for what cannot be, or where nothing was asked for and nothing is wrong."""
+        from mapctl.capture.masks import ALL, Mask
+
+        if not self.gap and self.joints is None:
+            from mapctl.gaps.finding import find
+
+            return find(motion)
+        gaps = parse_ranges(self.gap, fps=float(motion.fps), frames=motion.num_frames) or [(0, motion.num_frames)]
+        names = [ALL] if self.joints is None else [name.strip() for name in self.joints.split(",")]
+        return [Mask(name, start, stop) for start, stop in gaps for name in names]
+
+    def _infilled(self, motion: "Motion", masks: Sequence["Mask"]) -> "Infilled":
+        import priors
+        from controllers.infill import InfillSettings, infill
+
+        infiller = None if self.method == "linear" else priors.load_infiller(self.infiller)
+        density = None if self.prior is None else priors.load(self.prior)
+        settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
+        return infill(motion, infiller, masks, settings=settings, density=density, rig=rig)
+
+    def _tell(self, done: "Infilled") -> None:
+        summary = done.summary()
+        gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in summary["gaps"])
+        print(f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
+              f" {summary['frame_ms']:.1f} ms a filled frame")  # fmt: skip
+        for note in done.notes:
+            print(note)
