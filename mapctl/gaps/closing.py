@@ -17,6 +17,7 @@ from mapctl.capture.faults import runs
 
 _SECOND = (1.0, -2.0, 1.0)
 _REACH = 0.12  # seconds over which an offset fades away from its edge
+_ANY_BODY, _ANY_JOINT = 4.0, 30.0  # m/s^2 and rad/s^2 that are nothing unusual in any motion
 
 
 def closed_places(
@@ -24,7 +25,7 @@ def closed_places(
 ) -> Float[Tensor, "frames width"]:
     """Places whose frames `put` were put in; all others stay."""
     values = values.clone()
-    usual = _usual(torch.diff(values, n=2, dim=0)[:, None], put[:, None])
+    usual = _usual(torch.diff(values, n=2, dim=0)[:, None], put[:, None], _ANY_BODY / fps**2)
     for _, start, stop in runs(put[:, None]):
         rows = _rows(start, stop, len(values))
         bends = torch.diff(values[rows.start : rows.stop + 2], n=2, dim=0)[:, None] if len(rows) else values[:0, None]
@@ -38,7 +39,7 @@ def closed_rotations(
 ) -> Float[Tensor, "frames joints 4"]:
     """Local rotations (xyzw) whose frames `put` were put in, joint by joint; all others stay."""
     quats = rotations.sign_continuous(quats)
-    usual = _usual(_turning_bends(quats), put)
+    usual = _usual(_turning_bends(quats), put, _ANY_JOINT / fps**2)
     spans: dict[tuple[int, int], list[int]] = {}
     for joint, start, stop in runs(put):
         spans.setdefault((start, stop), []).append(joint)
@@ -60,12 +61,15 @@ def _turning_bends(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "be
     return torch.diff(turns, dim=0)
 
 
-def _usual(bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"]) -> Float[Tensor, " joints"]:
-    """By joint, the bend that one in twenty exceeds where nothing was put in."""
+def _usual(
+    bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"], least: float
+) -> Float[Tensor, " joints"]:
+    """By joint, the bend that one in a hundred exceeds where nothing was put in; `least`, where that is less."""
     sizes = bends.norm(dim=-1)
     own = ~(put[:-2] | put[1:-1] | put[2:])
     whole = [sizes[own[:, joint], joint] for joint in range(sizes.shape[1])]
-    return torch.stack([part.quantile(0.95) if len(part) else sizes.new_tensor(torch.inf) for part in whole])
+    found = torch.stack([part.quantile(0.99) if len(part) else sizes.new_tensor(least) for part in whole])
+    return found.clamp_min(least)
 
 
 def _rows(start: int, stop: int, frames: int) -> range:
