@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mapctl import gaussian, rotations
 from mapctl.capture import Capture
+from mapctl.capture.observed import last_seen, next_seen
 from mapctl.contacts import steadied
 from mapctl.features import LAYOUT, Place, decode, root_places
 from mapctl.motion import Motion
@@ -42,6 +43,10 @@ class StandingSettings:
     """Doubt about the angles of joints that were not."""
     unseen_cm: float = 5.0
     """Doubt about the place of hips that were not."""
+    ease: float = 0.0
+    """Frames next to seen ones over which the doubt about unseen ones rises from nothing; 0 for at once."""
+    smooth: float = 2.0
+    """Frames (sigma) over which a correction reaches."""
     temperature: float = 1.0
     """Of the density's likelihood, if there is one; above 1 it is trusted less."""
     frames: int = 96
@@ -88,7 +93,7 @@ def stand(
         stop = min(frames, first + settings.frames)
         count = stop - first if stop == frames else settings.frames - settings.ahead
         poses = Poses(guide.slice(first, stop), sigma[first:stop], done.place, done.before, done.contacts,
-                      proposal.skeleton, density=density, state=_state(done, density, guide, first))  # fmt: skip
+                      proposal.skeleton, smooth=settings.smooth, density=density, state=_state(done, density, guide, first))  # fmt: skip
         features, used, entries, done = _window(poses, terms, count, settings, density)
         pieces.append(features)
         spent, first, ledger = spent + used, first + count, ledger.join(entries)
@@ -170,10 +175,21 @@ def rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> float:
 
 def _doubt(capture: Capture, settings: StandingSettings) -> Float[Tensor, "frames width"]:
     """Sigma of root, heading and angles by frame (see `Guide.packed`)."""
-    unseen = math.radians(settings.unseen_deg)
+    unseen = math.radians(settings.unseen_deg) * _eased(capture.seen[0], settings.ease)
     angle = torch.where(capture.seen[0], settings.share * capture.sigma[0], unseen).clamp_min(1e-4)
-    root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], settings.unseen_cm / 100)
+    away = settings.unseen_cm / 100 * _eased(capture.seen_root[0][:, None], settings.ease)[:, 0]
+    root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], away)
     hips = angle[:, :1]
     # Feet are put down even in a capture without noise, if only by half a millimetre.
     root = root.clamp_min(5e-4)[:, None]
     return torch.cat([root.expand(-1, 3), hips.expand(-1, 3), angle[:, 1:].repeat_interleave(3, dim=-1)], dim=-1)
+
+
+def _eased(seen: Bool[Tensor, "frames columns"], ease: float) -> Float[Tensor, "frames columns"]:
+    """0 where something is seen, rising smoothly to 1 so many frames away from there; 1 throughout for no frames."""
+    if ease <= 0 or bool(seen.all()):
+        return torch.ones(seen.shape)
+    frame = torch.arange(len(seen))[None]
+    away = torch.minimum((frame - last_seen(seen.T)).abs(), (frame - next_seen(seen.T)).abs()).T
+    share = torch.sin(0.5 * math.pi * (away / ease).clamp(max=1)).square()
+    return torch.where(seen.any(dim=0), share, 1.0)

@@ -96,15 +96,18 @@ class Bands:
 
     def _carried(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
         """From the prior's rate to the recording's."""
-        return upsampled(change, fps=float(self.slow.fps), frames=self.slow.num_frames)
+        seconds = torch.arange(len(change), dtype=torch.float64) / PRIOR_FPS
+        return upsampled(change, seconds, fps=float(self.slow.fps), frames=self.slow.num_frames)
 
 
-def upsampled(values: Float[Tensor, "shown *width"], *, fps: float, frames: int) -> Float[Tensor, "frames *width"]:
-    """From the prior's rate to another one, by a cubic spline; held beyond the last frame."""
+def upsampled(
+    values: Float[Tensor, "shown *width"], seconds: Float[Tensor, " shown"], *, fps: float, frames: int
+) -> Float[Tensor, "frames *width"]:
+    """Values at these times, which rise, at a rate of so many frames, by a cubic spline; held beyond the last."""
     if len(values) < 2:
         return values.expand(frames, *values.shape[1:])
-    times = np.arange(len(values)) / PRIOR_FPS
-    wanted = np.clip(np.arange(frames) / fps, 0, times[-1])
+    times = seconds.numpy()
+    wanted = np.clip(np.arange(frames) / fps, times[0], times[-1])
     return torch.as_tensor(CubicSpline(times, values.double().numpy(), axis=0)(wanted))
 
 

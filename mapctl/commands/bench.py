@@ -3,7 +3,7 @@
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -13,6 +13,9 @@ from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
 from mapctl.progress import bar
 
+if TYPE_CHECKING:
+    from controllers.bench_denoise import Clip
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -20,25 +23,29 @@ class Bench:
 
     what: Positional[
         Annotated[
-            Literal["speed", "ablation", "free-run", "generation", "steer", "live", "denoise"],
-            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise"),
+            Literal["speed", "ablation", "free-run", "generation", "steer", "live", "denoise", "infill"],
+            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill"),
         ]
     ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
     `free-run`: 8 random motions of 10,000 frames beside the training data; `generation`: raw, refined and finished
     motion beside mocap that training did not see; `steer`: random commands, which are reached and how soon; `live`: the
     same against the wall clock, for one, two and four characters at once; `denoise`: clips that training did not see,
-    spoilt in several ways, beside filters tuned on the truth."""
+    spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
     `live`, if not given; for `denoise` a density whose likelihood joins the last stage, none if not given."""
     data: options.MaybeFile = None
-    """For `generation` and `denoise`: the folder that was trained on; its held-out clips are looked up there."""
+    """For `generation`, `denoise` and `infill`: the folder that was trained on, for the clips that were held out."""
     count: options.Count = 48
-    """For `generation`: clips of 10 s to draw; for `steer`: commands to give; for `denoise`:
-    clips, spread over the kinds."""
+    """For `generation`: clips of 10 s to draw; for `steer`: commands to give; for `denoise` and
+    `infill`: clips, spread over the kinds."""
     denoiser: options.Name = "denoiser"
     """For `denoise`: the bundled denoiser, or the file or run folder of a trained one."""
+    infiller: options.Name = "infiller"
+    """For `infill`: the bundled infiller, or the file or run folder of a trained one."""
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
+    """For `infill`: other trained infillers, to compare as they are."""
     refiner: options.Name = "auto"
     """For `generation`: a bundled refiner, or the file or run folder of a trained one; auto is the prior's own."""
     minutes: options.Number = 0.5
@@ -53,7 +60,8 @@ class Bench:
         compute_on_one()
         from mapctl import report
 
-        rows = self._denoise() if self.what == "denoise" else self._of_a_prior()
+        others = {"denoise": self._denoise, "infill": self._infill}
+        rows = others.get(self.what, self._of_a_prior)()
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
         else:
@@ -78,22 +86,43 @@ class Bench:
 
     def _denoise(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_denoise import KINDS, Clip, kind_of, shortened, table
+        from controllers.bench_denoise import table
+
+        denoiser = priors.load_denoiser(self.denoiser)
+        clips = self._clips_by_kind(denoiser.card)
+        density = None if self.prior is None else priors.load(self.prior)
+        with bar("denoising") as progress:
+            return table(clips, denoiser, density=density, progress=progress)
+
+    def _infill(self) -> list[dict[str, Any]]:
+        import priors
+        from controllers.bench_infill import table
+        from mapctl import retarget
+
+        infiller = priors.load_infiller(self.infiller)
+        networks = {infiller.card.config["architecture"]: infiller}
+        for name in filter(None, self.baselines.split(",")):
+            other = priors.load_infiller(name)
+            networks[other.card.config["architecture"]] = other
+        clips = [retarget.to_canonical(clip.motion)[0] for clip in self._clips_by_kind(infiller.card)]
+        with bar("filling") as progress:
+            return table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
+
+    def _clips_by_kind(self, card: Any) -> "list[Clip]":
+        """Unseen clips, as many of each kind, without their T-poses."""
+        from controllers.bench_denoise import KINDS, Clip, kind_of, shortened
         from controllers.denoise import begins_with_tpose
         from mapctl import formats
 
-        denoiser = priors.load_denoiser(self.denoiser)
         paths: dict[str, list[Path]] = {}
-        for path in self._held_out(denoiser.card):
+        for path in self._held_out(card):
             paths.setdefault(kind_of(path.relative_to(self.data or "").as_posix()), []).append(path)
         clips = []
         for kind in KINDS:
             for path in paths.get(kind, [])[: max(1, self.count // len(KINDS))]:
                 motion = formats.load(path)
                 clips.append(Clip(kind, shortened(motion, skip_first=begins_with_tpose(motion))))
-        density = None if self.prior is None else priors.load(self.prior)
-        with bar("denoising") as progress:
-            return table(clips, denoiser, density=density, progress=progress)
+        return clips
 
     def _held_out(self, card: Any) -> list[Path]:
         """The clips that were kept from training; RequestError where they are not all there."""

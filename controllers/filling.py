@@ -1,0 +1,222 @@
+"""Make whole what lacks frames or joints, on any rig: an infiller proposes joint positions (infilling paper), inverse
+kinematics makes them rotations of rigid bones, and the MAP stage puts the feet down; what is known stays to the bit.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from controllers.standing import StandingSettings, stand
+from mapctl import contacts, inverse_kinematics, rotations
+from mapctl.capture import Capture
+from mapctl.capture.bands import upsampled
+from mapctl.capture.faults import runs
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.gaps import PositionImage
+from mapctl.gaps.closing import closed_places, closed_rotations
+from mapctl.gaps.lost import Lost, put_back, straight
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.retarget import from_canonical, to_canonical
+from mapctl.rigs import Rig
+from mapctl.skeleton import CANONICAL, leg_length
+from mapctl.solver.result import Ledger
+from mapctl.terms.footing import TOES
+
+Method = Literal["infiller", "map", "linear"]
+_TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
+_BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
+
+
+@dataclass(frozen=True)
+class InfillSettings:
+    """How gaps are filled."""
+
+    method: Method = "map"
+    """`infiller` leaves the proposal as it is, but for rigid bones; `map` finishes it; `linear` knows no network."""
+    standing: StandingSettings = field(default_factory=lambda: StandingSettings(ease=5.0))
+    """The MAP stage."""
+
+
+@dataclass(frozen=True, eq=False)
+class Infilled:
+    """A whole motion, and how it became so."""
+
+    motion: Motion
+    """On the given rig, at its rate, with all of its frames."""
+    lost: Lost
+    """What was filled in."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted, at the prior's rate."""
+    ledger: Ledger
+    """Of the MAP stage, by term and frame at the prior's rate, of the frames that it saw."""
+    seconds: float = 0.0
+    """Compute, wall clock."""
+    notes: tuple[str, ...] = ()
+    """What the user should know."""
+
+    def summary(self) -> dict[str, Any]:
+        """For a report, in plain numbers."""
+        filled = int(self.lost.frames.sum())
+        gaps = [{"start": start, "stop": stop, "joints": int(self.lost.joints[start:stop].any(dim=0).sum()),
+                 "root": bool(self.lost.root[start:stop].any())}
+                for _, start, stop in runs(self.lost.frames[:, None])]  # fmt: skip
+        return {
+            "frames": self.motion.num_frames, "fps": float(self.motion.fps), "gaps": gaps,
+            "ledger": self.ledger.summary(), "seconds": self.seconds,
+            "frame_ms": 1000 * self.seconds / max(1, filled), "notes": list(self.notes),
+        }  # fmt: skip
+
+
+def fill(
+    motion: Motion, lost: Lost, infiller: Inbetweener | None, *, settings: InfillSettings | None = None,
+    density: Any = None, rig: Rig | None = None,
+) -> Infilled:  # fmt: skip
+    """What is lost of a motion, filled in; RequestError for a method without its network."""
+    settings, began = settings or InfillSettings(), time.perf_counter()
+    if infiller is None and settings.method != "linear":
+        raise RequestError(f"method {settings.method} needs an infiller")
+    base = straight(motion, lost)
+    if settings.method == "linear" or infiller is None:
+        nothing = torch.zeros(0, 2, dtype=torch.bool)
+        return Infilled(put_back(base, motion, lost), lost, nothing, Ledger(), time.perf_counter() - began)
+    canonical, rigmap = to_canonical(base, rig)
+    gap = _CanonicalGap.of(canonical, lost, rigmap.joint_of)
+    proposal, bits = _proposed(gap, infiller)
+    stands, ledger = contacts.steadied(bits > 0), Ledger()
+    if settings.method == "map":
+        proposal, ledger = _stood(proposal, bits, gap, settings.standing, density)
+    whole = _at_rate_of(canonical, proposal, gap.seconds)
+    filled = from_canonical(whole, rigmap, base)
+    return Infilled(_closed(put_back(filled, base, lost), lost, motion), lost, stands, ledger,
+                    time.perf_counter() - began)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _CanonicalGap:
+    """The motion at the prior's rate, on canonical joints and the performer's bones, and what of it is lost."""
+
+    motion: Motion
+    turns: Bool[Tensor, "frames joints"]
+    """Rotations that are lost."""
+    root: Bool[Tensor, " frames"]
+    """Places of the hips that are lost."""
+    seconds: Float[Tensor, " frames"]
+    """When each frame is: a key between two frames is taken for one of them, and stays at its own time."""
+
+    @staticmethod
+    def of(canonical: Motion, lost: Lost, joint_of: Sequence[int | None]) -> "_CanonicalGap":
+        """From the rig's rate. A frame between two of which one is lost shows the other, if that is near enough."""
+        whole = canonical.resample(PRIOR_FPS)
+        at = torch.arange(whole.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
+        low = (at + 1e-9).floor().long()
+        high = torch.where(at - low > 1e-6, low + 1, low).clamp(max=canonical.num_frames - 1)
+        nearest, reach = _nearest_known(at, ~lost.frames), 0.5 * float(canonical.fps) / PRIOR_FPS
+        between = lost.frames[low] | lost.frames[high]
+        # Half open: a key in the middle of two moments is that of one.
+        snapped = between & (nearest - at <= reach) & (nearest - at > -reach)
+        at = torch.where(snapped, nearest.to(at), at)
+        low, high = torch.where(snapped, nearest, low), torch.where(snapped, nearest, high)
+        quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[nearest], whole.local_quat_xyzw)
+        root = torch.where(snapped[:, None], canonical.root_position[nearest], whole.root_position)
+        shown = replace(whole, root_position=root, local_quat_xyzw=rotations.sign_continuous(quats))
+        columns = [torch.zeros(canonical.num_frames, dtype=torch.bool) if joint is None else lost.joints[:, joint]
+                   for joint in joint_of]  # fmt: skip
+        turns = torch.stack(columns, dim=1)
+        for joint, own in enumerate(joint_of):  # an End Site turns with its parent
+            if own is None:
+                turns[:, joint] = turns[:, CANONICAL.parents[joint]]
+        return _CanonicalGap(shown, turns[low] | turns[high], lost.root[low] | lost.root[high],
+                             at / float(canonical.fps))  # fmt: skip
+
+    def places_known(self) -> Bool[Tensor, "frames joints"]:
+        """A place is known if all that carries it is."""
+        known = [~self.root]
+        for parent in CANONICAL.parents[1:]:
+            known.append(known[parent] & ~self.turns[:, parent])
+        known[0] = ~(self.root | self.turns[:, 0])
+        return torch.stack(known, dim=1)
+
+    @property
+    def scale(self) -> float:
+        """How much longer the performer's legs are than the canonical ones."""
+        return leg_length(self.motion.skeleton) / leg_length(CANONICAL)
+
+
+def _proposed(gap: _CanonicalGap, infiller: Inbetweener) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+    """The infiller's motion on rigid bones, its seams closed, and the log odds of its contacts."""
+    shown = gap.motion
+    body = Motion(CANONICAL, shown.fps, shown.root_position / gap.scale, shown.local_quat_xyzw)
+    places = body.joint_positions()
+    stands = contacts.planted(places[:, list(_TOES)], PRIOR_FPS).float()
+    image = PositionImage.of_world(
+        places.float()[None], heading(shown.local_quat_xyzw[:, 0]).float()[None], stands[None],
+        known=gap.places_known()[None], present=torch.ones(1, len(places), dtype=torch.bool), toes=_TOES,
+    )  # fmt: skip
+    proposed = infiller.propose(image)
+    wanted = image.to_world(proposed.places)[0].double()
+    root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
+    quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root)
+    quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
+    quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
+    root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
+    bits = torch.where(image.known[0][:, list(_TOES)], 8 * stands - 4, proposed.contacts[0])
+    return replace(shown, root_position=root, local_quat_xyzw=quats), bits
+
+
+def _stood(
+    proposal: Motion, bits: Tensor, gap: _CanonicalGap, settings: StandingSettings, density: Any
+) -> tuple[Motion, Ledger]:
+    """The proposal with its feet put down, gap by gap; and the ledger of these."""
+    quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
+    for _, start, stop in runs((gap.turns.any(dim=1) | gap.root)[:, None]):
+        first, last = max(0, start - _BESIDE), min(proposal.num_frames, stop + _BESIDE)
+        if last - first < 2:
+            continue
+        part = slice(first, last)
+        capture = Capture.of_motion(
+            proposal.slice(first, last), seen=~gap.turns[part], seen_root=~gap.root[part],
+            sigma=torch.zeros(CANONICAL.num_joints), sigma_root=0.0,
+        )  # fmt: skip
+        stood = stand(proposal.slice(first, last), bits[part], capture, settings, density=density)
+        quats[part] = torch.where(gap.turns[part, :, None], stood.motion.local_quat_xyzw, quats[part])
+        root[part] = torch.where(gap.root[part, None], stood.motion.root_position, root[part])
+        ledger = ledger.join(stood.ledger)
+    return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
+
+
+def _nearest_known(at: Float[Tensor, " shown"], known: Bool[Tensor, " frames"]) -> Int[Tensor, " shown"]:
+    """For each moment, in frames, the nearest one that is known; RequestError if none is."""
+    frames = known.nonzero()[:, 0]
+    after = torch.searchsorted(frames.to(at), at).clamp(max=len(frames) - 1)
+    before = (after - 1).clamp_min(0)
+    nearer = (frames[before] - at).abs() <= (frames[after] - at).abs()
+    return torch.where(nearer, frames[before], frames[after])
+
+
+def _at_rate_of(canonical: Motion, proposal: Motion, seconds: Float[Tensor, " shown"]) -> Motion:
+    """The proposal at the given motion's rate, by splines through its frames."""
+    if canonical.fps == PRIOR_FPS:
+        return proposal
+    frames, fps = canonical.num_frames, float(canonical.fps)
+    quats = rotations.sign_continuous(proposal.local_quat_xyzw)
+    quats = torch.nn.functional.normalize(upsampled(quats, seconds, fps=fps, frames=frames), dim=-1)
+    return replace(canonical, root_position=upsampled(proposal.root_position, seconds, fps=fps, frames=frames),
+                   local_quat_xyzw=quats)  # fmt: skip
+
+
+def _closed(filled: Motion, lost: Lost, original: Motion) -> Motion:
+    """On the rig, with seams that run on; what is known is the original's."""
+    fps = float(original.fps)
+    moving = {joint: closed_places(values, lost.root, fps=fps) for joint, values in filled.moving_offsets.items()}
+    closed = replace(filled, moving_offsets=moving,
+                     root_position=closed_places(filled.root_position, lost.root, fps=fps),
+                     local_quat_xyzw=closed_rotations(filled.local_quat_xyzw, lost.joints, fps=fps))  # fmt: skip
+    return put_back(closed, original, lost)
