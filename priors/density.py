@@ -1,5 +1,6 @@
 """A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its starts and its card."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -89,6 +90,17 @@ class LstmGmmDensity:
         known = [name for name in names if name in self.reference.config.labels]
         return replace(self, reference=self.reference.told(known))
 
+    def blurred(self, spread: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
+        """The same density, scoring motion that was seen with errors of this spread (physical units); see LstmGmm."""
+        return replace(self, reference=self.reference.blurred(spread))
+
+    @property
+    def usual_nats(self) -> float:
+        """Log density a frame (physical units, see mapctl.choosing) that 98 % of the windows of its own held-out data
+        reach when blurred by `choosing.spread()`; minus infinity where the card does not say.
+        """
+        return float(self.card.quality.get("windows", {}).get("p2", -math.inf))
+
     def _label(self, name: str) -> str:
         """The whole label that a name, or its part after the `=`, stands for."""
         known = self.reference.config.labels
@@ -101,6 +113,12 @@ class LstmGmmDensity:
     def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
         """A state with empty memory after one frame."""
         return self.reference.initial_state(previous)
+
+    def likely_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
+        """The state, before them, that makes a motion's first frames likely (Eq. 26); see priors.beginning."""
+        from priors.beginning import likely_state
+
+        return likely_state(self.reference, self.starts.state, features)
 
     def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
         """See Density."""

@@ -104,18 +104,21 @@ class Mixture:
     """Log odds that the left and right toe are planted."""
 
     def log_prob(
-        self, target: Float[Tensor, "*batch size"], whitening: Float[Tensor, "components continuous continuous"] | None
-    ) -> Float[Tensor, "*batch"]:
+        self, target: Float[Tensor, "*batch size"], whitening: Float[Tensor, "components continuous continuous"] | None,
+        blur: Float[Tensor, "components continuous"] | None = None,
+    ) -> Float[Tensor, "*batch"]:  # fmt: skip
         """Eq. 8 without its sign, plus the contact bits; the target is normalised, its bits are 0 or 1.
 
-        `whitening` holds each component's unit lower triangular factor, which leaves volumes as they are.
+        `whitening` holds each component's unit lower triangular factor, which leaves volumes as they are; `blur` is
+        added to the variances of the values that it makes independent.
         """
         continuous, bits = target[..., : self.mean.shape[-1]], target[..., self.mean.shape[-1] :]
         error = continuous.unsqueeze(-2) - self.mean
         if whitening is not None:
             error = torch.einsum("kij,...kj->...ki", whitening, error)
-        error = error * torch.exp(-self.log_sigma)
-        each = -0.5 * (error**2).sum(-1) - self.log_sigma.sum(-1) - 0.5 * math.log(2 * math.pi) * error.shape[-1]
+        log_sigma = self.log_sigma if blur is None else 0.5 * torch.log(torch.exp(2 * self.log_sigma) + blur)
+        error = error * torch.exp(-log_sigma)
+        each = -0.5 * (error**2).sum(-1) - log_sigma.sum(-1) - 0.5 * math.log(2 * math.pi) * error.shape[-1]
         signed = torch.where(bits > 0.5, self.contact_logit, -self.contact_logit)
         return torch.logsumexp(self.log_weight + each, dim=-1) + nn.functional.logsigmoid(signed).sum(-1)
 
@@ -125,6 +128,7 @@ class LstmGmm(nn.Module):
 
     mean: Tensor
     std: Tensor
+    blur: Tensor | None
 
     def __init__(
         self, config: LstmGmmConfig, *, mean: Float[Tensor, " size"], std: Float[Tensor, " size"],
@@ -134,6 +138,7 @@ class LstmGmm(nn.Module):
         self.config, self.layout = config, layout
         self.register_buffer("mean", mean.clone())
         self.register_buffer("std", std.clone())
+        self.register_buffer("blur", None)
         width, outputs = config.width, config.components * (1 + 2 * layout.continuous) + 2
         self.fc1, self.fc2 = nn.Linear(layout.size, width), nn.Linear(width, width)
         self.lstm = nn.LSTM(width, width, num_layers=2, batch_first=True)
@@ -174,6 +179,19 @@ class LstmGmm(nn.Module):
             known[[int(self.config.knows_noise) + self.config.labels.index(label) for label in labels]] = 1
             with torch.no_grad():
                 model.fc1.bias += self.condition(known.to(self.mean))
+        return model
+
+    def blurred(self, spread: Float[Tensor, " continuous"]) -> "LstmGmm":
+        """A copy whose `log_prob` is of motion seen with independent errors of this spread (physical units).
+
+        Sharp densities say nothing of how wrong a motion is that is off by more than they allow. What the errors add
+        to the correlated values is taken to be independent as well, which keeps the density a density.
+        """
+        model, size = copy.deepcopy(self), self.layout.continuous
+        variance = (spread.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
+        if (whitening := self.whitening) is not None:
+            variance = torch.einsum("kij,kj->ki", whitening.detach().square(), variance)
+        model.blur = variance.clone()
         return model
 
     def normalise(self, features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
@@ -223,7 +241,7 @@ class LstmGmm(nn.Module):
         seen = features if inputs is None else inputs
         before = torch.cat([state.previous.unsqueeze(1), seen[:, :-1]], dim=1)
         mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
-        return mixture.log_prob(self._target(features), self.whitening)
+        return mixture.log_prob(self._target(features), self.whitening, self.blur)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
         """The state after the committed frames were seen."""

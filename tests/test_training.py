@@ -85,11 +85,15 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert (card.data["clips"], card.data["frames"]) == (5, 5 * 80)
     assert card.training["settings"] == asdict(SETTINGS)
     assert "mapctl train lstm-gmm" in card.training["command"]
+    assert "--skip-first" not in card.training["command"]
+    other = request_in(out, data, skip_first=True, settings={"bfloat16": True})
+    assert "--skip-first --bfloat16" in run.command(other)
     held = card.data["held_out"]["validation"] + card.data["held_out"]["test"]
     assert len(held) == 2
     assert not set(held) & set(card.data["starts"])
     assert {"validation_nats", "free_run_speed_ratio", "free_run_finite"} <= set(card.training["curve"][-1])
     assert card.quality["test_nats_per_frame"]
+    assert prior.usual_nats == card.quality["windows"]["p2"] <= card.quality["windows"]["mean"]
     assert 0 < prior.abilities.slowest < prior.abilities.fastest < 3
     assert any("step 6: " in line for line in news)
     files = {file.name for file in out.iterdir()}

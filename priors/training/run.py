@@ -19,7 +19,7 @@ from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import resume, run_files
 from priors.training.health import free_run
-from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats
+from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
 from priors.training.starts import abilities, choose
 
 Progress = Callable[[str], None]
@@ -123,7 +123,8 @@ def _card(
             "split_seed": request.settings.seed, "starts": list(starts),
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
     training = {"command": command(request), "settings": asdict(request.settings), "curve": curve}
-    quality = {"test_nats_per_frame": validation_nats(model, parts.test), "mocap": _mocap(parts),
+    quality = {"test_nats_per_frame": validation_nats(model, parts.test),
+               "windows": window_nats(model, (parts.validation, parts.test)), "mocap": _mocap(parts),
                "data": state_summary(parts.train.features)}  # fmt: skip
     return checkpoints.Card(
         kind="lstm-gmm", config=model.config.as_card(), licence=request.licence, data=data, training=training,
@@ -136,7 +137,7 @@ def command(request: TrainRequest) -> str:
     plain, parts = TrainingSettings(), [f"mapctl train lstm-gmm --data DATA -o RUN --match '{request.match}'"]
     parts += [f"--labels '{request.labels}'"] if request.labels else []
     parts += [f"--init {request.init}"] if request.init else [f"--width {request.config.width}"]
-    parts += ["--bfloat16"] if request.settings.bfloat16 else []
+    parts += ["--skip-first"] * request.skip_first + ["--bfloat16"] * request.settings.bfloat16
     wanted, default = asdict(request.settings), asdict(plain)
     for name in ("steps", "batch", "window", "learning_rate", "seed"):
         if wanted[name] != default[name]:

@@ -1,0 +1,100 @@
+"""Which of several densities a motion is likelier under, and how far any of them is to be trusted with it.
+
+Networks normalise inside themselves, each by its own statistics, so their log densities are compared in physical units:
+less the sum of the logarithms of the standard deviations of the values. Contact bits count the same for all.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, encode
+from mapctl.motion import Motion
+
+WINDOW = 96
+"""Frames over which a density's trust is told: of the windows of denoising, and of a card's `windows`."""
+_ANGLE_DEG, _PLACE_CM = 1.0, 0.5  # by which proposals are typically off
+_HOPELESS = -1e6  # nats
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The density under which a motion is likeliest."""
+
+    density: Any
+    """Of those given."""
+    nats: Mapping[str, float]
+    """By name of each density, the mean log density of a frame, physical units."""
+
+    @property
+    def weight(self) -> float:
+        """Share, 0 to 1, that its log density should count with: 1 while the motion is as likely as its own data.
+
+        Gaussians whose errors are sqrt(T) times too large lose (T - 1) / 2 nats a value: 1 / T makes up for it.
+        """
+        lacking = self.density.usual_nats - self.nats[self.density.name]
+        return 1.0 / (1.0 + max(0.0, lacking) / (LAYOUT.continuous / 2))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What densities made of some frames."""
+
+    start: int
+    """First frame, from 0."""
+    stop: int
+    """One past the last."""
+    prior: str
+    """Name of the density that was used, the likeliest of those given."""
+    nats: Mapping[str, float]
+    """By name of each density, the mean log density of a frame, physical units."""
+    weight: float
+    """Share that its log density counted with; below 1 it was out of its depth."""
+
+
+def likeliest(densities: Sequence[Any], features: Float[Tensor, "frames size"], states: Sequence[Any]) -> Choice:
+    """Of some densities with their states before the frames. RequestError where there are none.
+
+    To score a proposal, blur the densities first (`density.blurred(spread())`): they are sharper than it is right.
+    """
+    if not densities:
+        raise RequestError("no density to choose from")
+    with torch.no_grad():
+        nats = {density.name: _nats(density, features, state) for density, state in zip(densities, states, strict=True)}
+    return Choice(max(densities, key=lambda density: nats[density.name]), nats)
+
+
+def likeliest_of_motion(densities: Sequence[Any], motion: Motion) -> Choice:
+    """The same of a whole canonical motion at any rate, from its first frame on.
+
+    RequestError where there are none; MapctlError for a motion of fewer than two frames at the priors' rate.
+    """
+    features = encode(motion.resample(PRIOR_FPS))[0].float()
+    return likeliest(densities, features[1:], [density.initial_state(features[:1]) for density in densities])
+
+
+def spread() -> Float[Tensor, " continuous"]:
+    """What a proposal is off by: standard deviations of the continuous features, physical units."""
+    found = torch.full((LAYOUT.continuous,), math.radians(_ANGLE_DEG))
+    for block in ("root_displacement_heading", "root_height"):
+        found[LAYOUT.slices[block]] = _PLACE_CM / 100
+    # Errors of neighbouring frames go together, so their difference is smaller.
+    found[LAYOUT.slices["heading_change"]] /= 2
+    return found
+
+
+def physical_nats(log_density: Float[Tensor, "*batch"], feature_std: Float[Tensor, " size"]) -> Float[Tensor, "*batch"]:
+    """Log densities of normalised features in physical units."""
+    return log_density - feature_std[: LAYOUT.continuous].log().sum()
+
+
+def _nats(density: Any, features: Tensor, state: Any) -> float:
+    """Mean of the frames; hopeless where it is not finite."""
+    found = float(physical_nats(density.log_prob(features[None], state), density.feature_std).mean())
+    return found if math.isfinite(found) else _HOPELESS

@@ -1,0 +1,79 @@
+"""The memory before a motion's first frames (Eq. 26)."""
+
+from functools import cache
+
+import torch
+from helpers import tiny_density, walk
+
+from mapctl.features import encode
+from mapctl.solver.budget import Budget
+from priors.beginning import BeginningSettings, likely_state
+from priors.lstm_gmm import LstmState
+
+
+@cache
+def tiny():
+    """Of weights so large that what it remembers makes a difference."""
+    density = tiny_density(width=12)
+    for layer in (density.reference.fc3, density.reference.out):
+        layer.weight.mul_(4)
+    return density
+
+
+def frames(count=30, seed=3):
+    return encode(walk(count, turn_rate=0.4, seed=seed))[0].float()
+
+
+def nats(state, features):
+    with torch.no_grad():
+        return float(tiny().log_prob(features[None], state).sum())
+
+
+def prior(state):
+    """Of the memory, by the mean and spread of the known ones."""
+    known = tiny().starts.state
+    total = 0.0
+    for mine, theirs in ((state.hidden, known.hidden), (state.cell, known.cell)):
+        spread = theirs.std(dim=1, correction=0).clamp_min(0.05)
+        total += float(0.5 * ((mine[:, 0] - theirs.mean(dim=1)) / spread).square().sum())
+    return total
+
+
+def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_one():
+    first = frames()[:10]
+    found = tiny().likely_state(frames())
+    assert nats(found, first) > nats(tiny().initial_state(first[:1]), first) + 10
+    known = tiny().starts.state
+    for row in range(known.batch):
+        other = known.pick(torch.tensor([row]))
+        other = LstmState(first[:1], other.hidden, other.cell)
+        assert nats(found, first) - prior(found) > nats(other, first) - prior(other)
+
+
+def test_the_same_frames_give_the_same_state():
+    one, other = (tiny().likely_state(frames()) for _ in range(2))
+    assert torch.equal(one.hidden, other.hidden)
+    assert torch.equal(one.cell, other.cell)
+    assert torch.equal(one.previous, frames()[:1])
+
+
+def test_without_a_search_it_is_the_best_of_the_known_ones():
+    known = tiny().starts.state
+    found = likely_state(tiny().reference, known, frames(), BeginningSettings(budget=Budget(evaluations=1)))
+    apart = (known.hidden - found.hidden).abs().amax(dim=(0, 2))
+    assert float(apart.min()) < 1e-5
+
+
+def test_short_motions_and_one_known_state_will_do():
+    for count in (1, 2, 5):
+        state = tiny().likely_state(frames()[:count])
+        assert state.batch == 1
+        assert bool(torch.isfinite(state.cell).all())
+    one = tiny().starts.state.pick(torch.tensor([0]))
+    assert bool(torch.isfinite(likely_state(tiny().reference, one, frames()).hidden).all())
+
+
+def test_only_the_first_frames_count():
+    later = frames().clone()
+    later[10:] += 1.0
+    assert torch.equal(tiny().likely_state(later).hidden, tiny().likely_state(frames()).hidden)
