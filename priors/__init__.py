@@ -2,6 +2,9 @@
 
 from typing import TYPE_CHECKING
 
+AUTO = ("locomotion", "general")
+"""Bundled densities that `auto` chooses from, by likelihood (see mapctl.choosing)."""
+
 if TYPE_CHECKING:
     from priors.denoiser import ConvDenoiser
     from priors.density import LstmGmmDensity
@@ -14,6 +17,13 @@ def load(name: str) -> "LstmGmmDensity":
     from priors import density
 
     return density.load(name)
+
+
+def load_choice(name: str | None) -> "list[LstmGmmDensity]":
+    """The densities that a --prior leaves to choose from: for `auto` the bundled ones, else the named one, or none."""
+    if name is None:
+        return []
+    return [load(each) for each in (AUTO if name == "auto" else (name,))]
 
 
 def load_refiner(name: str) -> "LstmRefiner":
