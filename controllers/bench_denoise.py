@@ -56,7 +56,7 @@ def shortened(motion: Motion, *, skip_first: bool) -> Motion:
 
 
 def table(
-    clips: Sequence[Clip], denoiser: Denoiser, *, density: Any = None,
+    clips: Sequence[Clip], denoiser: Denoiser, *, densities: Sequence[Any] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:  # fmt: skip
     """By condition over all clips, then by kind of clip in the standard condition, then clean clips."""
@@ -66,7 +66,7 @@ def table(
         found = []
         for number, clip in enumerate(clips):
             spoilt = CONDITIONS[name](clip.motion, torch.Generator().manual_seed(number))
-            found.append(judged(clip.motion, spoilt, denoiser, density))
+            found.append(judged(clip.motion, spoilt, denoiser, densities))
             if name == STANDARD:
                 by_kind.setdefault(clip.kind, []).append(found[-1])
             done += 1
@@ -76,19 +76,19 @@ def table(
     rows += [{"what": f"{kind}, {STANDARD}", "clips": len(found), **_mean(found)} for kind, found in by_kind.items()]
     clean = []
     for clip in clips:
-        clean.append({"out_cm": _error(clip.motion, denoise(clip.motion, denoiser, density=density).motion)})
+        clean.append({"out_cm": _error(clip.motion, denoise(clip.motion, denoiser, densities=densities).motion)})
         done += 1
         if progress is not None:
             progress(done, len(clips) * (len(conditions) + 1))
     return [*rows, {"what": "clean, change", "clips": len(clips), **_mean(clean)}]
 
 
-def judged(truth: Motion, spoilt: Spoilt, denoiser: Denoiser, density: Any = None) -> Row:
+def judged(truth: Motion, spoilt: Spoilt, denoiser: Denoiser, densities: Sequence[Any] = ()) -> Row:
     """Mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside mocap's,
     milliseconds a frame.
     """
     began = time.perf_counter()
-    done = denoise(spoilt.motion, denoiser, masks=spoilt.masks, density=density)
+    done = denoise(spoilt.motion, denoiser, masks=spoilt.masks, densities=densities)
     seconds = time.perf_counter() - began
     butterworth, savgol = best_filters(truth, examine(spoilt.motion, spoilt.masks))
     ours, mocap = metrics.measure(done.motion), metrics.measure(truth)

@@ -38,14 +38,15 @@ _PIECE, _SHARED = 60.0, 2.0  # seconds of a long capture that are cleaned at onc
 
 def denoise(
     motion: Motion, denoiser: Denoiser, *, masks: Sequence[Mask] = (), settings: DenoiseSettings | None = None,
-    density: Any = None, rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
+    densities: Sequence[Any] = (), rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Denoised:  # fmt: skip
     """Denoise a motion on any rig that `mapctl.rigs` can tell, or on a given one; RequestError for others and for masks
     that do not fit.
 
-    `denoiser` proposes (see priors.load_denoiser); a `density` adds its likelihood to the MAP stage. A T-pose in frame
-    0, as many captures begin with, stays. A long capture is cleaned in pieces that fade into each other, so
-    memory beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
+    `denoiser` proposes (see priors.load_denoiser). Of `densities` the likeliest adds its likelihood to each window of
+    the MAP stage. A T-pose in frame 0, as many captures begin with, stays. A long capture is cleaned in pieces that
+    fade into each other, so memory beyond the capture's own does not grow with it. `progress` is called with frames
+    done and all frames.
     """
     settings = settings or DenoiseSettings()
     masked(motion, masks)  # whole: of a piece they are cut to its frames
@@ -64,7 +65,7 @@ def denoise(
             last, first = pieces[-1]
             part = written_back(part, last.motion.slice(start - first, before - first), hidden)
             hidden = after(hidden, before - start)
-        pieces.append((_cleaned(part, denoiser, hidden, settings, density, rig), start))
+        pieces.append((_cleaned(part, denoiser, hidden, settings, densities, rig), start))
         start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
@@ -90,8 +91,9 @@ def _beginning(motion: Motion) -> Motion:
 
 
 def _cleaned(
-    motion: Motion, denoiser: Denoiser, masks: Sequence[Mask], settings: DenoiseSettings, density: Any, rig: Rig
-) -> Denoised:
+    motion: Motion, denoiser: Denoiser, masks: Sequence[Mask], settings: DenoiseSettings, densities: Sequence[Any],
+    rig: Rig,
+) -> Denoised:  # fmt: skip
     began = time.perf_counter()
     examined = examine(motion, masks)
     if motion.num_frames < _SHORTEST:
@@ -100,7 +102,7 @@ def _cleaned(
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
         return Denoised(motion, motion, examined.noise, examined.noise_root, (), nothing, believed, Ledger(),
                         notes=(note,))  # fmt: skip
-    done = Piece(examined, denoiser, settings, rig).run(density)
+    done = Piece(examined, denoiser, settings, rig).run(densities)
     return replace(done, seconds=time.perf_counter() - began)
 
 
@@ -118,8 +120,10 @@ def _led_by(motion: Motion, done: Denoised, rigmap: RigMap) -> Denoised:
     at_rest = _apart(rest, first.local_quat_xyzw) < reach
     first = replace(first, local_quat_xyzw=torch.where(at_rest[..., None], rest, first.local_quat_xyzw))
     faults = tuple(replace(fault, start=fault.start + 1, stop=fault.stop + 1) for fault in done.faults)
+    stretches = tuple(replace(part, start=part.start + 1, stop=part.stop + 1) for part in done.stretches)
     note = "frame 0 is a T-pose: it stays, but for noise of joints at rest"
-    return replace(done, motion=first.join(done.motion), capture=motion, faults=faults, notes=(note, *done.notes))
+    return replace(done, motion=first.join(done.motion), capture=motion, faults=faults, stretches=stretches,
+                   notes=(note, *done.notes))  # fmt: skip
 
 
 def _rests(motion: Motion, rigmap: RigMap) -> list[Float[Tensor, "1 joints 4"]]:

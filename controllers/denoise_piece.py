@@ -1,6 +1,7 @@
 """One piece of a capture: proposal, what goes back, feet, and the way back to its rig."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from mapctl.capture.noise import angle_noise, place_noise
 from mapctl.capture.residuals import returned
 from mapctl.capture.smoothing import smoothed_angles
 from mapctl.capture.spikes import leaps
+from mapctl.choosing import Stretch
 from mapctl.contacts import steadied
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
@@ -66,7 +68,7 @@ class Piece:
         self.shown = self.bands.at_prior_rate()
         self.capture = self._capture(seen)
 
-    def run(self, density: Any) -> Denoised:
+    def run(self, densities: Sequence[Any]) -> Denoised:
         """Propose, give back, put the feet down, return to the rig."""
         proposal, contacts = self._propose()
         if self.bands.exact:
@@ -75,14 +77,23 @@ class Piece:
         proposal, share = self._given_back(proposal)
         if self.settings.anchor:
             proposal = anchored(proposal, steadied(contacts > 0))
-        stood = stand(proposal, contacts, self.capture, self.settings.standing, density=density)
+        stood = stand(proposal, contacts, self.capture, self.settings.standing, densities=densities)
         joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
         within = self.bands.within
         stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
         examined, found = self.examined, self._faults(motion, proposal.slice(0, within), stood)
         return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts,
-                        1 - share[:within], stood.ledger)  # fmt: skip
+                        1 - share[:within], stood.ledger, stretches=self._at_own_rate(stood.stretches))  # fmt: skip
+
+    def _at_own_rate(self, stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+        """In frames of the capture; the last ends with it."""
+        frames, shown = self.examined.motion.num_frames, self.shown.num_frames
+        ratio = float(self.examined.motion.fps) / float(self.shown.fps)
+        moved = [replace(part, start=min(frames, round(part.start * ratio)),
+                         stop=frames if part.stop == shown else min(frames, round(part.stop * ratio)))
+                 for part in stretches]  # fmt: skip
+        return tuple(part for part in moved if part.start < part.stop)
 
     def _faults(self, motion: Motion, proposal: Motion, stood: Stood) -> tuple[faults.Fault, ...]:
         """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,12 +11,14 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.capture.faults import Fault, runs
+from mapctl.choosing import Stretch
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.result import Ledger
 
+Part = TypeVar("Part", Fault, Stretch)
 _DOUBTED = 0.5  # share of a joint's frames from which the network counts as out of its depth
 
 
@@ -47,15 +49,19 @@ class Denoised:
     """Compute, wall clock."""
     notes: tuple[str, ...] = ()
     """What the user should know."""
+    stretches: tuple[Stretch, ...] = ()
+    """Of each window of the MAP stage, in frames of the capture, which density counted and how much; none where none
+    was given."""
 
     def slice(self, start: int, stop: int) -> "Denoised":
         """Frames start to stop, with what was wrong in them; the noise stays that of the whole."""
         ratio = PRIOR_FPS / float(self.motion.fps)
         part = slice(round(start * ratio), round(stop * ratio))
-        faults = (replace(f, start=f.start - start, stop=f.stop - start) for f in _between(self.faults, start, stop))
+        faults = _shifted(_between(self.faults, start, stop), -start)
         return replace(
             self, motion=self.motion.slice(start, stop), capture=self.capture.slice(start, stop),
             faults=tuple(faults), contacts=self.contacts[part], believed=self.believed[part],
+            stretches=tuple(_shifted(_between(self.stretches, start, stop), -start)),
             ledger=_part(self.ledger, part),
         )  # fmt: skip
 
@@ -72,6 +78,7 @@ class Denoised:
             "correction_cm": dict(zip(names, moved.tolist(), strict=True)),
             "correction_deg": dict(zip(names, turned.tolist(), strict=True)),
             "contacts": self.contact_frames(), "fallback": self.fallback(),
+            "densities": [vars(stretch) for stretch in self.stretches],
             "ledger": self.ledger.summary(), "seconds": self.seconds,
             "frame_ms": 1000 * self.seconds / self.motion.num_frames, "notes": list(self.notes),
         }  # fmt: skip
@@ -121,8 +128,8 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
     skip = start + shared // 2
     kept = round(skip * ratio)
     skipped = kept - round(start * ratio)
-    later = [replace(fault, start=fault.start + start, stop=fault.stop + start) for fault in piece.faults]
-    faults = _chained(_between(whole.faults, 0, skip), _between(later, skip, motion.num_frames))
+    faults = _chained(_between(whole.faults, 0, skip), _between(_shifted(piece.faults, start), skip, motion.num_frames))
+    later = _between(_shifted(piece.stretches, start), skip, motion.num_frames)
     share = piece.motion.num_frames / motion.num_frames
     return replace(
         whole, motion=motion, capture=whole.capture.join(piece.capture.slice(shared, piece.capture.num_frames)),
@@ -133,13 +140,19 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
         ledger=whole.ledger.slice(kept).join(_part(piece.ledger, slice(skipped, None))),
         seconds=whole.seconds + piece.seconds,
         notes=tuple(dict.fromkeys(whole.notes + piece.notes)),
+        stretches=(*_between(whole.stretches, 0, skip), *later),
     )  # fmt: skip
 
 
-def _between(faults: Sequence[Fault], start: int, stop: int) -> list[Fault]:
-    """What of the faults lies in frames start to stop."""
-    cut = [replace(fault, start=max(fault.start, start), stop=min(fault.stop, stop)) for fault in faults]
-    return [fault for fault in cut if fault.start < fault.stop]
+def _shifted(parts: Sequence[Part], frames: int) -> list[Part]:
+    """The same, so many frames later."""
+    return [replace(part, start=part.start + frames, stop=part.stop + frames) for part in parts]
+
+
+def _between(parts: Sequence[Part], start: int, stop: int) -> list[Part]:
+    """What of the faults or stretches lies in frames start to stop."""
+    cut = [replace(part, start=max(part.start, start), stop=min(part.stop, stop)) for part in parts]
+    return [part for part in cut if part.start < part.stop]
 
 
 def _chained(before: Sequence[Fault], after: Sequence[Fault]) -> tuple[Fault, ...]:

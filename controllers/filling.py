@@ -77,7 +77,7 @@ class Infilled:
 
 def fill(
     motion: Motion, lost: Lost, infiller: Inbetweener | None, *, settings: InfillSettings | None = None,
-    density: Any = None, rig: Rig | None = None,
+    densities: Sequence[Any] = (), rig: Rig | None = None,
 ) -> Infilled:  # fmt: skip
     """What is lost of a motion, filled in; RequestError for a method without its network."""
     settings, began = settings or InfillSettings(), time.perf_counter()
@@ -92,7 +92,7 @@ def fill(
     proposal, bits = _proposed(gap, infiller)
     stands, ledger = contacts.steadied(bits > 0), Ledger()
     if settings.method == "map":
-        proposal, ledger = _stood(proposal, bits, gap, settings.standing, density)
+        proposal, ledger = _stood(proposal, bits, gap, settings.standing, densities)
     whole = _at_rate_of(canonical, proposal, gap.seconds)
     filled = from_canonical(whole, rigmap, base)
     return Infilled(_closed(put_back(filled, base, lost), lost, motion), lost, stands, ledger,
@@ -172,7 +172,7 @@ def _proposed(gap: _CanonicalGap, infiller: Inbetweener) -> tuple[Motion, Float[
 
 
 def _stood(
-    proposal: Motion, bits: Tensor, gap: _CanonicalGap, settings: StandingSettings, density: Any
+    proposal: Motion, bits: Tensor, gap: _CanonicalGap, settings: StandingSettings, densities: Sequence[Any]
 ) -> tuple[Motion, Ledger]:
     """The proposal with its feet put down, gap by gap; and the ledger of these."""
     quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
@@ -185,7 +185,7 @@ def _stood(
             proposal.slice(first, last), seen=~gap.turns[part], seen_root=~gap.root[part],
             sigma=torch.zeros(CANONICAL.num_joints), sigma_root=0.0,
         )  # fmt: skip
-        stood = stand(proposal.slice(first, last), bits[part], capture, settings, density=density)
+        stood = stand(proposal.slice(first, last), bits[part], capture, settings, densities=densities)
         quats[part] = torch.where(gap.turns[part, :, None], stood.motion.local_quat_xyzw, quats[part])
         root[part] = torch.where(gap.root[part, None], stood.motion.root_position, root[part])
         ledger = ledger.join(stood.ledger)

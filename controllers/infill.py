@@ -17,14 +17,14 @@ __all__ = ["InfillSettings", "Infilled", "Method", "infill"]
 
 def infill(
     motion: Motion, infiller: Inbetweener | None, masks: Sequence[Mask], *,
-    settings: InfillSettings | None = None, density: Any = None, rig: Rig | None = None,
+    settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
 ) -> Infilled:  # fmt: skip
     """Fill what the masks say is missing. RequestError for masks that do not fit, or a method without its network.
 
     What stands in a gap does not matter. A gap at the motion's beginning or end is extended into.
     """
     lost = Lost.of_masks(motion, masks, to_canonical(motion, rig)[1])
-    done = fill(motion, lost, infiller, settings=settings, density=density, rig=rig)
+    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig)
     return replace(done, notes=_notes(lost))
 
 

@@ -13,11 +13,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import gaussian, rotations
+from mapctl import choosing, gaussian, rotations
 from mapctl.capture import Capture
 from mapctl.capture.observed import last_seen, next_seen
+from mapctl.choosing import Choice, Stretch
 from mapctl.contacts import steadied
-from mapctl.features import LAYOUT, Place, decode, root_places
+from mapctl.features import Place, decode, root_places
 from mapctl.motion import Motion
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, minimise
@@ -47,8 +48,8 @@ class StandingSettings:
     """Frames next to seen ones over which the doubt about unseen ones rises from nothing; 0 for at once."""
     smooth: float = 2.0
     """Frames (sigma) over which a correction reaches."""
-    temperature: float = 1.0
-    """Of the density's likelihood, if there is one; above 1 it is trusted less."""
+    temperature: float = 8.0
+    """Of a density's likelihood, if there is one; above 1 it is trusted less, since the proposal knows the data too."""
     frames: int = 96
     """Of a window."""
     ahead: int = 24
@@ -73,32 +74,41 @@ class Stood:
     """By term and frame."""
     evaluations: int
     """Spent in all."""
+    stretches: tuple[Stretch, ...] = ()
+    """Of each window, which density was used; none where none was given."""
 
 
 def stand(
     proposal: Motion, contacts: Float[Tensor, "frames 2"], capture: Capture, settings: StandingSettings, *,
-    density: Any = None,
+    densities: Sequence[Any] = (),
 ) -> Stood:  # fmt: skip
-    """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was."""
+    """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was.
+
+    In each window that density counts under which the proposal is likeliest, and less where it is out of its depth.
+    """
     guide = guide_of(proposal, steadied(contacts > 0))
     sigma = _doubt(capture, settings)
     footing = replace(settings.footing, rest_height=rest_height(proposal, guide.contacts))
-    terms: list[Term] = [Noise(1.0), footing]
-    if density is not None:
-        terms.append(Likelihood(settings.temperature))
-    place = Place(guide.root[0, ::2], guide.heading[0])
-    done = _Done(place, torch.zeros(0, proposal.num_joints, 3), torch.zeros(2, dtype=torch.bool), None)
+    judges = [density.blurred(choosing.spread()) for density in densities]
+    place = _before(guide)
+    done = _Done(place, torch.zeros(0, proposal.num_joints, 3), torch.zeros(2, dtype=torch.bool), ())
     frames, pieces, spent, ledger, first = proposal.num_frames, [], 0, Ledger(), 0
+    stretches: list[Stretch] = []
     while first < frames:
         stop = min(frames, first + settings.frames)
         count = stop - first if stop == frames else settings.frames - settings.ahead
         poses = Poses(guide.slice(first, stop), sigma[first:stop], done.place, done.before, done.contacts,
-                      proposal.skeleton, smooth=settings.smooth, density=density, state=_state(done, density, guide, first))  # fmt: skip
-        features, used, entries, done = _window(poses, terms, count, settings, density)
+                      proposal.skeleton, smooth=settings.smooth)  # fmt: skip
+        terms: list[Term] = [Noise(1.0), footing]
+        if judges:
+            poses, done, choice = _judged(poses, done, judges)
+            terms.append(Likelihood(settings.temperature / choice.weight))
+            stretches.append(Stretch(first, first + count, choice.density.name, choice.nats, choice.weight))
+        features, used, entries, done = _window(poses, terms, count, settings, done, judges)
         pieces.append(features)
         spent, first, ledger = spent + used, first + count, ledger.join(entries)
     motion = decode(torch.cat(pieces), place, skeleton=proposal.skeleton)
-    return Stood(motion, guide.contacts, ledger, spent)
+    return Stood(motion, guide.contacts, ledger, spent, tuple(stretches))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +118,11 @@ class _Done:
     place: Place
     before: Tensor
     contacts: Tensor
-    state: Any
+    states: Sequence[Any]
 
 
 def _window(
-    poses: Poses, terms: Sequence[Term], count: int, settings: StandingSettings, density: Any
+    poses: Poses, terms: Sequence[Term], count: int, settings: StandingSettings, before: _Done, judges: Sequence[Any]
 ) -> tuple[Tensor, int, Ledger, _Done]:
     """The first `count` frames of one window; one without a finite solution is left as it was proposed."""
     objective, meter = Objective(poses.build, terms), Meter(settings.budget)
@@ -123,20 +133,30 @@ def _window(
         features = trial.features[:, :count]
         ground, heading = root_places(features[0], poses.place)
         joints = torch.cat([poses.before, trial.joints_world[0, :count]])[-settings.past :]
-        state = None if density is None else density.advance(poses.state, features)
-    done = _Done(Place(ground[-1], heading[-1]), joints, poses.guide.contacts[count - 1], state)
+        states = [judge.advance(state, features) for judge, state in zip(judges, before.states, strict=True)]
+    done = _Done(Place(ground[-1], heading[-1]), joints, poses.guide.contacts[count - 1], states)
     return features[0], meter.evaluations, objective.ledger_of(trial).slice(count), done
 
 
-def _state(done: _Done, density: Any, guide: Guide, first: int) -> Any:
-    """The density's before the window; before the first one, after some frames of standing as the motion begins."""
-    if density is None or done.state is not None:
-        return done.state
-    still = torch.zeros(1, LAYOUT.size)
-    still[:, LAYOUT.slices["root_height"]] = guide.root[first, 1]
-    still[:, LAYOUT.slices["root_tilt"].start : LAYOUT.continuous] = guide.angles[first]
-    still[:, LAYOUT.continuous :] = guide.contacts[first].float()
-    return density.advance(density.initial_state(still), still[:, None].expand(-1, 5, -1))
+def _judged(poses: Poses, done: _Done, judges: Sequence[Any]) -> tuple[Poses, _Done, Choice]:
+    """The window scored by the density under which its guide is likeliest; the first window's states are looked for."""
+    with torch.no_grad():
+        features = poses.build(torch.zeros(1, poses.sigma.numel())).features[0]
+    if not done.states:
+        done = replace(done, states=[judge.likely_state(features) for judge in judges])
+    choice = choosing.likeliest(judges, features, done.states)
+    state = done.states[judges.index(choice.density)]
+    return replace(poses, density=choice.density, state=state), done, choice
+
+
+def _before(guide: Guide) -> Place:
+    """The place from which the first frame's step and turn are as the second's: nobody begins by standing still."""
+    place = Place(guide.root[0, ::2], guide.heading[0])
+    if len(guide.root) == 1:
+        return place
+    turn = guide.heading[1] - guide.heading[0]
+    step = rotations.rotate_ground(guide.root[1, ::2] - guide.root[0, ::2], -guide.heading[0])
+    return place.before(step, turn)
 
 
 def guide_of(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Guide:

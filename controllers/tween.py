@@ -15,7 +15,7 @@ from mapctl.rigs import Rig
 
 def tween(
     motion: Motion, keys: Sequence[int], infiller: Inbetweener | None, *,
-    settings: InfillSettings | None = None, density: Any = None, rig: Rig | None = None,
+    settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
 ) -> Infilled:  # fmt: skip
     """A motion of the same length that goes through the frames `keys` of a motion, of which nothing else counts.
 
@@ -30,4 +30,4 @@ def tween(
     free = torch.ones(frames, dtype=torch.bool)
     free[wanted] = False
     lost = Lost(free[:, None].expand(-1, motion.num_joints).clone(), free)
-    return fill(motion, lost, infiller, settings=settings, density=density, rig=rig)
+    return fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig)

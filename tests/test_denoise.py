@@ -99,9 +99,22 @@ def test_the_density_joins_where_one_is_given():
     from helpers import tiny_density
 
     given = noisy(on_rig("canonical", 40))
-    done = cleaned(given, density=tiny_density())
+    done = cleaned(given, densities=[tiny_density()])
     assert "likelihood" in {entry.name for entry in done.ledger.entries}
     assert done.motion.num_frames == 40
+
+
+def test_what_densities_made_of_windows_is_told_in_frames_of_the_capture():
+    from helpers import tiny_density
+
+    done = cleaned(noisy(on_rig("daz", 361, fps=120)), densities=[tiny_density()])
+    assert (done.stretches[0].start, done.stretches[-1].stop) == (0, 361)
+    first, second = done.slice(0, 100), done.slice(100, 361)
+    assert (first.stretches[-1].stop, second.stretches[0].start, second.stretches[-1].stop) == (100, 0, 261)
+    parts = joined([(first, 0), (second, 100)]).stretches
+    assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
+    assert (parts[0].start, parts[-1].stop) == (0, 361)
+    json.dumps(done.summary(), allow_nan=False)
 
 
 @pytest.mark.parametrize("rig", RIGS)

@@ -92,6 +92,26 @@ def test_a_prior_joins_the_last_stage(denoise, recording, tmp_path):
     assert "likelihood" in json.loads(report.read_text())["ledger"]
 
 
+def test_auto_chooses_among_the_bundled_densities_and_says_which(denoise, recording, tmp_path, capsys):
+    report = tmp_path / "r.json"
+    assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", "auto", "--report", report) == 0
+    (window,) = json.loads(report.read_text())["densities"]
+    assert (window["start"], window["stop"]) == (0, 40)
+    assert set(window["nats"]) == {"locomotion", "general"}
+    assert window["prior"] == max(window["nats"], key=window["nats"].get)
+    assert 0 < window["weight"] <= 1
+    told = capsys.readouterr().out
+    assert f"{window['prior']} {window['nats'][window['prior']]:.0f} nats a frame, used in 40" in told
+
+
+def test_where_a_prior_is_out_of_its_depth_is_said(denoise, recording, tmp_path, capsys):
+    prior = save_tiny_prior(tmp_path / "prior.safetensors")
+    card = prior.with_suffix(".json")
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"quality": {"windows": {"p2": 1e5}}}))
+    assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", prior) == 0
+    assert "prior out of its depth, so that it counts for less than half: frames 0:40" in capsys.readouterr().out
+
+
 @pytest.fixture
 def folder(tmp_path):
     """Two captures of which one lies deeper, and a file that is none."""

@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import apart_deg
-from helpers import finite_difference, generator, walk
+from helpers import finite_difference, generator, tiny_density, walk
 
 from controllers import standing
 from controllers.standing import StandingSettings, guide_of, rest_height, stand
-from mapctl import rotations
+from mapctl import choosing, rotations
 from mapctl.capture import Capture
 from mapctl.capture.faults import runs
 from mapctl.contacts import steadied
@@ -123,6 +123,41 @@ def test_what_was_not_seen_moves_before_what_was():
     lost = replace(capture, seen_root=torch.zeros(1, 40, dtype=torch.bool))
     held, free = (speeds(stand(motion, odds(motion), given, QUICK).motion)[2:].mean() for given in (capture, lost))
     assert free < 0.5 * held
+
+
+def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
+    """The windows say so, and the energy is divided by what is lost."""
+    motion, settings = walk(50), replace(QUICK, frames=30, ahead=10, budget=Budget(evaluations=2))
+    deep = tiny_density()
+    shallow = replace(deep, card=replace(deep.card, quality={"windows": {"p2": 1e5}}))
+    found = {}
+    for density in (deep, shallow):
+        stood = stand(motion, odds(motion), told(motion), settings, densities=[density])
+        assert [(part.start, part.stop) for part in stood.stretches] == [(0, 20), (20, 50)]
+        (entry,) = (entry for entry in stood.ledger.entries if entry.name == "likelihood")
+        scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in stood.stretches])
+        assert torch.allclose(entry.energy * settings.temperature, entry.residual * scale, rtol=1e-4)
+        found[density] = {part.weight for part in stood.stretches}
+    assert found[deep] == {1.0}
+    assert max(found[shallow]) < 1e-3
+
+
+def test_of_several_densities_the_likelier_counts_in_each_window():
+    motion = walk(50)
+    near = tiny_density()
+    far = replace(near, name="far", reference=near.reference.blurred(100 * choosing.spread()))
+    stood = stand(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10), densities=[far, near])
+    for part in stood.stretches:
+        assert part.prior == max(part.nats, key=lambda name: part.nats[name])
+        assert set(part.nats) == {"tiny", "far"}
+
+
+def test_a_walk_that_is_moving_begins_so():
+    """The density is not shown a first frame that stands: its step is the second's."""
+    motion = walk(30)
+    place = standing._before(guide_of(motion, torch.zeros(30, 2, dtype=torch.bool)))
+    step = motion.root_position[1, [0, 2]] - motion.root_position[0, [0, 2]]
+    assert torch.allclose((motion.root_position[0, [0, 2]] - place.position_xz), step, atol=1e-4)
 
 
 def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):

@@ -34,7 +34,7 @@ class Bench:
     spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
-    `live`, if not given; for `denoise` a density whose likelihood joins the last stage, none if not given."""
+    `live`, if not given; for `denoise` as that command takes it."""
     data: options.MaybeFile = None
     """For `generation`, `denoise` and `infill`: the folder that was trained on, for the clips that were held out."""
     count: options.Count = 48
@@ -90,9 +90,9 @@ class Bench:
 
         denoiser = priors.load_denoiser(self.denoiser)
         clips = self._clips_by_kind(denoiser.card)
-        density = None if self.prior is None else priors.load(self.prior)
+        densities = priors.load_choice(self.prior)
         with bar("denoising") as progress:
-            return table(clips, denoiser, density=density, progress=progress)
+            return table(clips, denoiser, densities=densities, progress=progress)
 
     def _infill(self) -> list[dict[str, Any]]:
         import priors

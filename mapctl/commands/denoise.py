@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _NOT_ALL_HOLDS = 3
 _MOST_NAMED = 6
+_DOUBTED = 0.5  # of a density's weight
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Denoise:
     denoiser: options.Name = "denoiser"
     """The bundled denoiser, or the file or run folder of a trained one."""
     prior: options.MaybeName = None
-    """A density whose likelihood joins the last stage: a bundled one, a file or a run folder."""
+    """A density whose likelihood joins the last stage: a bundled one, a file or a run folder; `auto` takes, window by
+    window, the bundled one under which the motion is likelier. None if not given, which measures as well."""
     report: options.MaybeFile = None
     """JSON with the faults found, corrections, contacts, ledger; of a folder, a folder of them."""
     plot: options.MaybeFile = None
@@ -112,7 +114,7 @@ class Denoise:
         import priors
 
         settings, masks, rig = self.settings(), self._masks(), options.read_rig(self.rig)
-        density = None if self.prior is None else priors.load(self.prior)
+        densities = priors.load_choice(self.prior)
         denoiser, motion = priors.load_denoiser(self.denoiser), options.read_motion(self.source, rig)
         with bar("denoising", quiet=self.quiet) as progress:
             if self.causal:
@@ -124,7 +126,7 @@ class Denoise:
             from controllers.denoise import denoise
 
             return denoise(
-                motion, denoiser, masks=masks, settings=settings, density=density, rig=rig, progress=progress
+                motion, denoiser, masks=masks, settings=settings, densities=densities, rig=rig, progress=progress
             )
 
     def settings(self):
@@ -158,7 +160,7 @@ class Denoise:
               f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame")  # fmt: skip
         for line in fault_lines(done):
             print(line)
-        for note in done.notes:
+        for note in (*done.notes, *density_lines(done)):
             print(note)
 
 
@@ -178,4 +180,26 @@ def fault_lines(done: "Denoised") -> list[str]:
             named.append(f"{name}{amount}" + (f" ({len(found)} times)" if len(found) > 1 else ""))
         rest = len(worst) - len(named)
         lines.append(f"{kind}: {', '.join(named)}" + (f" and {rest} more joints" if rest > 0 else ""))
+    return lines
+
+
+def density_lines(done: "Denoised") -> list[str]:
+    """Which densities counted, how likely the motion is under each, and where they were out of their depth."""
+    if not done.stretches:
+        return []
+    frames = {name: 0 for name in done.stretches[0].nats}
+    totals = dict.fromkeys(frames, 0.0)
+    for part in done.stretches:
+        frames[part.prior] += part.stop - part.start
+        for name, nats in part.nats.items():
+            totals[name] += nats * (part.stop - part.start)
+    whole = sum(frames.values())
+    told = ", ".join(f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames)
+    lines = [f"prior: {told} of {whole} frames"]
+    doubted = [part for part in done.stretches if part.weight < _DOUBTED]
+    if doubted:
+        places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MOST_NAMED])
+        rest = len(doubted) - _MOST_NAMED
+        lines.append(f"prior out of its depth, so that it counts for less than half: frames {places}"
+                     + (f" and {rest} more windows" if rest > 0 else ""))  # fmt: skip
     return lines

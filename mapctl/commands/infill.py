@@ -36,7 +36,8 @@ class Infill:
     infiller: options.Name = "infiller"
     """The bundled infiller, or the file or run folder of a trained one."""
     prior: options.MaybeName = None
-    """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder."""
+    """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
+    window, the bundled one under which the motion is likelier."""
     report: options.MaybeFile = None
     """JSON with the gaps, contacts, ledger, measures and timing."""
     video: options.MaybeFile = None
@@ -102,9 +103,9 @@ class Infill:
         from controllers.infill import InfillSettings, infill
 
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller)
-        density = None if self.prior is None else priors.load(self.prior)
+        densities = priors.load_choice(self.prior)
         settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
-        return infill(motion, infiller, masks, settings=settings, density=density, rig=rig)
+        return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig)
 
     def _tell(self, done: "Infilled") -> None:
         summary = done.summary()
