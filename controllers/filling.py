@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controllers.canonical_gap import CanonicalGap
 from controllers.standing import StandingSettings, stand
 from mapctl import contacts, inverse_kinematics, rotations
 from mapctl.capture import Capture
@@ -21,17 +22,19 @@ from mapctl.features import PRIOR_FPS
 from mapctl.gaps import PositionImage
 from mapctl.gaps.closing import closed_places, closed_rotations
 from mapctl.gaps.lost import Lost, put_back, straight
+from mapctl.gaps.targets import Targets, missed, reached
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.rigs import Rig
-from mapctl.skeleton import CANONICAL, leg_length
+from mapctl.skeleton import CANONICAL
 from mapctl.solver.result import Ledger
 from mapctl.terms.footing import TOES
 
 Method = Literal["infiller", "map", "linear"]
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
+_MISSED = 0.001  # metres from a wanted place that are worth a word
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 
 
@@ -77,9 +80,12 @@ class Infilled:
 
 def fill(
     motion: Motion, lost: Lost, infiller: Inbetweener | None, *, settings: InfillSettings | None = None,
-    densities: Sequence[Any] = (), rig: Rig | None = None,
+    densities: Sequence[Any] = (), rig: Rig | None = None, targets: Targets | None = None,
 ) -> Infilled:  # fmt: skip
-    """What is lost of a motion, filled in; RequestError for a method without its network."""
+    """What is lost of a motion, filled in; RequestError for a method without its network.
+
+    `targets` are places that canonical joints are wanted at in frames in which they are lost.
+    """
     settings, began = settings or InfillSettings(), time.perf_counter()
     if infiller is None and settings.method != "linear":
         raise RequestError(f"method {settings.method} needs an infiller")
@@ -88,77 +94,34 @@ def fill(
         nothing = torch.zeros(0, 2, dtype=torch.bool)
         return Infilled(put_back(base, motion, lost), lost, nothing, Ledger(), time.perf_counter() - began)
     canonical, rigmap = to_canonical(base, rig)
-    gap = _CanonicalGap.of(canonical, lost, rigmap.joint_of)
-    proposal, bits = _proposed(gap, infiller)
+    gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
+    shown = None if targets is None else targets.shown(gap.seconds, fps=float(motion.fps))
+    proposal, bits = _proposed(gap, infiller, shown)
     stands, ledger = contacts.steadied(bits > 0), Ledger()
     if settings.method == "map":
-        proposal, ledger = _stood(proposal, bits, gap, settings.standing, densities)
+        proposal, ledger = _stood(proposal, bits, gap, settings.standing, densities, shown)
     whole = _at_rate_of(canonical, proposal, gap.seconds)
     filled = from_canonical(whole, rigmap, base)
-    return Infilled(_closed(put_back(filled, base, lost), lost, motion), lost, stands, ledger,
-                    time.perf_counter() - began)  # fmt: skip
+    done, notes = _closed(put_back(filled, base, lost), lost, motion), ()
+    if targets is not None:
+        done, notes = _on_target(done, targets, lost, motion, rig)
+    return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes)
 
 
-@dataclass(frozen=True, eq=False)
-class _CanonicalGap:
-    """The motion at the prior's rate, on canonical joints and the performer's bones, and what of it is lost."""
-
-    motion: Motion
-    turns: Bool[Tensor, "frames joints"]
-    """Rotations that are lost."""
-    root: Bool[Tensor, " frames"]
-    """Places of the hips that are lost."""
-    seconds: Float[Tensor, " frames"]
-    """When each frame is: a key between two frames is taken for one of them, and stays at its own time."""
-
-    @staticmethod
-    def of(canonical: Motion, lost: Lost, joint_of: Sequence[int | None]) -> "_CanonicalGap":
-        """From the rig's rate. A frame between two of which one is lost shows the other, if that is near enough."""
-        whole = canonical.resample(PRIOR_FPS)
-        at = torch.arange(whole.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
-        low = (at + 1e-9).floor().long()
-        high = torch.where(at - low > 1e-6, low + 1, low).clamp(max=canonical.num_frames - 1)
-        nearest, reach = _nearest_known(at, ~lost.frames), 0.5 * float(canonical.fps) / PRIOR_FPS
-        between = lost.frames[low] | lost.frames[high]
-        # Half open: a key in the middle of two moments is that of one.
-        snapped = between & (nearest - at <= reach) & (nearest - at > -reach)
-        at = torch.where(snapped, nearest.to(at), at)
-        low, high = torch.where(snapped, nearest, low), torch.where(snapped, nearest, high)
-        quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[nearest], whole.local_quat_xyzw)
-        root = torch.where(snapped[:, None], canonical.root_position[nearest], whole.root_position)
-        shown = replace(whole, root_position=root, local_quat_xyzw=rotations.sign_continuous(quats))
-        columns = [torch.zeros(canonical.num_frames, dtype=torch.bool) if joint is None else lost.joints[:, joint]
-                   for joint in joint_of]  # fmt: skip
-        turns = torch.stack(columns, dim=1)
-        for joint, own in enumerate(joint_of):  # an End Site turns with its parent
-            if own is None:
-                turns[:, joint] = turns[:, CANONICAL.parents[joint]]
-        return _CanonicalGap(shown, turns[low] | turns[high], lost.root[low] | lost.root[high],
-                             at / float(canonical.fps))  # fmt: skip
-
-    def places_known(self) -> Bool[Tensor, "frames joints"]:
-        """A place is known if all that carries it is."""
-        known = [~self.root]
-        for parent in CANONICAL.parents[1:]:
-            known.append(known[parent] & ~self.turns[:, parent])
-        known[0] = ~(self.root | self.turns[:, 0])
-        return torch.stack(known, dim=1)
-
-    @property
-    def scale(self) -> float:
-        """How much longer the performer's legs are than the canonical ones."""
-        return leg_length(self.motion.skeleton) / leg_length(CANONICAL)
-
-
-def _proposed(gap: _CanonicalGap, infiller: Inbetweener) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+def _proposed(
+    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None
+) -> tuple[Motion, Float[Tensor, "frames 2"]]:
     """The infiller's motion on rigid bones, its seams closed, and the log odds of its contacts."""
     shown = gap.motion
     body = Motion(CANONICAL, shown.fps, shown.root_position / gap.scale, shown.local_quat_xyzw)
-    places = body.joint_positions()
+    places, known = body.joint_positions(), gap.places_known()
+    if targets is not None:
+        places = torch.where(targets.wanted[..., None], targets.places / gap.scale, places)
+        known = known | targets.wanted
     stands = contacts.planted(places[:, list(_TOES)], PRIOR_FPS).float()
     image = PositionImage.of_world(
         places.float()[None], heading(shown.local_quat_xyzw[:, 0]).float()[None], stands[None],
-        known=gap.places_known()[None], present=torch.ones(1, len(places), dtype=torch.bool), toes=_TOES,
+        known=known[None], present=torch.ones(1, len(places), dtype=torch.bool), toes=_TOES,
     )  # fmt: skip
     proposed = infiller.propose(image)
     wanted = image.to_world(proposed.places)[0].double()
@@ -172,8 +135,9 @@ def _proposed(gap: _CanonicalGap, infiller: Inbetweener) -> tuple[Motion, Float[
 
 
 def _stood(
-    proposal: Motion, bits: Tensor, gap: _CanonicalGap, settings: StandingSettings, densities: Sequence[Any]
-) -> tuple[Motion, Ledger]:
+    proposal: Motion, bits: Tensor, gap: CanonicalGap, settings: StandingSettings, densities: Sequence[Any],
+    targets: Targets | None,
+) -> tuple[Motion, Ledger]:  # fmt: skip
     """The proposal with its feet put down, gap by gap; and the ledger of these."""
     quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
     for _, start, stop in runs((gap.turns.any(dim=1) | gap.root)[:, None]):
@@ -185,20 +149,12 @@ def _stood(
             proposal.slice(first, last), seen=~gap.turns[part], seen_root=~gap.root[part],
             sigma=torch.zeros(CANONICAL.num_joints), sigma_root=0.0,
         )  # fmt: skip
-        stood = stand(proposal.slice(first, last), bits[part], capture, settings, densities=densities)
+        wanted = None if targets is None else Targets(targets.places[part], targets.wanted[part])
+        stood = stand(proposal.slice(first, last), bits[part], capture, settings, densities=densities, targets=wanted)
         quats[part] = torch.where(gap.turns[part, :, None], stood.motion.local_quat_xyzw, quats[part])
         root[part] = torch.where(gap.root[part, None], stood.motion.root_position, root[part])
         ledger = ledger.join(stood.ledger)
     return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
-
-
-def _nearest_known(at: Float[Tensor, " shown"], known: Bool[Tensor, " frames"]) -> Int[Tensor, " shown"]:
-    """For each moment, in frames, the nearest one that is known; RequestError if none is."""
-    frames = known.nonzero()[:, 0]
-    after = torch.searchsorted(frames.to(at), at).clamp(max=len(frames) - 1)
-    before = (after - 1).clamp_min(0)
-    nearer = (frames[before] - at).abs() <= (frames[after] - at).abs()
-    return torch.where(nearer, frames[before], frames[after])
 
 
 def _at_rate_of(canonical: Motion, proposal: Motion, seconds: Float[Tensor, " shown"]) -> Motion:
@@ -220,3 +176,17 @@ def _closed(filled: Motion, lost: Lost, original: Motion) -> Motion:
                      root_position=closed_places(filled.root_position, lost.root, fps=fps),
                      local_quat_xyzw=closed_rotations(filled.local_quat_xyzw, lost.joints, fps=fps))  # fmt: skip
     return put_back(closed, original, lost)
+
+
+def _on_target(
+    filled: Motion, targets: Targets, lost: Lost, original: Motion, rig: Rig | None
+) -> tuple[Motion, tuple[str, ...]]:
+    """With limbs that are at their places to the hair; and a word on those that do not reach."""
+    canonical, rigmap = to_canonical(filled, rig)
+    there = reached(canonical, targets, lost.frames)
+    away = missed(there, targets)
+    notes = ()
+    if float(away.max()) > _MISSED:
+        worst = int(away.argmax())
+        notes = (f"frame {worst}: a limb stays {100 * float(away.max()):.1f} cm from its place, out of reach",)
+    return put_back(from_canonical(there, rigmap, filled), original, lost), notes

@@ -19,13 +19,14 @@ from mapctl.capture.observed import last_seen, next_seen
 from mapctl.choosing import Choice, Stretch
 from mapctl.contacts import steadied
 from mapctl.features import Place, decode, root_places
+from mapctl.gaps.targets import Targets
 from mapctl.motion import Motion
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, minimise
 from mapctl.solver.objective import Objective
 from mapctl.solver.poses import Guide, Poses
 from mapctl.solver.result import Ledger
-from mapctl.terms import Footing, Likelihood, Noise, Term
+from mapctl.terms import Footing, Keyframe, Likelihood, Noise, Term
 from mapctl.terms.footing import TOES
 
 _DRIFT = 3.0  # frames, sigma, over which the travel of planted toes is averaged
@@ -80,9 +81,10 @@ class Stood:
 
 def stand(
     proposal: Motion, contacts: Float[Tensor, "frames 2"], capture: Capture, settings: StandingSettings, *,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Any] = (), targets: Targets | None = None,
 ) -> Stood:  # fmt: skip
-    """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was.
+    """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was. `targets` are
+    places that joints are wanted at.
 
     In each window that density counts under which the proposal is likeliest, and less where it is out of its depth.
     """
@@ -104,6 +106,8 @@ def stand(
             poses, done, choice = _judged(poses, done, judges)
             terms.append(Likelihood(settings.temperature / choice.weight))
             stretches.append(Stretch(first, first + count, choice.density.name, choice.nats, choice.weight))
+        if targets is not None:
+            terms.append(Keyframe(targets.places[first:stop], targets.wanted[first:stop]))
         features, used, entries, done = _window(poses, terms, count, settings, done, judges)
         pieces.append(features)
         spent, first, ledger = spent + used, first + count, ledger.join(entries)

@@ -161,6 +161,11 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
         root = term.root.clone()
         root[:, ::2] = rotate_ground(root[:, ::2], angle.expand(len(root))) + torch.tensor(shift).double()
         term = replace(term, root=root, heading=term.heading + turn)
+    if "places" in names:
+        places = term.places.clone()
+        turned = rotate_ground(places[..., ::2], angle.expand(places.shape[:-1]))
+        places[..., ::2] = turned + torch.tensor(shift).double()
+        term = replace(term, places=places)
     torch.testing.assert_close(term(there), TERMS[name](here), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(term.residual(there), TERMS[name].residual(here), rtol=1e-6, atol=1e-6)
 

@@ -20,6 +20,7 @@ from mapctl.commands.render import Render
 from mapctl.commands.run import RunScene
 from mapctl.commands.steer import Steer
 from mapctl.commands.train import Train
+from mapctl.commands.tween import Tween
 
 
 @runtime_checkable
@@ -40,6 +41,7 @@ COMMANDS: dict[str, type[Command]] = {
     "live": Live,
     "denoise": Denoise,
     "infill": Infill,
+    "tween": Tween,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

@@ -3,6 +3,7 @@
 from mapctl.terms.base import Term
 from mapctl.terms.closeness import Closeness
 from mapctl.terms.footing import Footing
+from mapctl.terms.keyframe import Keyframe
 from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.noise import Noise
 from mapctl.terms.observation import Observation
@@ -11,12 +12,13 @@ from mapctl.terms.seam import Seam
 from mapctl.terms.steps import Steps
 from mapctl.terms.travel import Travel
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe)
 
 __all__ = [
     "ALL",
     "Closeness",
     "Footing",
+    "Keyframe",
     "Likelihood",
     "Noise",
     "Observation",

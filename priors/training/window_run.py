@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from mapctl.errors import MapctlError, RequestError
 from priors import checkpoints
@@ -20,6 +20,7 @@ Progress = Callable[[str], None]
 """Called with one line of news."""
 
 
+@runtime_checkable
 class Config(Protocol):
     """Shape of a network."""
 
@@ -28,6 +29,7 @@ class Config(Protocol):
         ...
 
 
+@runtime_checkable
 class Settings(Protocol):
     """A recipe: a frozen dataclass with at least these fields."""
 
