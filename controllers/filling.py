@@ -13,7 +13,7 @@ from torch import Tensor
 
 from controllers.canonical_gap import CanonicalGap
 from controllers.standing import StandingSettings, stand
-from mapctl import contacts, inverse_kinematics, rotations
+from mapctl import contacts, gaussian, inverse_kinematics, rotations
 from mapctl.capture import Capture
 from mapctl.capture.bands import upsampled
 from mapctl.capture.faults import runs
@@ -34,6 +34,9 @@ from mapctl.terms.footing import TOES
 
 Method = Literal["infiller", "map", "linear"]
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
+_TREMBLE = 0.8  # frames at the prior's rate
+_SURE = 4.0  # log odds of contacts that are known
+_SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
 _MISSED = 0.001  # metres from a wanted place that are worth a word
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 
@@ -124,14 +127,30 @@ def _proposed(
         known=known[None], present=torch.ones(1, len(places), dtype=torch.bool), toes=_TOES,
     )  # fmt: skip
     proposed = infiller.propose(image)
-    wanted = image.to_world(proposed.places)[0].double()
+    wanted = image.to_world(_without_tremble(proposed.places, image))[0].double()
     root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
     quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root)
     quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
     quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
     root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
-    bits = torch.where(image.known[0][:, list(_TOES)], 8 * stands - 4, proposed.contacts[0])
-    return replace(shown, root_position=root, local_quat_xyzw=quats), bits
+    made = replace(shown, root_position=root, local_quat_xyzw=quats)
+    bits = torch.where(_toe_speeds(made) < _SWINGS * gap.scale, proposed.contacts[0], -_SURE)
+    return made, torch.where(image.known[0][:, list(_TOES)], _SURE * (2 * stands - 1), bits)
+
+
+def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
+    """A network's frames are each a little off on their own: what it changes is smoothed over about a frame. What it
+    leaves alone stays.
+    """
+    change = (places - image.places)[0].flatten(1)
+    smooth = gaussian.convolved(change, gaussian.kernel(_TREMBLE, 3), "repeated").unflatten(1, (-1, 3))
+    return torch.where(image.known[..., None], places, image.places + smooth)
+
+
+def _toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
+    """Over the ground, m/s."""
+    toes = motion.joint_positions()[:, list(_TOES)][..., ::2]
+    return torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)
 
 
 def _stood(
