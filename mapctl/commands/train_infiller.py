@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mapctl.commands.train import Train
     from priors.training.infiller_run import InfillerRequest
 
-_OF_OTHERS = ("density", "components", "labels", "init", "paper", "width")
+_OF_OTHERS = ("density", "components", "labels", "paper", "width")
 
 
 def run(given: "Train", say: Callable[[str], None]) -> Path:
@@ -36,5 +36,5 @@ def request(given: "Train") -> "InfillerRequest":
     return InfillerRequest(
         data=given.data, out=given.out, match=given.match or "", config=config, settings=settings,
         resume=given.resume, checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence,
-        skip_first=given.skip_first,
+        skip_first=given.skip_first, init=given.init,
     )  # fmt: skip

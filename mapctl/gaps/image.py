@@ -21,7 +21,7 @@ class PositionImage:
     """A batch of motions of one length, on canonical joints at the prior's rate. Joint 0 is the hips."""
 
     places: Float[Tensor, "batch frames joints 3"]
-    """Seen from the reference, metres; unknown ones straight between known ones, 0 for joints that are never known."""
+    """Seen from the reference, metres; unknown ones are a guess, as what slerp makes of the joints' rotations."""
     contacts: Float[Tensor, "batch frames 2"]
     """Left and right toe planted, 0 or 1; 0.5 where the toe is not known."""
     known: Bool[Tensor, "batch frames joints"]
@@ -39,7 +39,9 @@ class PositionImage:
         contacts: Float[Tensor, "batch frames 2"], *, known: Bool[Tensor, "batch frames joints"],
         present: Bool[Tensor, "batch frames"], toes: tuple[int, int],
     ) -> "PositionImage":  # fmt: skip
-        """From world positions (metres) and the hips' heading (radians); what is not known may hold anything finite."""
+        """From world positions (metres), guesses where they are not known, and the hips' heading (radians), which may
+        be anything finite there.
+        """
         known = known & present[..., None]
         rooted = known[..., 0]
         ground = filled(places_world[..., 0, ::2], rooted)
@@ -47,9 +49,8 @@ class PositionImage:
         held = torch.take_along_dim(heading, last_seen(rooted), dim=1)
         facing = filled(rotations.unwrap_angle(held)[..., None], rooted)[..., 0]
         bits = torch.where(known[..., list(toes)], contacts, 0.5)
-        empty = torch.zeros_like(places_world)
-        image = PositionImage(empty, bits, known, present, ground, facing)
-        return replace(image, places=_between(image.from_world(places_world), known))
+        image = PositionImage(places_world, bits, known, present, ground, facing)
+        return replace(image, places=image.from_world(places_world))
 
     def from_world(self, places_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
         """World positions seen from the reference."""
@@ -75,14 +76,6 @@ class Proposed:
     """Of all joints, seen from the image's reference, metres. Bones may have changed their lengths a little."""
     contacts: Float[Tensor, "batch frames 2"]
     """Log odds that the left and the right toe are planted."""
-
-
-def _between(places: Float[Tensor, "batch frames joints 3"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
-    """Unknown ones straight between known ones of the same joint."""
-    batch = len(places)
-    rows, seen = places.transpose(1, 2).flatten(0, 1), known.transpose(1, 2).flatten(0, 1)
-    between = filled(rows, seen) * seen.any(dim=1)[:, None, None]
-    return between.unflatten(0, (batch, -1)).transpose(1, 2)
 
 
 def _with_ground(places: Float[Tensor, "batch frames joints 3"], ground: Float[Tensor, "batch frames joints 2"]):

@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.features import LAYOUT, Place, root_places
+from mapctl.capture.observed import filled, last_seen, next_seen
+from mapctl.features import LAYOUT, Place, local_rotations, root_places
 from mapctl.gaps import PositionImage
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus, folder_of_clips
@@ -22,6 +23,8 @@ class Window:
 
     places: Float[Tensor, "batch frames joints 3"]
     """World, metres, on canonical bones."""
+    quats: Float[Tensor, "batch frames joints 4"]
+    """Local rotations, xyzw."""
     heading: Float[Tensor, "batch frames"]
     """Of the hips, radians."""
     contacts: Float[Tensor, "batch frames 2"]
@@ -30,9 +33,30 @@ class Window:
     """Whether there is such a frame; the clip may be shorter."""
 
     def image(self, known: Bool[Tensor, "batch frames joints"]) -> PositionImage:
-        """With gaps."""
-        return PositionImage.of_world(self.places, self.heading, self.contacts, known=known, present=self.present,
+        """With gaps, in which the guess is slerp's."""
+        known = known & self.present[..., None]
+        places = torch.where(known[..., None], self.places, self._slerped(known))
+        return PositionImage.of_world(places, self.heading, self.contacts, known=known, present=self.present,
                                       toes=_TOES)  # fmt: skip
+
+    def _slerped(self, known: Bool[Tensor, "batch frames joints"]) -> Float[Tensor, "batch frames joints 3"]:
+        """Where joints are if rotations that they no longer show go the short way between those that they do."""
+        shown = known.clone()
+        for joint, parent in enumerate(CANONICAL.parents):
+            if parent >= 0:
+                shown[..., parent] &= known[..., joint]
+        batch, frames, joints = shown.shape
+        columns = shown.transpose(1, 2).flatten(0, 1)
+        before, after = last_seen(columns), next_seen(columns)
+        weight = (torch.arange(frames) - before).to(self.places) / (after - before).clamp_min(1)
+        quats = self.quats.transpose(1, 2).flatten(0, 1)
+        lost = ~columns
+        row, frame = lost.nonzero(as_tuple=True)
+        between = rotations.slerp(quats[row, before[lost]], quats[row, after[lost]], weight[row, frame].clamp(0, 1))
+        quats = quats.index_put((row, frame), between)
+        turns = rotations.to_matrix(quats.unflatten(0, (batch, joints)).transpose(1, 2))
+        root = filled(self.places[:, :, 0], known[..., 0])
+        return kinematics.positions_from_matrices(CANONICAL, turns) + root[:, :, None]
 
 
 class PositionWindows:
@@ -49,6 +73,7 @@ class PositionWindows:
         self.heading = torch.cat([heading for _, heading in roots])
         self.contacts = LAYOUT.pick(corpus.features, "contacts")
         self.local = torch.cat([local_places(part) for part in corpus.features.split(_AT_ONCE)])
+        self.quats = torch.cat([tilted_rotations(part) for part in corpus.features.split(_AT_ONCE)])
         folder = folder_of_clips(corpus)
         share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, self.lengths.float())
         self.chances = self.lengths / share[folder] ** evenness
@@ -83,7 +108,11 @@ class PositionWindows:
         heading, ground = heading * side, ground * flip[..., ::2]
         turned = rotations.rotate_ground(local[..., ::2], heading[..., None]) + ground[:, :, None]
         places = torch.stack([turned[..., 0], local[..., 1], turned[..., 1]], dim=-1)
-        return Window(places, heading, contacts, present)
+        quats = self.quats[index]
+        over = quats[:, :, self.partners] * quats.new_tensor([1.0, -1.0, -1.0, 1.0])
+        quats = torch.where(mirrored[:, None, None, None], over, quats)
+        quats[:, :, 0] = rotations.multiply(rotations.about_y(heading), quats[:, :, 0])
+        return Window(places, quats, heading, contacts, present)
 
 
 def local_places(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 3"]:
@@ -94,3 +123,8 @@ def local_places(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frame
     height = LAYOUT.pick(features, "root_height")
     up = torch.stack([torch.zeros_like(height), height, torch.zeros_like(height)], dim=-1)
     return kinematics.positions_from_matrices(CANONICAL, turns) + up
+
+
+def tilted_rotations(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 4"]:
+    """Local rotations (xyzw), the hips' without their heading."""
+    return local_rotations(features, torch.zeros(len(features)))

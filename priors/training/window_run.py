@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors import checkpoints
 from priors.training import corpus as corpora
 from priors.training import run_files
@@ -74,6 +74,8 @@ class WindowRequest(Generic[C, S]):
     """Of the weights, for the card."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    init: str | None = None
+    """Begin with the weights of this model, bundled or trained."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,17 @@ class _Run(Generic[C, S]):
             progress(f"resumed at step {self.trainer.step}")
         else:
             request.out.mkdir(parents=True, exist_ok=True)
+            if request.init is not None:
+                self._begin_with(request.init)
+
+    def _begin_with(self, name: str) -> None:
+        """Another model's weights; CheckpointError if they are not of this network."""
+        tensors, card = checkpoints.load(checkpoints.locate(name))
+        if card.kind != self.kind.name or card.config != self.request.config.as_card():
+            raise CheckpointError(
+                f"{name} is a {card.kind} of {card.config}, not a {self.kind.name} of the one asked for"
+            )
+        self.trainer.network.load_state_dict(tensors)
 
     def go(self) -> None:
         """To the end of the recipe."""
@@ -179,7 +192,8 @@ class _Run(Generic[C, S]):
     def _recipe(self) -> dict[str, dict]:
         """What must not change between a run's parts, as JSON gives it back."""
         settings = json.loads(json.dumps(_fields(self.request.settings)))
-        return {"settings": settings, "network": self.request.config.as_card(), "data": self.data}
+        return {"settings": settings, "network": self.request.config.as_card(), "data": self.data,
+                "init": {"name": self.request.init}}  # fmt: skip
 
 
 def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
@@ -191,6 +205,7 @@ def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
     for name in ("steps", "batch", "window", "learning_rate", "seed"):
         if given[name] != usual[name]:
             parts.append(f"--{name.replace('_', '-')} {given[name]:g}")
+    parts += [f"--init {request.init}"] if request.init is not None else []
     return " ".join(parts + ["--bfloat16"] * given["bfloat16"])
 
 
