@@ -49,8 +49,8 @@ def unwrap_angle(angle: Float[Tensor, "*batch frames"]) -> Float[Tensor, "*batch
     return torch.cat([angle[..., :1], angle[..., :1] + torch.cumsum(steps, dim=-1)], dim=-1)
 
 
-def rotate_ground(vector_xz: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
-    """Ground-plane (x, z) vectors turned by `angle` radians about +Y."""
+def rotate_ground(vector_xz: Float[Tensor, "*#batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 2"]:
+    """Ground-plane (x, z) vectors turned by `angle` radians about +Y; one angle may turn several vectors."""
     x, z = vector_xz.unbind(-1)
     sine, cosine = torch.sin(angle), torch.cos(angle)
     return torch.stack([cosine * x + sine * z, cosine * z - sine * x], dim=-1)

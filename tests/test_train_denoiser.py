@@ -1,174 +1,39 @@
-"""`mapctl train denoiser` on five synthetic clips, and the steps it is made of."""
+"""What `mapctl train denoiser` is made of; its runs are tested in test_window_run."""
 
-import json
 import math
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
-from helpers import corpus, generator, killing
+from helpers import corpus, generator
 
-import priors
 from mapctl import cli
 from mapctl.capture import Capture
 from mapctl.commands import train_denoiser
 from mapctl.commands.train import Train
-from mapctl.errors import CheckpointError, MapctlError, RequestError
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.denoiser import DenoiserConfig
 from priors.training.corpus import Corpus
 from priors.training.corruption import CorruptionSettings, clean_capture
 from priors.training.denoiser import DenoiserSettings, DenoiserTrainer, Windows, joint_positions, losses, validate
-from priors.training.denoiser_run import DenoiserRequest, command, train
+from priors.training.denoiser_run import DenoiserRequest, train
 
 TINY = DenoiserConfig(width=8, dilations=(1, 2))
 SETTINGS = DenoiserSettings(steps=6, batch=3, window=16)
 
 
-@pytest.fixture
-def request_in(data):
-    """Checkpoints in every step, so that a kill can come anywhere."""
-
-    def made(out, **changes):
-        settings = replace(SETTINGS, **changes.pop("settings", {}))
-        given = {"checkpoint_minutes": 0.0, "report_steps": 2, "validate_steps": 4, "config": TINY} | changes
-        return DenoiserRequest(data, out, settings=settings, **given)
-
-    return made
-
-
-def killed_in(request, number):
-    """Runs until a step is begun."""
-    with killing(DenoiserTrainer, "train_step", number, counter="step"):
+def test_clips_shorter_than_the_window_are_left_out(tmp_path, data):
+    request = DenoiserRequest(data, tmp_path / "run", config=TINY, settings=replace(SETTINGS, window=90))
+    with pytest.raises(RequestError, match="no clip is as long as the window"):
         train(request)
 
 
-def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, request_in):
-    whole = train(request_in(tmp_path / "whole"))
-    killed_in(request_in(tmp_path / "parts"), 3)
-    killed_in(request_in(tmp_path / "parts", resume=True), 4)
-    news = []
-    parts = train(request_in(tmp_path / "parts", resume=True), news.append)
-    assert "resumed at step 4" in news
-    for name in (whole.name, "model.json", "step-6-checkpoint.safetensors", "checkpoint.json"):
-        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
-    assert parts == tmp_path / "parts" / "model.safetensors"
-
-
-def test_a_finished_run_loads_with_a_complete_card(tmp_path, request_in):
-    news, out = [], tmp_path / "run"
-    train(request_in(out, licence="CC0"), news.append)
-    found = priors.load_denoiser(str(out))
-    card = found.card
-    assert (card.kind, card.licence, found.network.config) == ("denoiser", "CC0", TINY)
-    assert (card.data["clips"], card.data["frames"]) == ("5", "400")
-    assert card.training["settings"] == json.loads(json.dumps(asdict(SETTINGS)))
-    assert [row["step"] for row in card.training["curve"]] == [4, 6]
-    assert all(math.isfinite(value) for value in card.quality["test"].values())
-    assert set(card.data["held_out"]) == {"validation", "test"}
-    assert [line.split(":")[0] for line in news if line.startswith("step")] == ["step 2", "step 4", "step 6"]
-
-
-def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, request_in):
-    out = tmp_path / "run"
-    with pytest.raises(CheckpointError, match="no checkpoint to resume"):
-        train(request_in(out, resume=True))
-    killed_in(request_in(out), 2)
-    with pytest.raises(RequestError, match="already holds a run; pass --resume"):
-        train(request_in(out))
-    with pytest.raises(CheckpointError, match=r"other settings \(feet: 0\.5 then, 3\.0 now\)"):
-        train(request_in(out, resume=True, settings={"feet": 3.0}))
-    with pytest.raises(CheckpointError, match=r"other network \(width: 8 then, 7 now\)"):
-        train(request_in(out, resume=True, config=replace(TINY, width=7)))
-    with pytest.raises(CheckpointError, match="other data"):
-        train(request_in(out, resume=True, match="walk-[0-3]"))
-
-
-def test_what_cannot_be_trained_on_is_refused(tmp_path, request_in):
-    with pytest.raises(RequestError, match="not a folder of BVH"):
-        train(replace(request_in(tmp_path / "run"), data=tmp_path / "nowhere"))
-    with pytest.raises(RequestError, match=r"no .bvh below .* matches 'dance'"):
-        train(request_in(tmp_path / "run", match="dance"))
-    with pytest.raises(RequestError, match="no clip is as long as the window"):
-        train(request_in(tmp_path / "run", settings={"window": 90}))
-    with pytest.raises(RequestError, match="window must be at least 16"):
-        DenoiserSettings(window=15)
-    assert not (tmp_path / "run" / "checkpoint.json").exists()
-
-
-def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, request_in, monkeypatch):
-    step = DenoiserTrainer.train_step
-    monkeypatch.setattr(DenoiserTrainer, "train_step",
-                        lambda trainer: step(trainer) | ({"loss": math.nan} if trainer.step == 3 else {}))  # fmt: skip
-    with pytest.raises(MapctlError, match="diverged at step 3"):
-        train(request_in(tmp_path / "run"))
-    assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 2
-    assert not (tmp_path / "run" / "model.safetensors").exists()
-
-
-def requested(*words):
-    given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", *words])
+def test_a_width_of_nothing_is_refused():
+    given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", "--width", "0"])
     assert isinstance(given, Train)
-    return train_denoiser.request(given)
-
-
-def test_every_option_reaches_the_trainer():
-    given = requested()
-    assert (given.config, given.settings, given.match, given.resume) == (
-        DenoiserConfig(),
-        DenoiserSettings(),
-        "",
-        False,
-    )
-    assert (given.data, given.out) == (Path("data"), Path("run"))
-    given = requested("--match", "walk", "--steps", "7", "--batch", "6", "--window", "20", "--seed", "0",
-                      "--learning-rate", "0.01", "--width", "12", "--bfloat16", "--resume", "--licence", "CC0",
-                      "--skip-first", "--minutes-between-checkpoints", "0.5")  # fmt: skip
-    assert (given.match, given.resume, given.licence, given.skip_first) == ("walk", True, "CC0", True)
-    assert (given.checkpoint_minutes, given.config) == (0.5, DenoiserConfig(width=12))
-    assert given.settings == replace(DenoiserSettings(), steps=7, batch=6, window=20, seed=0, learning_rate=0.01,
-                                     bfloat16=True)  # fmt: skip
-
-
-@pytest.mark.parametrize("words", [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"],
-                                   ["--init", "locomotion"], ["--paper"]], ids=lambda words: words[0])  # fmt: skip
-def test_options_of_other_models_are_refused(words):
-    with pytest.raises(RequestError, match=f"{words[0]} is for other models"):
-        requested(*words)
-
-
-@pytest.mark.parametrize(("words", "message"), [
-    (["--steps", "0"], "--steps must be at least 1, got 0"), (["--batch", "-2"], "--batch must be at least 1"),
-    (["--window", "0"], "--window must be at least 1"), (["--window", "8"], "window must be at least 16"),
-    (["--width", "0"], "--width must be at least 1"), (["--seed", "-1"], "seed"),
-    (["--learning-rate", "2"], "learning rate"), (["--learning-rate", "0"], "learning rate"),
-    (["--minutes-between-checkpoints", "0"], "minutes between"), (["--device", "cuda"], "leave --device out"),
-], ids=lambda value: value[0] if isinstance(value, list) else "")  # fmt: skip
-def test_numbers_that_make_no_sense_are_refused(words, message):
-    with pytest.raises(RequestError, match=message):
-        requested(*words)
-
-
-def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data):
-    settings = replace(DenoiserSettings(), steps=7, bfloat16=True, seed=3, learning_rate=2e-4)
-    wanted = DenoiserRequest(data, tmp_path, match="walk-[01]", config=DenoiserConfig(width=12), settings=settings,
-                             skip_first=True)  # fmt: skip
-    words = command(wanted).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path)).split()
-    given = cli.parse(words[1:])
-    assert isinstance(given, Train)
-    assert train_denoiser.request(given) == wanted
-
-
-def test_the_command_line_trains_what_denoise_can_load(tmp_path, data, capsys):
-    words = ["train", "denoiser", "--data", data, "-o", tmp_path / "run", "--steps", 2, "--batch", 2, "--window", 16,
-             "--width", 8]  # fmt: skip
-    assert cli.main([str(word) for word in words]) == 0
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert told.out.endswith(f"wrote {tmp_path / 'run' / 'model.safetensors'}; use it with --denoiser"
-                             f" {tmp_path / 'run'}\n")  # fmt: skip
-    assert priors.load_denoiser(str(tmp_path / "run")).network.config.width == 8
+    with pytest.raises(RequestError, match="--width must be at least 1"):
+        train_denoiser.request(given)
 
 
 def test_windows_are_clips_mirrored_half_of_the_time():

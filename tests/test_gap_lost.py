@@ -1,0 +1,137 @@
+"""What a motion lacks, and straight lines across it."""
+
+import pytest
+import torch
+from captures import apart_deg, on_rig
+from scipy.spatial.transform import Rotation, Slerp
+
+from mapctl import retarget
+from mapctl.capture.masks import ALL, ROOT, Mask
+from mapctl.errors import RequestError
+from mapctl.gaps.lost import Lost, put_back, straight
+
+RIGS = ("canonical", "bandai", "daz")
+
+
+def lost_of(motion, *masks):
+    return Lost.of_masks(motion, masks, retarget.to_canonical(motion)[1])
+
+
+def interpolated(quats, start, stop):
+    """Between the frames beside a gap, by scipy; (gap, joints, 4)."""
+    between = [Slerp([start - 1, stop], Rotation.from_quat(quats[[start - 1, stop], joint].numpy()))
+               (range(start, stop)).as_quat() for joint in range(quats.shape[1])]  # fmt: skip
+    return torch.stack([torch.from_numpy(quat) for quat in between], dim=1)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize(("start", "stop"), [(20, 40), (20, 21), (1, 49)])
+def test_a_gap_is_crossed_by_slerp_and_straight_lines(rig, start, stop):
+    motion = on_rig(rig, 50)
+    made = straight(motion, lost_of(motion, Mask(ALL, start, stop)))
+    wanted = interpolated(motion.local_quat_xyzw, start, stop)
+    assert apart_deg(made.local_quat_xyzw[start:stop], wanted).max() < 1e-5
+    pairs = [(made.root_position, motion.root_position)]
+    pairs += [(made.moving_offsets[joint], values) for joint, values in motion.moving_offsets.items()]
+    weight = (torch.arange(start, stop).double() - (start - 1))[:, None] / (stop - start + 1)
+    for found, given in pairs:
+        line = (1 - weight) * given[start - 1] + weight * given[stop]
+        assert torch.allclose(found[start:stop], line, atol=1e-12)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_beyond_the_first_and_last_known_frame_it_holds(rig):
+    motion = on_rig(rig, 50)
+    made = straight(motion, lost_of(motion, Mask(ALL, 0, 10), Mask(ALL, 40, 50)))
+    for part, edge in ((slice(0, 10), 10), (slice(40, 50), 39)):
+        assert apart_deg(made.local_quat_xyzw[part], motion.local_quat_xyzw[edge].expand(10, -1, 4)).max() < 1e-5
+        assert torch.allclose(made.joint_positions()[part], motion.joint_positions()[edge].expand(10, -1, 3))
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_what_is_known_stays_to_the_bit(rig):
+    motion = on_rig(rig, 50)
+    lost = lost_of(motion, Mask(ALL, 12, 20), Mask(motion.skeleton.names[5], 30, 40))
+    for made in (straight(motion, lost), put_back(on_rig(rig, 50, seed=3), motion, lost)):
+        assert torch.equal(made.local_quat_xyzw[~lost.joints], motion.local_quat_xyzw[~lost.joints])
+        assert torch.equal(made.root_position[~lost.root], motion.root_position[~lost.root])
+        for joint, values in motion.moving_offsets.items():
+            assert torch.equal(made.moving_offsets[joint][~lost.root], values[~lost.root])
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_put_back_takes_what_is_lost_from_the_other_motion(rig):
+    motion, other = on_rig(rig, 50), on_rig(rig, 50, seed=3)
+    lost = lost_of(motion, Mask(ALL, 12, 20))
+    whole = put_back(other, motion, lost)
+    assert torch.equal(whole.local_quat_xyzw[12:20], other.local_quat_xyzw[12:20])
+    assert torch.equal(whole.joint_positions()[12:20], other.joint_positions()[12:20])
+    assert whole.source is motion.source
+
+
+def test_what_stands_in_the_gap_does_not_matter():
+    motion, other = on_rig("bandai", 50), on_rig("bandai", 50, seed=3)
+    lost = lost_of(motion, Mask(ALL, 12, 20), Mask("Hand_L", 0, 50))
+    first, second = straight(motion, lost), straight(put_back(other, motion, lost), lost)
+    assert torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
+    assert torch.equal(first.joint_positions(), second.joint_positions())
+
+
+def names_of(motion, lost):
+    """Of joints that are lost in any frame."""
+    return {name for name, gone in zip(motion.skeleton.names, lost.joints.any(dim=0).tolist(), strict=True) if gone}
+
+
+@pytest.mark.parametrize(("joint", "taken"), [
+    ("leftHand", {"leftHand", "leftLowerArm"}), ("leftLowerArm", {"leftLowerArm", "leftUpperArm"}),
+    ("leftUpperArm", {"leftUpperArm", "leftShoulder"}), ("rightToes", {"rightToes", "rightFoot"}),
+    ("head", {"head", "neck"}),
+    # A shoulder's place is the chest's doing, which the neck and the other shoulder show.
+    ("leftShoulder", {"leftShoulder"}), ("leftUpperLeg", {"leftUpperLeg"}), ("hips", {"hips"}),
+])  # fmt: skip
+def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
+    motion = on_rig("canonical", 30)
+    lost = lost_of(motion, Mask(joint, 5, 9))
+    assert names_of(motion, lost) == taken
+    assert lost.joints[5:9].sum() == 4 * len(taken)
+    assert lost.frames.nonzero()[:, 0].tolist() == [5, 6, 7, 8]
+    assert not lost.root.any()
+
+
+@pytest.mark.parametrize(("rig", "joint", "taken"), [("bandai", "Hand_L", {"Hand_L", "LowerArm_L"}),
+                                                     ("daz", "lHand", {"lHand", "lForeArm"}),
+                                                     ("daz", "lThumb1", {"lThumb1"})])  # fmt: skip
+def test_on_other_rigs_too(rig, joint, taken):
+    motion = on_rig(rig, 30)
+    assert names_of(motion, lost_of(motion, Mask(joint, 5, 9))) == taken
+
+
+def test_the_place_of_the_root_can_be_lost_alone():
+    motion = on_rig("bandai", 30)
+    lost = lost_of(motion, Mask(ROOT, 5, 9))
+    assert not lost.joints.any()
+    assert lost.root.nonzero()[:, 0].tolist() == [5, 6, 7, 8]
+    part = lost.slice(8, 12)
+    assert part.frames.tolist() == [True, False, False, False]
+
+
+def test_joints_that_are_never_known_rest():
+    motion = on_rig("canonical", 30)
+    lost = lost_of(motion, Mask("leftHand", 0, 30))
+    made = straight(motion, lost)
+    rest = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    for name in ("leftHand", "leftLowerArm"):
+        assert torch.equal(made.local_quat_xyzw[:, motion.skeleton.index(name)], rest.expand(30, 4))
+
+
+@pytest.mark.parametrize(("masks", "message"), [
+    ([Mask("leftHnad", 5, 9)], "no joint 'leftHnad'.* the nearest is leftHand"),
+    ([Mask("Lefthand", 5, 9)], "the nearest is leftHand"),
+    ([Mask(ALL, 5, 31)], "the gap 5:31 ends after the motion's 30 frames"),
+    ([Mask(ALL, 0, 30)], "leave nothing of the motion's 30 frames"),
+    ([Mask(ALL, 0, 15), Mask(ALL, 15, 30)], "leave nothing"),
+    ([Mask(ROOT, 0, 30)], "leave nothing"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(masks, message):
+    with pytest.raises(RequestError, match=message):
+        lost_of(on_rig("canonical", 30), *masks)

@@ -1,0 +1,214 @@
+"""Filling gaps on any rig: what is known stays, what stood in a gap does not matter, a true proposal is met."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from captures import error_cm, on_rig
+from helpers import random_motion, tiny_density
+from tiny_infiller import tiny_infiller
+
+from controllers.infill import InfillSettings, infill
+from mapctl import retarget
+from mapctl.capture.masks import ALL, ROOT, Mask
+from mapctl.errors import RequestError
+from mapctl.gaps import PositionImage, Proposed
+from mapctl.gaps.lost import Lost, put_back, straight
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, leg_length
+
+RIGS = ("canonical", "bandai", "daz")
+CASES = [*((rig, 30) for rig in RIGS), ("daz", 120)]
+
+
+def filled(motion, *masks, method="infiller", drawn=0.2, infiller=None, **options):
+    network = infiller if infiller is not None else tiny_infiller(drawn=drawn)
+    return infill(motion, network, masks, settings=InfillSettings(method=method), **options)
+
+
+def seconds(motion, *edges):
+    """A mask of everything between two times."""
+    return Mask(ALL, *(round(edge * float(motion.fps)) for edge in edges))
+
+
+def lost_of(motion, masks):
+    return Lost.of_masks(motion, masks, retarget.to_canonical(motion)[1])
+
+
+def assert_known_stays(motion, made, masks):
+    lost = lost_of(motion, masks)
+    assert (made.num_frames, made.fps, made.skeleton) == (motion.num_frames, motion.fps, motion.skeleton)
+    assert torch.equal(made.local_quat_xyzw[~lost.joints], motion.local_quat_xyzw[~lost.joints])
+    assert torch.equal(made.root_position[~lost.root], motion.root_position[~lost.root])
+    assert made.moving_offsets.keys() == motion.moving_offsets.keys()
+    for joint, values in motion.moving_offsets.items():
+        assert torch.equal(made.moving_offsets[joint][~lost.root], values[~lost.root])
+    assert made.joint_positions().isfinite().all()
+
+
+def same(first, second):
+    quats = torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
+    return quats and torch.equal(first.joint_positions(), second.joint_positions())
+
+
+@pytest.mark.parametrize(("rig", "fps"), CASES)
+@pytest.mark.parametrize("method", ["infiller", "linear"])
+def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, fps, method):
+    motion = on_rig(rig, 2 * fps, fps=fps)
+    mask = seconds(motion, 0.7, 1.2)
+    made = filled(motion, mask, method=method).motion
+    assert_known_stays(motion, made, [mask])
+    gap = slice(mask.start, mask.stop)
+    assert (made.joint_positions()[gap] - motion.joint_positions()[gap]).norm(dim=-1).mean() > 0.002
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_the_map_stage_keeps_what_is_known_too(rig):
+    motion = on_rig(rig, 50)
+    mask = Mask(ALL, 20, 32)
+    done = filled(motion, mask, method="map")
+    assert_known_stays(motion, done.motion, [mask])
+    assert "footing" in done.ledger.summary()
+
+
+@pytest.mark.parametrize(("rig", "method"), [*((rig, "infiller") for rig in RIGS), ("daz", "map"), ("daz", "linear")])
+def test_what_stands_in_the_gap_does_not_matter(rig, method):
+    motion = on_rig(rig, 45)
+    masks = [Mask(ALL, 15, 25), Mask(motion.skeleton.names[8], 30, 40)]
+    wild = random_motion(motion.skeleton, 45, seed=3)
+    wild = replace(wild, moving_offsets={joint: wild.root_position for joint in motion.moving_offsets})
+    spoilt = put_back(wild, motion, lost_of(motion, masks))
+    assert not same(spoilt, motion)
+    assert same(*(filled(given, *masks, method=method).motion for given in (motion, spoilt)))
+
+
+def test_linear_is_straight_lines_and_needs_no_network():
+    motion = on_rig("bandai", 45)
+    mask = Mask(ALL, 15, 25)
+    made = infill(motion, None, [mask], settings=InfillSettings(method="linear")).motion
+    assert same(made, straight(motion, lost_of(motion, [mask])))
+
+
+@pytest.mark.parametrize("method", ["infiller", "map"])
+def test_other_methods_need_one(method):
+    with pytest.raises(RequestError, match=f"method {method} needs an infiller"):
+        infill(on_rig("canonical", 30), None, [Mask(ALL, 5, 9)], settings=InfillSettings(method=method))
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Knows the motion."""
+
+    truth: Motion
+
+    def propose(self, image: PositionImage) -> Proposed:
+        """The true places."""
+        canonical = retarget.to_canonical(self.truth)[0].resample(30)
+        scale = leg_length(canonical.skeleton) / leg_length(CANONICAL)
+        body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
+        places = body.joint_positions().float()[None]
+        return Proposed(image.from_world(places), torch.zeros(1, places.shape[1], 2))
+
+
+@pytest.mark.parametrize(("rig", "fps"), CASES)
+def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
+    motion = on_rig(rig, 3 * fps, fps=fps)
+    masks = [seconds(motion, 0.8, 1.4), seconds(motion, 2.0, 2.03 + 1 / fps)]
+    made, lines = (filled(motion, *masks, method=method, infiller=Oracle(motion)).motion
+                   for method in ("infiller", "linear"))  # fmt: skip
+    assert error_cm(made, motion) < 0.15 * error_cm(lines, motion)
+    frames = lost_of(motion, masks).frames
+    off = (made.joint_positions() - motion.joint_positions())[frames].norm(dim=-1)
+    assert off.mean() < 0.01
+
+
+@pytest.mark.parametrize("rig", ["bandai", "daz"])
+def test_a_larger_performer_is_shown_as_one_of_the_networks_size(rig):
+    """What is proposed is scaled back: places by the legs, while rotations are the same."""
+    small = on_rig(rig, 60)
+    motion = replace(
+        small, skeleton=replace(small.skeleton, offsets=1.25 * small.skeleton.offsets),
+        root_position=1.25 * small.root_position,
+        moving_offsets={joint: 1.25 * values for joint, values in small.moving_offsets.items()},
+    )  # fmt: skip
+    made, unscaled = (filled(each, Mask(ALL, 20, 40), infiller=Oracle(small)).motion for each in (motion, small))
+    assert (made.joint_positions() - 1.25 * unscaled.joint_positions()).norm(dim=-1).max() < 0.005
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_lost_joints_are_filled_and_no_other(rig):
+    motion = on_rig(rig, 45)
+    hand = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}[rig]
+    for mask in (Mask(hand, 0, 45), Mask(hand, 10, 30)):
+        made = filled(motion, mask)
+        assert_known_stays(motion, made.motion, [mask])
+        assert made.notes == ()
+        moved = (made.motion.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1).any(dim=0)
+        assert 1 <= int(moved.sum()) <= 2
+
+
+def test_a_lost_arm_comes_back_from_its_true_places():
+    motion = on_rig("canonical", 60)
+    masks = [Mask(name, 20, 40) for name in ("leftHand", "leftLowerArm")]
+    made = filled(motion, *masks, infiller=Oracle(motion)).motion
+    assert (made.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.01
+
+
+def test_the_place_of_the_body_can_be_lost_alone():
+    motion = on_rig("bandai", 45)
+    made = filled(motion, Mask(ROOT, 15, 25))
+    assert_known_stays(motion, made.motion, [Mask(ROOT, 15, 25)])
+    (gap,) = made.summary()["gaps"]
+    assert gap == {"start": 15, "stop": 25, "joints": 0, "root": True}
+
+
+@pytest.mark.parametrize("method", ["infiller", "map"])
+def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
+    motion = on_rig("bandai", 50)
+    masks = [Mask(ALL, 0, 8), Mask(ALL, 42, 50)]
+    done = filled(motion, *masks, method=method)
+    assert_known_stays(motion, done.motion, masks)
+    assert [note.partition(":")[0] for note in done.notes] == ["a gap at the beginning", "a gap at the end"]
+
+
+@pytest.mark.parametrize("fps", [24, 30, 60, 120])
+@pytest.mark.parametrize("gap", [(0.5, 0.52), (0.0, 0.1), (0.9, 1.0)])
+def test_gaps_of_a_few_frames_anywhere_break_nothing(fps, gap):
+    motion = on_rig("canonical", fps, fps=fps)
+    start = min(fps - 1, round(gap[0] * fps))
+    mask = Mask(ALL, start, max(start + 1, round(gap[1] * fps)))
+    assert_known_stays(motion, filled(motion, mask, drawn=0.0).motion, [mask])
+
+
+@pytest.mark.parametrize(("frames", "method"), [(2, "infiller"), (3, "infiller"), (5, "linear"), (3, "map")])
+def test_motions_of_a_few_frames_break_nothing(frames, method):
+    motion = on_rig("canonical", frames)
+    for mask in (Mask(ALL, 0, 1), Mask(ALL, frames - 1, frames), Mask(ALL, 1, frames)):
+        assert_known_stays(motion, filled(motion, mask, method=method).motion, [mask])
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+def test_seams_do_not_leap(fps):
+    """Whatever is proposed: a frame differs from the next by no more than within the gap."""
+    motion = on_rig("bandai", 3 * fps, fps=fps)
+    mask = seconds(motion, 1.0, 2.0)
+    steps = torch.diff(filled(motion, mask).motion.joint_positions(), dim=0).norm(dim=-1).amax(dim=1)
+    edges = torch.stack([steps[mask.start - 1], steps[mask.stop - 1]])
+    assert edges.max() < 2 * max(float(steps[mask.start : mask.stop - 1].max()), float(steps[: mask.start - 1].max()))
+
+
+def test_a_density_joins_the_map_stage():
+    motion = on_rig("canonical", 45)
+    done = filled(motion, Mask(ALL, 15, 25), method="map", densities=[tiny_density()])
+    assert "likelihood" in done.ledger.summary()
+
+
+def test_the_summary_tells_gaps_and_cost():
+    motion = on_rig("canonical", 45)
+    done = filled(motion, Mask(ALL, 15, 25), Mask("leftHand", 30, 33), method="linear")
+    told = done.summary()
+    assert told["gaps"] == [{"start": 15, "stop": 25, "joints": 21, "root": True},
+                            {"start": 30, "stop": 33, "joints": 2, "root": False}]  # fmt: skip
+    assert (told["frames"], told["fps"], told["notes"]) == (45, 30.0, [])
+    assert told["seconds"] == done.seconds > 0
+    assert told["frame_ms"] == pytest.approx(1000 * done.seconds / 13)

@@ -1,0 +1,225 @@
+"""`mapctl infill` as a user types it: files, gaps, reports, and what is refused."""
+
+import json
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from captures import on_rig
+from helpers import run, walk
+from tiny_denoiser import save_tiny_denoiser
+from tiny_infiller import save_tiny_infiller
+from tiny_prior import save_tiny_prior
+
+import mapctl
+
+NAMES = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.2)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Files of walks by rig and rate, 1.5 seconds each."""
+    folder, made = tmp_path_factory.mktemp("recording"), {}
+
+    def of(rig="bandai", fps=30):
+        if (rig, fps) not in made:
+            made[rig, fps] = folder / f"{rig}-{fps}.bvh"
+            on_rig(rig, round(1.5 * fps), fps=fps).save(made[rig, fps])
+        return made[rig, fps]
+
+    return of
+
+
+@pytest.fixture
+def infill(tiny):
+    """Runs the command; returns the exit status."""
+    return lambda *words: run("infill", *words, "--infiller", tiny)
+
+
+def rows(path):
+    """The lines of the frames, as text."""
+    return path.read_text().split("Frame Time")[1].splitlines()[1:]
+
+
+def spoilt(source, out, *gaps):
+    """The file with nonsense in the gaps."""
+    lines, draw = source.read_text().splitlines(), np.random.default_rng(0)
+    first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+    for start, stop in gaps:
+        for frame in range(first + start, first + stop):
+            lines[frame] = " ".join(f"{value:.3f}" for value in draw.uniform(-170, 170, len(lines[frame].split())))
+    out.write_text("\n".join(lines) + "\n")
+    return out
+
+
+@pytest.mark.parametrize(("rig", "fps", "method"), [
+    ("bandai", 30, "infiller"), ("bandai", 120, "infiller"), ("canonical", 30, "infiller"), ("daz", 120, "infiller"),
+    ("daz", 30, "linear"), ("bandai", 30, "map"),
+])  # fmt: skip
+def test_outside_the_gap_every_channel_is_as_it_was(recording, tmp_path, rig, fps, method):
+    """In the text of the file, where the gap is filled with something as sane as straight lines."""
+    source, out, plain = recording(rig, fps), tmp_path / "out.bvh", save_tiny_infiller(tmp_path / "plain.safetensors")
+    words = ["--gap", f"{fps // 2}:{fps}", "--method", method, "--infiller", plain, "--quiet"]
+    assert run("infill", source, "-o", out, *words) == 0
+    before, after = rows(source), rows(out)
+    same = [one == other for one, other in zip(before, after, strict=True)]
+    assert same == [not fps // 2 <= frame < fps for frame in range(len(before))]
+
+
+@pytest.mark.parametrize("rig", sorted(NAMES))
+def test_after_a_gap_that_turns_about_the_same_rotations_are_written(infill, recording, tmp_path, rig):
+    """By angles that go on from those in the gap: whole turns and Euler twins may differ, nothing else does."""
+    source, out = recording(rig), tmp_path / "out.bvh"
+    assert infill(source, "-o", out, "--gap", "15:30", "--method", "infiller", "--quiet") == 0
+    assert rows(source)[:15] == rows(out)[:15]
+    before, after = (mapctl.load(path).joint_positions()[30:] for path in (source, out))
+    assert (before - after).abs().max() < 1e-7
+
+
+@pytest.mark.parametrize(("rig", "method"), [("bandai", "map"), ("bandai", "linear"), ("daz", "infiller")])
+def test_what_stands_in_the_gap_does_not_matter(infill, recording, tmp_path, rig, method):
+    found, gaps = set(), ((10, 15), (22, 30))
+    wild = spoilt(recording(rig), tmp_path / "wild.bvh", *gaps)
+    words = [word for gap in gaps for word in ("--gap", "{}:{}".format(*gap))]
+    for source in (recording(rig), wild):
+        assert infill(source, "-o", tmp_path / "out.bvh", *words, "--method", method, "--quiet") == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+
+
+def test_the_same_bytes_come_twice_and_quiet_says_nothing(infill, recording, tmp_path, capsys):
+    found = set()
+    for _ in range(2):
+        assert infill(recording(), "-o", tmp_path / "out.bvh", "--gap", "20:30", "--quiet") == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_several_gaps_in_frames_and_seconds_are_told(infill, recording, tmp_path, capsys):
+    out = tmp_path / "out.npz"
+    assert infill(recording(), "-o", out, "--gap", "1s:1.2s", "--gap", "10:15", "--method", "infiller") == 0
+    told = capsys.readouterr()
+    assert f"{out}: 45 frames at 30 a second; filled 10:15 (22 joints), 30:36 (22 joints);" in told.out
+    assert told.err == ""
+    assert mapctl.load(out).num_frames == 45
+
+
+@pytest.mark.parametrize("rig", sorted(NAMES))
+@pytest.mark.parametrize("gap", [(), ("--gap", "20:30")])
+def test_lost_joints_with_and_without_gaps(infill, recording, tmp_path, rig, gap):
+    source, out, report = recording(rig), tmp_path / "out.bvh", tmp_path / "r.json"
+    words = ["--joints", NAMES[rig], *gap, "--method", "infiller", "--report", report, "--quiet"]
+    assert infill(source, "-o", out, *words) == 0
+    (found,) = json.loads(report.read_text())["gaps"]
+    assert (found["start"], found["stop"]) == ((20, 30) if gap else (0, 45))
+    assert (found["joints"], found["root"]) == (2, False)
+    before, after = (np.array([row.split() for row in rows(path)], dtype=float) for path in (source, out))
+    changed = (before != after).any(axis=0).sum()
+    assert 1 <= changed <= 6  # of the hand and the lower arm
+    if gap:
+        assert (before == after).all(axis=1).sum() == 35
+
+
+def test_gaps_at_the_ends_are_said(infill, recording, tmp_path, capsys):
+    words = ["--gap", "0:5", "--gap", "40:45", "--method", "infiller"]
+    assert infill(recording(), "-o", tmp_path / "out.bvh", *words) == 0
+    told = capsys.readouterr().out
+    assert "a gap at the beginning: the motion is extended backwards" in told
+    assert "a gap at the end: the motion is extended" in told
+
+
+def test_a_report_tells_the_request_and_what_was_done(infill, recording, tmp_path):
+    report = tmp_path / "r.json"
+    words = ["--gap", "20:30", "--report", report, "--prior", save_tiny_prior(tmp_path / "prior.safetensors")]
+    assert infill(recording(), "-o", tmp_path / "out.bvh", *words, "--quiet") == 0
+    told = json.loads(report.read_text())
+    assert told["request"]["command"] == "infill"
+    assert (told["request"]["gap"], told["request"]["method"]) == (["20:30"], "map")
+    assert told["gaps"] == [{"start": 20, "stop": 30, "joints": 22, "root": True}]
+    assert {"mapctl", "versions", "frames", "fps", "ledger", "seconds", "frame_ms", "notes", "measures"} <= set(told)
+    assert {"footing", "likelihood"} <= set(told["ledger"])
+
+
+@pytest.mark.skipif(any(find_spec(name) is None for name in ("matplotlib", "PIL")), reason="needs mapctl[render]")
+def test_a_film_is_made(infill, tmp_path):
+    on_rig("canonical", 12).save(tmp_path / "in.bvh")
+    words = ["--gap", "5:8", "--method", "linear", "--video", tmp_path / "v.png", "--quiet"]
+    assert infill(tmp_path / "in.bvh", "-o", tmp_path / "out.bvh", *words) == 0
+    assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_linear_needs_no_network(recording, tmp_path):
+    words = ["infill", recording(), "-o", tmp_path / "out.bvh", "--gap", "20:30", "--method", "linear"]
+    assert run(*words, "--infiller", "nobody", "--quiet") == 0
+    assert (tmp_path / "out.bvh").exists()
+
+
+def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):
+    lines = recording().read_text().splitlines()
+    lines[-25:-15] = [lines[-26]] * 10
+    (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
+    assert infill(tmp_path / "frozen.bvh", "-o", tmp_path / "out.bvh", "--method", "infiller") == 0
+    assert "filled 20:30 (22 joints);" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["gone.bvh", "-o", "a.bvh", "--gap", "5:9"], "gone.bvh"),
+    (["broken.bvh", "-o", "a.bvh", "--gap", "5:9"], "broken.bvh"),
+    (["in.bvh", "--gap", "5:9"], "--out"),
+    (["in.bvh", "-o", "a.mp3", "--gap", "5:9"], ".mp3"),
+    (["in.bvh", "-o", "gone/a.bvh", "--gap", "5:9"], "gone"),
+    (["in.bvh", "-o", "a.bvh", "--report", "a.bvh", "--gap", "5:9"], "asked for twice"),
+    (["in.bvh", "-o", "a.bvh", "--video", "p.avi", "--gap", "5:9"], ".mp4"),
+    (["in.bvh", "-o", "a.bvh"], "say which frames are missing (--gap A:B) or which joints"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5:12", "--gap", "11:20"], "the gaps 5:12 and 11:20 overlap; make them one"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "40:46"], "within the motion's frames 0:45"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "1s:2s"], "within the motion's frames 0:45"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "9:5"], "must begin before it ends"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5:5"], "must begin before it ends"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5"], "a gap is A:B, frames or seconds as in 60:120 or 2s:4s; got '5'"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "a:b"], "a frame is a whole number from 0"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "0:45"], "leave nothing of the motion's 45 frames"),
+    (["in.bvh", "-o", "a.bvh", "--joints", "Hnad_L"], "no joint 'Hnad_L' to mask; the nearest is Hand_L"),
+    (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,LowerArmL"], "the nearest is LowerArm_L"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--joints", "hand_L"], "the nearest is Hand_L"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "best"], "--method"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--rig", "nobody"], "nobody"),
+    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--prior", "nobody"], "no prior 'nobody'"),
+], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
+    infill, recording, tmp_path, monkeypatch, capsys, words, said
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in.bvh").write_bytes(recording().read_bytes())
+    (tmp_path / "broken.bvh").write_text("HIERARCHY\nnonsense")
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert infill(*words) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("mapctl: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_an_infiller_that_is_none_is_refused(recording, tmp_path, capsys):
+    denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
+    for name, said in ((denoiser, "a denoiser, not an infiller"), ("nobody", "no prior 'nobody'")):
+        words = ["infill", recording(), "-o", tmp_path / "a.bvh", "--gap", "5:9", "--infiller", name]
+        assert run(*words) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
+
+
+def test_other_formats_come_and_go(infill, tmp_path):
+    walk(40).save(tmp_path / "in.npz")
+    for out in ("out.glb", "out.bvh", "out.npz"):
+        assert infill(tmp_path / "in.npz", "-o", tmp_path / out, "--gap", "20:30", "--method", "linear") == 0
+    assert mapctl.load(tmp_path / "out.npz").num_frames == 40
+    assert (tmp_path / "out.glb").stat().st_size > 0

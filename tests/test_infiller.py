@@ -1,0 +1,159 @@
+"""The network that proposes what is missing: what it does untrained, what it never does with any weights, its file."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator, moved, tiny_density, walk
+from test_gap_image import shown
+from tiny_denoiser import save_tiny_denoiser
+from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infiller
+
+import priors
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.protocols import Inbetweener
+from mapctl.skeleton import CANONICAL
+from priors import checkpoints
+from priors.infiller import InfillerConfig
+
+JOINTS = CANONICAL.num_joints
+ARCHITECTURES = ("skips", "image", "vanilla", "manifold")
+DRAWN = 0.2
+
+
+def holed(frames=60, *, gaps=((20, 40),), turn_rate=0.8, seed=0, motion=None):
+    """The image, in single precision, of a walk with gaps."""
+    known = torch.ones(1, frames, JOINTS, dtype=torch.bool)
+    for start, stop in gaps:
+        known[:, start:stop] = False
+    image = shown(walk(frames, turn_rate=turn_rate, seed=seed) if motion is None else motion, known)
+    return single(image)
+
+
+def single(image):
+    floats = {name: getattr(image, name).float() for name in ("places", "contacts", "ground", "heading")}
+    return replace(image, **floats)
+
+
+def of(architecture):
+    return replace(CONFIG, architecture=architecture)
+
+
+def test_untrained_it_draws_straight_lines():
+    image = holed()
+    proposed = network()(image)
+    assert torch.equal(proposed.places, image.places)
+    assert not proposed.contacts.any()
+
+
+def test_drawn_weights_do_something():
+    """Or the tests with them would say nothing."""
+    image = holed()
+    proposed = network(drawn=DRAWN)(image)
+    assert (proposed.places - image.places)[0, 20:40].norm(dim=-1).mean() > 0.01
+    assert proposed.contacts.std() > 0.01
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 31, 33, 70])
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_any_length_comes_back_as_it_is(architecture, frames):
+    image = holed(frames, gaps=((frames // 2, frames // 2 + 1),) if frames > 1 else ())
+    proposed = network(drawn=DRAWN, config=of(architecture))(image)
+    assert proposed.places.shape == (1, frames, JOINTS, 3)
+    assert proposed.contacts.shape == (1, frames, 2)
+    assert proposed.places.isfinite().all()
+
+
+def test_known_places_stay_to_the_bit():
+    known = torch.rand(1, 60, JOINTS, generator=generator()) < 0.6
+    image = single(shown(walk(60), known))
+    proposed = network(drawn=DRAWN)(image)
+    assert torch.equal(proposed.places[known], image.places[known])
+    assert (proposed.places != image.places).any()
+
+
+def test_autoencoders_make_everything_anew():
+    image = holed()
+    for architecture in ARCHITECTURES[1:]:
+        proposed = network(drawn=DRAWN, config=of(architecture))(image)
+        assert (proposed.places[image.known] != image.places[image.known]).any()
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_it_does_not_matter_where_the_motion_stands_and_faces(architecture):
+    motion, net = walk(60, turn_rate=0.8), network(drawn=DRAWN, config=of(architecture))
+    here, there = holed(motion=motion), holed(motion=moved(motion, turn=2.2, shift=(5.0, -3.0)))
+    assert torch.allclose(net(here).places, net(there).places, atol=1e-3)
+    assert torch.allclose(net(here).contacts, net(there).contacts, atol=1e-3)
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_a_batch_is_its_members(architecture):
+    first, second = holed(), holed(gaps=((5, 30), (50, 60)), seed=1, turn_rate=-0.5)
+    both = type(first)(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in vars(first)))
+    net = network(drawn=DRAWN, config=of(architecture))
+    together, alone = net(both), net(second)
+    assert torch.allclose(together.places[1:], alone.places, atol=1e-5)
+    assert torch.allclose(together.contacts[1:], alone.contacts, atol=1e-5)
+
+
+def test_joints_that_are_never_known_begin_at_their_mean():
+    known = torch.ones(1, 60, JOINTS, dtype=torch.bool)
+    known[..., 8] = False
+    net = network()
+    net.mean[8] = torch.tensor([0.1, 1.0, 0.2])
+    proposed = net(single(shown(walk(60), known)))
+    assert torch.allclose(proposed.places[0, :, 8], net.mean[8].expand(60, 3))
+
+
+def test_as_a_controller_takes_it_it_is_an_inbetweener_without_gradients():
+    infiller = tiny_infiller(drawn=DRAWN)
+    assert isinstance(infiller, Inbetweener)
+    proposed = infiller.propose(holed())
+    assert not proposed.places.requires_grad
+    assert torch.equal(proposed.places, infiller.network(holed()).places)
+
+
+def test_a_saved_infiller_loads_as_it_was(tmp_path):
+    path = save_tiny_infiller(tmp_path / "run" / "model.safetensors", drawn=DRAWN)
+    wanted = network(drawn=DRAWN)(holed())
+    for name in (path, path.parent):
+        loaded = priors.load_infiller(str(name))
+        assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "infiller")
+        assert torch.allclose(loaded.propose(holed()).places, wanted.places, atol=1e-3)  # float16 in the file
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_the_card_gives_the_shape_back(architecture):
+    config = InfillerConfig(architecture, (4, 5, 6), 5)
+    assert InfillerConfig.of_card(config.as_card()) == config
+
+
+@pytest.mark.parametrize("wrong", [{"widths": ()}, {"widths": (8, 0)}, {"kernel": 2}, {"kernel": -1}])
+def test_shapes_that_cannot_be_are_refused(wrong):
+    with pytest.raises(RequestError, match="positive widths and an odd kernel"):
+        InfillerConfig(**wrong)
+
+
+def test_what_is_no_infiller_is_refused(tmp_path):
+    denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
+    with pytest.raises(CheckpointError, match="a denoiser, not an infiller"):
+        priors.load_infiller(str(denoiser))
+    density, wrong = tiny_density(), tmp_path / "density.safetensors"
+    checkpoints.save(density.reference.state_dict(), density.card, wrong)
+    with pytest.raises(CheckpointError, match="a lstm-gmm, not an infiller"):
+        priors.load_infiller(str(wrong))
+    with pytest.raises(CheckpointError, match="no prior 'nobody'"):
+        priors.load_infiller("nobody")
+    path = save_tiny_infiller(tmp_path / "tiny.safetensors")
+    with pytest.raises(CheckpointError, match="infiller is no denoiser"):
+        priors.load_denoiser(str(path))
+
+
+@pytest.mark.parametrize("config", [{"widths": [8, 8]}, {"widths": 3}, {"kernel": 5}, {"kernel": 4}, {"depth": 3},
+                                    {"architecture": "manifold"}, {"architecture": "gpt"}])  # fmt: skip
+def test_tensors_that_do_not_fit_their_card_are_refused(tmp_path, config):
+    path = tmp_path / "broken.safetensors"
+    checkpoints.save(network().state_dict(), replace(card(), config={**CONFIG.as_card(), **config}), path)
+    with pytest.raises(CheckpointError, match="do not fit"):
+        priors.load_infiller(str(path))

@@ -1,0 +1,170 @@
+"""From joint positions to rotations: what forward kinematics made comes back."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import apart_deg, on_rig, shaken
+from helpers import bandai_skeleton, cmu_skeleton, generator, quat_xyzw, random_motion, walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapctl import inverse_kinematics, rotations
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton
+
+SKELETONS = {"canonical": CANONICAL, "bandai": bandai_skeleton(), "daz": cmu_skeleton()}
+
+
+def solved(places, start, skeleton=CANONICAL, **options):
+    """The solution as a motion."""
+    quats = inverse_kinematics.solve(places, start, skeleton, **options)
+    root = options.get("root_position", places[:, 0])
+    return Motion(skeleton, walk(2).fps, root, quats)
+
+
+def lengths(motion):
+    """Of all bones (frames, joints)."""
+    places = motion.joint_positions()
+    return (places[:, 1:] - places[:, list(motion.skeleton.parents[1:])]).norm(dim=-1)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.sampled_from(sorted(SKELETONS)), st.integers(0, 10_000))
+def test_any_pose_comes_back_from_its_places_whatever_one_starts_from(rig, seed):
+    wanted = random_motion(SKELETONS[rig], 4, seed=seed)
+    start = random_motion(SKELETONS[rig], 4, seed=seed + 1)
+    made = solved(wanted.joint_positions(), start.local_quat_xyzw, SKELETONS[rig])
+    assert (made.joint_positions() - wanted.joint_positions()).norm(dim=-1).max() < 1e-9
+
+
+@pytest.mark.parametrize("rig", ["canonical", "bandai", "daz"])
+def test_twist_and_swing_of_a_walk_come_back_as_places(rig):
+    motion = on_rig(rig, 30)
+    start = shaken(motion.local_quat_xyzw, 0.4)
+    still = replace(motion, moving_offsets={})  # bones keep their lengths: a hip that travels is not one
+    made = solved(still.joint_positions(), start, motion.skeleton)
+    assert (made.joint_positions() - still.joint_positions()).norm(dim=-1).max() < 1e-9
+    assert torch.allclose(lengths(made), lengths(still), atol=1e-12)
+
+
+def test_from_the_answer_nothing_changes():
+    motion = walk(20)
+    made = solved(motion.joint_positions(), motion.local_quat_xyzw)
+    assert apart_deg(made.local_quat_xyzw, motion.local_quat_xyzw).max() < 1e-5
+
+
+def test_joints_without_children_keep_their_rotation():
+    motion, start = walk(10), random_motion(CANONICAL, 10)
+    made = solved(motion.joint_positions(), start.local_quat_xyzw)
+    for name in ("head", "leftHand", "rightToes"):
+        joint = CANONICAL.index(name)
+        assert apart_deg(made.local_quat_xyzw[:, joint], start.local_quat_xyzw[:, joint]).max() < 1e-5
+
+
+def test_a_bent_knee_tells_the_plane_in_which_it_bends():
+    """The knee itself turns about one axis only, as in the motion that the places are of."""
+    motion = walk(60)
+    thigh, knee = CANONICAL.index("leftUpperLeg"), CANONICAL.index("leftLowerLeg")
+    twist = quat_xyzw(torch.tensor([0.0, 0.6, 0.0], dtype=torch.float64)).expand(60, 4)
+    start = motion.local_quat_xyzw.clone()
+    start[:, thigh] = rotations.multiply(start[:, thigh], twist)
+    made = solved(motion.joint_positions(), start)
+    bent = rotations.to_rotation_vector(motion.local_quat_xyzw[:, knee])[:, 0] > 0.45
+    assert bent.sum() > 5
+    off = apart_deg(made.local_quat_xyzw[:, thigh], motion.local_quat_xyzw[:, thigh])
+    assert off[bent].max() < 0.5 * torch.rad2deg(torch.tensor(0.6))
+
+
+def test_joints_that_are_not_free_stay_as_they_are():
+    motion, start = walk(12), shaken(walk(12).local_quat_xyzw, 0.3)
+    free = torch.rand(12, CANONICAL.num_joints, generator=generator()) < 0.5
+    made = solved(motion.joint_positions(), start, free=free)
+    assert apart_deg(made.local_quat_xyzw, start)[~free].max() < 1e-5
+    nothing = solved(motion.joint_positions(), start, free=torch.zeros_like(free))
+    assert apart_deg(nothing.local_quat_xyzw, start).max() < 1e-5
+
+
+def test_the_free_reach_from_where_the_others_leave_them():
+    """An arm's joints are free, the trunk is not: the elbow and the hand are met."""
+    motion = walk(12)
+    arm = [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm")]
+    start = motion.local_quat_xyzw.clone()
+    start[:, arm] = shaken(start[:, arm], 0.5)
+    free = torch.zeros(12, CANONICAL.num_joints, dtype=torch.bool)
+    free[:, arm] = True
+    made = solved(motion.joint_positions(), start, free=free)
+    assert (made.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-9
+
+
+def test_a_limb_that_cannot_reach_points_at_its_place_on_rigid_bones():
+    motion = walk(6)
+    hand, elbow = CANONICAL.index("leftHand"), CANONICAL.index("leftLowerArm")
+    places = motion.joint_positions().clone()
+    places[:, hand] += torch.tensor([3.0, 2.0, -1.0])
+    made = solved(places, motion.local_quat_xyzw)
+    found = made.joint_positions()
+    aim, bone = places[:, hand] - found[:, elbow], found[:, hand] - found[:, elbow]
+    cosine = torch.cosine_similarity(aim, bone, dim=-1)
+    assert cosine.min() > 1 - 1e-9
+    assert torch.allclose(lengths(made), lengths(motion), atol=1e-12)
+
+
+def test_places_of_bones_that_have_stretched_are_met_by_rigid_ones_as_nearly_as_they_can():
+    """A network's bones do."""
+    motion = walk(6)
+    shift = 0.01 * torch.randn(6, CANONICAL.num_joints, 3, generator=generator(), dtype=torch.float64)
+    made = solved(motion.joint_positions() + shift, motion.local_quat_xyzw)
+    assert torch.allclose(lengths(made), lengths(motion), atol=1e-12)
+    assert (made.joint_positions() - motion.joint_positions() - shift).norm(dim=-1).mean() < 0.02
+
+
+def test_the_root_can_stand_elsewhere_than_its_place():
+    motion, shift = walk(6), torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
+    made = solved(motion.joint_positions() + shift, motion.local_quat_xyzw, root_position=motion.root_position + shift)
+    assert torch.allclose(made.joint_positions(), motion.joint_positions() + shift, atol=1e-9)
+
+
+def chain(*offsets):
+    """A limb of single bones."""
+    names = tuple(f"j{number}" for number in range(len(offsets) + 1))
+    return Skeleton(names, tuple(range(-1, len(offsets))), torch.tensor([(0.0, 0.0, 0.0), *offsets]).double())
+
+
+@pytest.mark.parametrize("direction", [(0, 1, 0), (0, -1, 0), (1, 0, 0), (0, 0, -1), (0, 0, 0), (1e-9, -1, 0)])
+def test_straight_limbs_and_opposite_directions_give_something_finite(direction):
+    limb = chain((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 1.0, 0.0))
+    aim = torch.tensor(direction).double()
+    places = (torch.arange(4)[:, None] * aim)[None]
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, 4, 4)
+    made = solved(places, still, limb)
+    assert made.local_quat_xyzw.isfinite().all()
+    assert torch.allclose(made.local_quat_xyzw.norm(dim=-1), torch.ones(1, 4).double())
+    if aim.any():
+        assert torch.allclose(made.joint_positions(), places, atol=1e-7)
+
+
+def test_all_joints_in_one_point_give_something_finite():
+    start = walk(3).local_quat_xyzw
+    made = inverse_kinematics.solve(torch.zeros(3, CANONICAL.num_joints, 3).double(), start, CANONICAL)
+    assert made.isfinite().all()
+
+
+def test_a_frame_does_not_depend_on_others():
+    motion, start = walk(9), shaken(walk(9).local_quat_xyzw, 0.3)
+    whole = solved(motion.joint_positions(), start)
+    part = solved(motion.joint_positions()[4:6], start[4:6])
+    assert apart_deg(whole.local_quat_xyzw[4:6], part.local_quat_xyzw).max() < 1e-5
+
+
+def test_signs_of_the_solution_do_not_jump():
+    motion = walk(60, turn_rate=6.0)
+    made = solved(motion.joint_positions(), motion.local_quat_xyzw)
+    assert (made.local_quat_xyzw[1:] * made.local_quat_xyzw[:-1]).sum(-1).min() > 0
+
+
+def test_other_shapes_are_refused():
+    motion = walk(4)
+    with pytest.raises(RequestError, match=r"must be of the same frames and of 21 joints"):
+        inverse_kinematics.solve(motion.joint_positions()[:, :20], motion.local_quat_xyzw[:, :20], CANONICAL)

@@ -1,0 +1,139 @@
+"""Windows of joint positions: those of the motions whose features the corpus holds."""
+
+import math
+
+import pytest
+import torch
+from helpers import corpus, generator, walks
+from scipy.spatial.transform import Rotation
+
+from mapctl.features import LAYOUT, Place, decode
+from mapctl.skeleton import CANONICAL
+from priors.training.corpus import Corpus
+from priors.training.position_windows import PositionWindows, local_places
+
+SWAP = CANONICAL.mirror_partners()
+
+
+def decoded(features):
+    return decode(features.double(), Place(torch.zeros(2).double(), torch.zeros(()).double()))
+
+
+def about_y(angle):
+    """Rotations by scipy."""
+    return Rotation.from_rotvec(angle.double()[:, None].numpy() * [0.0, 1.0, 0.0])
+
+
+def without_heading(places, facing):
+    """Places (frames, joints, 3) seen along the headings."""
+    return torch.from_numpy(about_y(-facing).as_matrix()[:, None] @ places.double().numpy()[..., None])[..., 0]
+
+
+def seen_from_the_root(motion):
+    """Joint positions over the hips' ground point, the heading turned away; by scipy."""
+    forward = Rotation.from_quat(motion.local_quat_xyzw[:, 0].numpy()).as_matrix()[:, :, 2]
+    facing = 2 * torch.atan2(motion.local_quat_xyzw[:, 0, 1], motion.local_quat_xyzw[:, 0, 3])
+    assert (torch.from_numpy(forward)[:, 2] * torch.cos(facing) > 0).all()  # upright, so that facing is near enough
+    places = motion.joint_positions() - motion.root_position[:, None] * torch.tensor([1.0, 0.0, 1.0])
+    return without_heading(places, facing)
+
+
+def test_local_places_are_the_motions_seen_from_its_root():
+    features = corpus(3, 60).features[60:120]
+    assert (local_places(features).double() - seen_from_the_root(decoded(features))).norm(dim=-1).max() < 1e-5
+
+
+def test_a_window_is_the_motion_from_that_frame_on():
+    data = corpus(3, 60)
+    windows = PositionWindows(data, frames=24, evenness=0.0)
+    found = windows.at(torch.tensor([1, 2]), torch.tensor([10, 36]), mirrored=torch.tensor([False, False]))
+    assert found.present.all()
+    for row, (clip, first) in enumerate(((1, 10), (2, 36))):
+        features = data.features[60 * clip : 60 * (clip + 1)]
+        wanted = decoded(features).joint_positions()[first : first + 24]
+        assert (found.places[row].double() - wanted).norm(dim=-1).max() < 1e-4
+        assert torch.equal(found.contacts[row], LAYOUT.pick(features, "contacts")[first : first + 24])
+        facing = torch.from_numpy(about_y(found.heading[row]).apply([0.0, 0.0, 1.0]))
+        hips = torch.from_numpy(Rotation.from_quat(decoded(features).local_quat_xyzw[:, 0].numpy()).as_matrix())
+        assert torch.cosine_similarity(facing[:, ::2], hips[first : first + 24, ::2, 2], dim=1).min() > 0.99
+
+
+def test_a_mirrored_window_is_the_window_in_a_mirror():
+    windows = PositionWindows(corpus(3, 60), frames=30, evenness=0.0)
+    clip, first = torch.tensor([0, 2]), torch.tensor([5, 20])
+    plain, mirrored = (windows.at(clip, first, mirrored=torch.tensor([side, side])) for side in (False, True))
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    assert torch.allclose(mirrored.places, plain.places[:, :, SWAP] * flip, atol=1e-5)
+    assert torch.allclose(mirrored.heading, -plain.heading)
+    assert torch.equal(mirrored.contacts, plain.contacts.flip(-1))
+    motion = walks(3, 60)[2].mirror()
+    # The walk itself in a mirror, but for where it starts and faces.
+    wanted = seen_from_the_root(motion)[20:50]
+    local = mirrored.places[1] - mirrored.places[1, :, :1] * torch.tensor([1.0, 0.0, 1.0])
+    assert (without_heading(local, mirrored.heading[1]) - wanted).norm(dim=-1).max() < 1e-4
+
+
+@pytest.mark.parametrize("first", [-10, 0, 25])
+def test_frames_that_the_clip_lacks_are_flagged(first):
+    windows = PositionWindows(corpus(2, 40), frames=60, evenness=0.0)
+    found = windows.at(torch.tensor([1]), torch.tensor([first]), mirrored=torch.tensor([False]))
+    frame = torch.arange(60) + first
+    assert torch.equal(found.present[0], (frame >= 0) & (frame < 40))
+    assert found.places.isfinite().all()
+    image = found.image(torch.ones(1, 60, CANONICAL.num_joints, dtype=torch.bool))
+    assert not image.known[0, ~found.present[0]].any()
+
+
+def test_draws_are_whole_windows_of_long_clips_and_whole_clips_in_windows():
+    windows = PositionWindows(Corpus(("a", "b"), (90, 40), corpus(1, 130).features), frames=60, evenness=1.0)
+    found = windows.draw(100, generator())
+    counts = found.present.sum(dim=1)
+    assert set(counts.tolist()) == {40, 60}
+    begins = found.present[counts == 40].to(torch.uint8).argmax(dim=1)
+    assert begins.min() < 4
+    assert begins.max() > 16
+
+
+def test_draws_are_the_seeds():
+    windows = PositionWindows(corpus(3, 60), frames=24, evenness=0.5)
+    first, again, other = (windows.draw(8, generator(seed)) for seed in (0, 0, 1))
+    for name in ("places", "heading", "contacts", "present"):
+        assert torch.equal(getattr(first, name), getattr(again, name))
+    assert not torch.equal(first.places, other.places)
+
+
+def test_half_of_the_windows_are_mirrored():
+    clip = corpus(1, 40)
+    windows = PositionWindows(clip, frames=40, evenness=0.0)
+    turns = windows.draw(200, generator()).places[:, -1, 0, 0]
+    sides = torch.sign(turns)
+    assert 0.35 < (sides > 0).double().mean() < 0.65
+
+
+def test_moments_are_those_of_the_clips_and_their_mirror_images():
+    windows = PositionWindows(corpus(3, 60), frames=24, evenness=0.0)
+    both = torch.cat([windows.local, windows.local[:, SWAP] * torch.tensor([-1.0, 1.0, 1.0])])
+    mean, std = windows.moments()
+    assert torch.allclose(mean, both.mean(dim=0), atol=1e-5)
+    assert torch.allclose(std, both.std(dim=0, unbiased=False), atol=1e-4)
+
+
+def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
+    one = corpus(1, 60).features
+    high = one[:30].clone()
+    high[:, LAYOUT.slices["root_height"]] += 50
+    uneven = Corpus(("big/a", "big/b", "big/c", "small/d"), (60, 60, 60, 30), torch.cat([one, one, one, high]))
+
+    def share(evenness):
+        drawn = PositionWindows(uneven, frames=30, evenness=evenness).draw(600, generator())
+        return float((drawn.places[:, 0, 0, 1] > 25).double().mean())
+
+    assert share(0.0) == pytest.approx(1 / 7, abs=0.05)
+    assert share(1.0) == pytest.approx(0.5, abs=0.07)
+
+
+def test_the_heading_goes_on_beyond_a_half_turn():
+    """Whole turns are the data's own: what is drawn does not jump."""
+    windows = PositionWindows(corpus(1, 100), frames=100, evenness=0.0)
+    found = windows.at(torch.tensor([0]), torch.tensor([0]), mirrored=torch.tensor([False]))
+    assert torch.diff(found.heading).abs().max() < math.pi / 4

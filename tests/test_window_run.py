@@ -1,0 +1,216 @@
+"""`mapctl train` of models that learn from windows, the denoiser and the infiller: runs, their options, their cards."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import tiny_denoiser
+import tiny_infiller
+from helpers import killing, run
+
+import priors
+from mapctl import cli
+from mapctl.commands import train_denoiser, train_infiller
+from mapctl.commands.train import Train
+from mapctl.errors import CheckpointError, MapctlError, RequestError
+from priors.denoiser import DenoiserConfig
+from priors.infiller import InfillerConfig
+from priors.training import denoiser_run, infiller_run
+from priors.training.denoiser import DenoiserSettings
+from priors.training.infiller import InfillerSettings
+from priors.training.window_run import command
+
+
+@dataclass(frozen=True)
+class Model:
+    """One of those that are trained so."""
+
+    runs: ModuleType
+    """`train` and `KIND`."""
+    request: Callable[..., Any]
+    """Of its run."""
+    of_command: Callable[[Train], Any]
+    """The request that a command line makes."""
+    load: Callable[[str], Any]
+    """As controllers get it."""
+    tiny: Any
+    """Shape of a small network."""
+    other: Any
+    """Another shape of it."""
+    usual: Any
+    """The recipe that is the default."""
+    shape: tuple[tuple[str, ...], Any]
+    """Words for another shape, and the shape."""
+
+    @property
+    def name(self) -> str:
+        return self.runs.KIND.name
+
+    @property
+    def settings(self):
+        """A recipe of six steps."""
+        return replace(self.usual, steps=6, batch=3, window=32)
+
+
+MODELS = (
+    Model(denoiser_run, denoiser_run.DenoiserRequest, train_denoiser.request, priors.load_denoiser,
+          tiny_denoiser.CONFIG, replace(tiny_denoiser.CONFIG, width=7), DenoiserSettings(),
+          (("--width", "12"), DenoiserConfig(width=12))),
+    Model(infiller_run, infiller_run.InfillerRequest, train_infiller.request, priors.load_infiller,
+          tiny_infiller.CONFIG, replace(tiny_infiller.CONFIG, kernel=5), InfillerSettings(),
+          (("--architecture", "manifold"), InfillerConfig(architecture="manifold"))),
+)  # fmt: skip
+
+
+@pytest.fixture(params=MODELS, ids=lambda model: model.name)
+def model(request):
+    return request.param
+
+
+@pytest.fixture
+def request_in(data, model):
+    """Checkpoints in every step, so that a kill can come anywhere."""
+
+    def made(out, **changes):
+        settings = replace(model.settings, **changes.pop("settings", {}))
+        given = {"checkpoint_minutes": 0.0, "report_steps": 2, "validate_steps": 4, "config": model.tiny} | changes
+        return model.request(data, out, settings=settings, **given)
+
+    return made
+
+
+def killed_in(model, request, number):
+    """Runs until a step is begun."""
+    with killing(model.runs.KIND.trainer, "train_step", number, counter="step"):
+        model.runs.train(request)
+
+
+def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, model, request_in):
+    whole = model.runs.train(request_in(tmp_path / "whole"))
+    killed_in(model, request_in(tmp_path / "parts"), 3)
+    killed_in(model, request_in(tmp_path / "parts", resume=True), 4)
+    news = []
+    parts = model.runs.train(request_in(tmp_path / "parts", resume=True), news.append)
+    assert "resumed at step 4" in news
+    for name in (whole.name, "model.json", "step-6-checkpoint.safetensors", "checkpoint.json"):
+        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert parts == tmp_path / "parts" / "model.safetensors"
+
+
+def test_a_finished_run_loads_with_a_complete_card(tmp_path, model, request_in):
+    news, out = [], tmp_path / "run"
+    model.runs.train(request_in(out, licence="CC0"), news.append)
+    found = model.load(str(out))
+    card = found.card
+    assert (card.kind, card.licence, found.network.config) == (model.name, "CC0", model.tiny)
+    assert (card.data["clips"], card.data["frames"]) == ("5", "400")
+    assert card.training["settings"] == json.loads(json.dumps(asdict(model.settings)))
+    assert [row["step"] for row in card.training["curve"]] == [4, 6]
+    assert all(math.isfinite(value) for value in card.quality["test"].values())
+    assert set(card.data["held_out"]) == {"validation", "test"}
+    assert [line.split(":")[0] for line in news if line.startswith("step")] == ["step 2", "step 4", "step 6"]
+
+
+def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, model, request_in):
+    out, train = tmp_path / "run", model.runs.train
+    with pytest.raises(CheckpointError, match="no checkpoint to resume"):
+        train(request_in(out, resume=True))
+    killed_in(model, request_in(out), 2)
+    with pytest.raises(RequestError, match="already holds a run; pass --resume"):
+        train(request_in(out))
+    with pytest.raises(CheckpointError, match=r"other settings \(feet: .* then, 3\.0 now\)"):
+        train(request_in(out, resume=True, settings={"feet": 3.0}))
+    with pytest.raises(CheckpointError, match=r"other network \((width|kernel): \d then, \d now\)"):
+        train(request_in(out, resume=True, config=model.other))
+    with pytest.raises(CheckpointError, match="other data"):
+        train(request_in(out, resume=True, match="walk-[0-3]"))
+
+
+def test_what_cannot_be_trained_on_is_refused(tmp_path, model, request_in):
+    with pytest.raises(RequestError, match="not a folder of BVH"):
+        model.runs.train(replace(request_in(tmp_path / "run"), data=tmp_path / "nowhere"))
+    with pytest.raises(RequestError, match=r"no .bvh below .* matches 'dance'"):
+        model.runs.train(request_in(tmp_path / "run", match="dance"))
+    for wrong in ({"window": 15}, {"steps": 0}, {"batch": 0}):
+        with pytest.raises(RequestError, match=f"{next(iter(wrong))} must be at least"):
+            replace(model.settings, **wrong)
+    assert not (tmp_path / "run" / "checkpoint.json").exists()
+
+
+def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, model, request_in, monkeypatch):
+    trainer = model.runs.KIND.trainer
+    step = trainer.train_step
+    monkeypatch.setattr(trainer, "train_step",
+                        lambda trainer: step(trainer) | ({"loss": math.nan} if trainer.step == 3 else {}))  # fmt: skip
+    with pytest.raises(MapctlError, match="diverged at step 3"):
+        model.runs.train(request_in(tmp_path / "run"))
+    assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 2
+    assert not (tmp_path / "run" / "model.safetensors").exists()
+
+
+def requested(model, *words):
+    given = cli.parse(["train", model.name, "--data", "data", "-o", "run", *words])
+    assert isinstance(given, Train)
+    return model.of_command(given)
+
+
+def test_every_option_reaches_the_trainer(model):
+    given = requested(model)
+    assert (given.config, given.settings) == (type(model.tiny)(), model.usual)
+    assert (given.data, given.out, given.match, given.resume) == (Path("data"), Path("run"), "", False)
+    words, config = model.shape
+    given = requested(model, "--match", "walk", "--steps", "7", "--batch", "6", "--window", "40", "--seed", "0",
+                      "--learning-rate", "0.01", "--bfloat16", "--resume", "--licence", "CC0",
+                      "--skip-first", "--minutes-between-checkpoints", "0.5", *words)  # fmt: skip
+    assert (given.match, given.resume, given.licence, given.skip_first) == ("walk", True, "CC0", True)
+    assert (given.checkpoint_minutes, given.config) == (0.5, config)
+    assert given.settings == replace(model.usual, steps=7, batch=6, window=40, seed=0, learning_rate=0.01,
+                                     bfloat16=True)  # fmt: skip
+
+
+@pytest.mark.parametrize("words", [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"],
+                                   ["--init", "locomotion"], ["--paper"]], ids=lambda words: words[0])  # fmt: skip
+def test_options_of_other_models_are_refused(model, words):
+    with pytest.raises(RequestError, match=f"{words[0]} is for other models; an? {model.name} has no such option"):
+        requested(model, *words)
+
+
+def test_a_shape_that_only_another_model_has_is_refused(model):
+    (other,) = (each for each in MODELS if each is not model)
+    with pytest.raises(RequestError, match=f"{other.shape[0][0]} is for other models"):
+        requested(model, *other.shape[0])
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    (["--steps", "0"], "--steps must be at least 1, got 0"), (["--batch", "-2"], "--batch must be at least 1"),
+    (["--window", "0"], "--window must be at least 1"), (["--window", "8"], "window must be at least"),
+    (["--seed", "-1"], "seed"), (["--learning-rate", "2"], "learning rate"), (["--learning-rate", "0"], "learning"),
+    (["--minutes-between-checkpoints", "0"], "minutes between"), (["--device", "cuda"], "leave --device out"),
+], ids=lambda value: value[0] if isinstance(value, list) else "")  # fmt: skip
+def test_numbers_that_make_no_sense_are_refused(model, words, message):
+    with pytest.raises(RequestError, match=message):
+        requested(model, *words)
+
+
+def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, model):
+    settings = replace(model.usual, steps=7, bfloat16=True, seed=3, learning_rate=2e-4)
+    wanted = model.request(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings,
+                           skip_first=True)  # fmt: skip
+    words = command(wanted, model.runs.KIND).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path))
+    given = cli.parse(words.split()[1:])
+    assert isinstance(given, Train)
+    assert model.of_command(given) == wanted
+
+
+def test_the_command_line_trains_what_can_be_loaded(tmp_path, data, model, capsys):
+    out, (words, config) = tmp_path / "run", model.shape
+    assert run("train", model.name, "--data", data, "-o", out, "--steps", 2, "--batch", 2, "--window", 32, *words) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert told.out.endswith(f"wrote {out / 'model.safetensors'}; use it with --{model.name} {out}\n")
+    assert model.load(str(out)).network.config == config
