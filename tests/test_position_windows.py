@@ -1,6 +1,7 @@
 """Windows of joint positions: those of the motions whose features the corpus holds."""
 
 import math
+from fractions import Fraction
 
 import pytest
 import torch
@@ -8,6 +9,8 @@ from helpers import corpus, generator, walks
 from scipy.spatial.transform import Rotation
 
 from mapctl.features import LAYOUT, Place, decode
+from mapctl.gaps.lost import Lost, straight
+from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus
 from priors.training.position_windows import PositionWindows, local_places
@@ -137,3 +140,17 @@ def test_the_heading_goes_on_beyond_a_half_turn():
     windows = PositionWindows(corpus(1, 100), frames=100, evenness=0.0)
     found = windows.at(torch.tensor([0]), torch.tensor([0]), mirrored=torch.tensor([False]))
     assert torch.diff(found.heading).abs().max() < math.pi / 4
+
+
+def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
+    """Told from the rotations of a batch, and of a motion on its rig: written twice, it must be the same."""
+    windows = PositionWindows(corpus(3, 60), frames=40, evenness=0.0)
+    window = windows.at(torch.tensor([1]), torch.tensor([3]), mirrored=torch.tensor([False]))
+    known = torch.ones(1, 40, CANONICAL.num_joints, dtype=torch.bool)
+    known[:, 10:25] = False
+    motion = Motion(CANONICAL, Fraction(30), window.places[0, :, 0].double(), window.quats[0].double())
+    gone = ~known[0, :, 0]
+    lost = Lost(gone[:, None].expand(-1, CANONICAL.num_joints), gone)
+    wanted = straight(motion, lost).joint_positions()
+    image = window.image(known)
+    torch.testing.assert_close(image.to_world(image.places)[0].double(), wanted, atol=1e-4, rtol=0)

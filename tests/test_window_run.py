@@ -142,6 +142,22 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path, model, request_in):
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
+def test_a_run_may_begin_with_the_weights_of_another(tmp_path, model, request_in):
+    first = model.runs.train(request_in(tmp_path / "first"))
+    wanted = replace(request_in(tmp_path / "second"), init=str(first))
+    killed_in(model, wanted, 2)  # at the step after its second checkpoint
+    model.runs.train(replace(wanted, resume=True))
+    card = model.load(str(tmp_path / "second")).card
+    assert "--init INIT" in card.training["command"]
+    own = model.runs.train(request_in(tmp_path / "own"))
+    assert own.read_bytes() == first.read_bytes() != (tmp_path / "second" / "model.safetensors").read_bytes()
+    again = request_in(tmp_path / "second", resume=True)
+    with pytest.raises(CheckpointError, match="other init"):
+        model.runs.train(again)
+    with pytest.raises(CheckpointError, match=f"wanted: {model.name}"):
+        model.runs.train(replace(request_in(tmp_path / "third", config=model.other), init=str(first)))
+
+
 def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, model, request_in, monkeypatch):
     trainer = model.runs.KIND.trainer
     step = trainer.train_step
@@ -174,7 +190,7 @@ def test_every_option_reaches_the_trainer(model):
 
 
 @pytest.mark.parametrize("words", [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"],
-                                   ["--init", "locomotion"], ["--paper"]], ids=lambda words: words[0])  # fmt: skip
+                                   ["--paper"]], ids=lambda words: words[0])  # fmt: skip
 def test_options_of_other_models_are_refused(model, words):
     with pytest.raises(RequestError, match=f"{words[0]} is for other models; an? {model.name} has no such option"):
         requested(model, *words)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mapctl.commands.train import Train
     from priors.training.denoiser_run import DenoiserRequest
 
-_OF_OTHERS = ("density", "components", "labels", "init", "paper", "architecture")
+_OF_OTHERS = ("density", "components", "labels", "paper", "architecture")
 
 
 def run(given: "Train", say: Callable[[str], None]) -> Path:
@@ -36,5 +36,5 @@ def request(given: "Train") -> "DenoiserRequest":
     return DenoiserRequest(
         data=given.data, out=given.out, match=given.match or "", config=config, settings=settings,
         resume=given.resume, checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence,
-        skip_first=given.skip_first,
+        skip_first=given.skip_first, init=given.init,
     )  # fmt: skip

@@ -131,9 +131,8 @@ class _Run(Generic[C, S]):
         """Another model's weights; CheckpointError if they are not of this network."""
         tensors, card = checkpoints.load(checkpoints.locate(name))
         if card.kind != self.kind.name or card.config != self.request.config.as_card():
-            raise CheckpointError(
-                f"{name} is a {card.kind} of {card.config}, not a {self.kind.name} of the one asked for"
-            )
+            wanted = f"{self.kind.name} of {self.request.config.as_card()}"
+            raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
         self.trainer.network.load_state_dict(tensors)
 
     def go(self) -> None:
@@ -205,7 +204,7 @@ def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
     for name in ("steps", "batch", "window", "learning_rate", "seed"):
         if given[name] != usual[name]:
             parts.append(f"--{name.replace('_', '-')} {given[name]:g}")
-    parts += [f"--init {request.init}"] if request.init is not None else []
+    parts += ["--init INIT"] if request.init is not None else []
     return " ".join(parts + ["--bfloat16"] * given["bfloat16"])
 
 
