@@ -4,5 +4,8 @@
 from controllers.denoise import DenoiseSettings, denoise
 from controllers.follow import FollowSettings, follow
 from controllers.generate import GenerateSettings, generate
+from controllers.infill import InfillSettings, infill
+from controllers.tween import Keys, tween
 
-__all__ = ["DenoiseSettings", "FollowSettings", "GenerateSettings", "denoise", "follow", "generate"]
+__all__ = ["DenoiseSettings", "FollowSettings", "GenerateSettings", "InfillSettings", "Keys", "denoise", "follow",
+           "generate", "infill", "tween"]  # fmt: skip

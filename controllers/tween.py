@@ -52,7 +52,7 @@ def tween(
     """
     wanted = keys.checked(motion)
     canonical, rigmap = to_canonical(motion, rig)
-    limbs = [_limb(name, motion, rigmap) for name in keys.limbs]
+    limbs = [limb_end(name, motion, rigmap) for name in keys.limbs]
     whole = [wanted[0], wanted[-1]] if keys.limbs or keys.root_only else wanted
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[whole] = False
@@ -83,7 +83,7 @@ def key_errors(made: Motion, source: Motion, keys: Keys) -> list[dict[str, Any]]
     return rows
 
 
-def _limb(name: str, motion: Motion, rigmap: RigMap) -> int:
+def limb_end(name: str, motion: Motion, rigmap: RigMap) -> int:
     """The canonical joint of a limb's end; RequestError, with the nearest name, for anything else."""
     ends = {motion.skeleton.names[joint]: canonical for canonical, joint in enumerate(rigmap.joint_of)
             if joint is not None and CANONICAL.names[canonical] in LIMBS}  # fmt: skip

@@ -7,6 +7,7 @@ Each is a frozen dataclass of options with a `run`; heavy imports wait until it 
 from typing import Protocol, runtime_checkable
 
 from mapctl.commands.bench import Bench
+from mapctl.commands.blend import Blend
 from mapctl.commands.convert import Convert
 from mapctl.commands.demo import Demo
 from mapctl.commands.denoise import Denoise
@@ -42,6 +43,7 @@ COMMANDS: dict[str, type[Command]] = {
     "denoise": Denoise,
     "infill": Infill,
     "tween": Tween,
+    "blend": Blend,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

@@ -1,0 +1,74 @@
+"""`mapctl blend`: a hand or foot of one clip does for a while what it does in another."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.frames import parse_frame, parse_range
+from mapctl.commands.threads import compute_on_one
+
+
+@dataclass(frozen=True)
+class Blend:
+    """Hands or feet of a clip do for a while what they do in another one: a walk that reaches or waves."""
+
+    source: options.InFile
+    """A motion file."""
+    other: Annotated[Path, arg(name="from", metavar="CLIP")]
+    """The clip that it is taken from, of any known rig; brought to IN's frame rate."""
+    joints: Annotated[str, arg(metavar="NAME,NAME")]
+    """Hands and feet, by the names of IN's rig."""
+    frames: Annotated[str, arg(metavar="A:B")]
+    """Of the other clip, or seconds as in 2s:2.5s."""
+    at: Annotated[str, arg(metavar="FRAME")]
+    """Where they go in IN, or seconds as in 1.5s."""
+    out: options.OutFile
+    """Where the motion goes."""
+    margin: options.Number = 0.5
+    """Seconds before and after in which the limb goes there and back."""
+    method: Annotated[Literal["infiller", "map"], arg(metavar="infiller|map")] = "map"
+    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones."""
+    infiller: options.Name = "infiller"
+    """The bundled infiller, or the file or run folder of a trained one."""
+    rig: options.MaybeRig = None
+    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
+    video: options.MaybeFile = None
+    """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, blend, write, tell."""
+        compute_on_one()
+        from mapctl import formats
+
+        formats.check_ending(self.out)
+        outputs.check_files(options.given(self.out, self.video))
+        if self.video is not None:
+            outputs.check_film(self.video, (1280, 720))
+        rig = options.read_rig(self.rig)
+        motion, other = options.read_motion(self.source, rig), options.read_motion(self.other, None)
+        import priors
+        from controllers.blend import Borrowed, blend
+        from controllers.filling import InfillSettings
+
+        other = other.resample(motion.fps)
+        fps = float(motion.fps)
+        start, stop = parse_range(self.frames, fps=fps, frames=other.num_frames)
+        names = tuple(name.strip() for name in self.joints.split(","))
+        borrowed = Borrowed(names, start, stop, parse_frame(self.at, fps=fps), margin=self.margin)
+        settings = InfillSettings(method=self.method)
+        done = blend(motion, other, borrowed, priors.load_infiller(self.infiller), settings=settings, rig=rig)
+        formats.save(done.motion, self.out)
+        if self.video is not None:
+            from mapctl.progress import bar
+            from scenes.denoise_plot import side_by_side
+
+            with bar("filming", quiet=self.quiet) as progress:
+                side_by_side(motion, done.motion, self.video, rig=rig, progress=progress)
+        if not self.quiet:
+            print("\n".join((f"{self.out}: {done.motion.num_frames} frames", *done.notes)))
+        return 0
