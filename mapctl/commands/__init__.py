@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from mapctl.commands.bench import Bench
 from mapctl.commands.blend import Blend
+from mapctl.commands.chain import Chain
 from mapctl.commands.convert import Convert
 from mapctl.commands.demo import Demo
 from mapctl.commands.denoise import Denoise
@@ -44,6 +45,7 @@ COMMANDS: dict[str, type[Command]] = {
     "infill": Infill,
     "tween": Tween,
     "blend": Blend,
+    "chain": Chain,
     "render": Render,
     "convert": Convert,
     "measure": Measure,

@@ -1,0 +1,101 @@
+"""One long motion through short pieces of many clips, the gaps between them filled in (infilling paper, figure 1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from controllers.filling import Infilled, InfillSettings
+from controllers.infill import infill
+from mapctl import rotations
+from mapctl.capture.masks import ALL, Mask
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.retarget import from_canonical, to_canonical
+from mapctl.skeleton import leg_length
+
+_END = 5  # frames over which the way on at a piece's end is told
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """How long pieces and gaps are, frames at the prior's rate."""
+
+    piece: int = 40
+    """From the middle of every clip; a shorter one is taken whole."""
+    gap: tuple[int, int] = (50, 100)
+    """Between two pieces, drawn evenly from the first up to the second."""
+
+    def __post_init__(self):
+        if self.piece < 2 or not 1 <= self.gap[0] <= self.gap[1] <= 900:
+            raise RequestError(f"pieces need 2 frames or more and gaps 1 to 900, got {self.piece} and {self.gap}")
+
+
+def chain(
+    clips: Sequence[Motion], infiller: Inbetweener | None, *, generator: torch.Generator,
+    settings: ChainSettings | None = None, filling: InfillSettings | None = None, densities: Sequence[Any] = (),
+) -> Infilled:  # fmt: skip
+    """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
+
+    Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's.
+    """
+    settings = settings or ChainSettings()
+    if len(clips) < 2:
+        raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
+    first, rigmap = to_canonical(clips[0])
+    whole: Motion | None = None
+    masks: list[Mask] = []
+    for clip in clips:
+        piece = _piece(clip, first, settings.piece)
+        if whole is None:
+            whole = piece
+            continue
+        low, high = settings.gap
+        gap = int(torch.randint(low, high + 1, (), generator=generator))
+        masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
+        piece = _led_on(whole, piece, gap)
+        held = torch.full((gap,), whole.num_frames - 1)
+        whole = whole.join(replace(whole, root_position=whole.root_position[held],
+                                   local_quat_xyzw=whole.local_quat_xyzw[held])).join(piece)  # fmt: skip
+    assert whole is not None, "there are clips"
+    rigged = replace(from_canonical(whole, rigmap), source=clips[0].source)
+    return infill(rigged, infiller, masks, settings=filling, densities=densities)
+
+
+def _piece(clip: Motion, body: Motion, frames: int) -> Motion:
+    """Frames from a clip's middle, on the bones of the body, in its size."""
+    canonical = to_canonical(clip)[0].resample(PRIOR_FPS)
+    count = min(frames, canonical.num_frames)
+    start = (canonical.num_frames - count) // 2
+    size = leg_length(body.skeleton) / leg_length(canonical.skeleton)
+    return replace(canonical.slice(start, start + count), skeleton=body.skeleton, source=None,
+                   root_position=size * canonical.root_position[start : start + count])  # fmt: skip
+
+
+def _led_on(before: Motion, piece: Motion, gap: int) -> Motion:
+    """The piece, moved and turned to where the motion before it comes after so many frames."""
+    facing = heading(before.local_quat_xyzw[-1:, 0])
+    turned = _turned(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
+    way = (gap + 1) / 2 * (_step(before.root_position[-_END:]) + _step(turned.root_position[:_END]))
+    aim = before.root_position[-1] + way
+    moved = aim - turned.root_position[0]
+    moved[1] = 0
+    return replace(turned, root_position=turned.root_position + moved)
+
+
+def _step(places: Tensor) -> Tensor:
+    """Mean way of a frame."""
+    return (places[-1] - places[0]) / max(1, len(places) - 1)
+
+
+def _turned(motion: Motion, angle: Tensor) -> Motion:
+    """About the vertical through the origin."""
+    turn = rotations.about_y(angle).expand(motion.num_frames, 4)
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
+    return replace(motion, local_quat_xyzw=quats, root_position=rotations.rotate(turn, motion.root_position))

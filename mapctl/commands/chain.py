@@ -1,0 +1,77 @@
+"""`mapctl chain`: one long motion through pieces of many clips."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import arg
+
+from mapctl.commands import options, outputs
+from mapctl.commands.threads import compute_on_one
+from mapctl.errors import RequestError
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One long motion through short pieces of many clips, the gaps between them filled in; on the first clip's rig."""
+
+    clips: tyro.conf.Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP CLIP ...")]]
+    """Motion files, of any known rigs."""
+    out: options.OutFile
+    """Where the motion goes, at 30 frames a second."""
+    piece: options.Count = 40
+    """Frames that are taken from the middle of every clip."""
+    gap: Annotated[str, arg(metavar="A:B")] = "50:100"
+    """Frames between two pieces: drawn from A to B."""
+    seed: options.Count = 0
+    """Of the gaps' lengths."""
+    method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
+    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
+    infiller: options.Name = "infiller"
+    """The bundled infiller, or the file or run folder of a trained one."""
+    video: options.MaybeFile = None
+    """Film of the motion: .mp4, .gif or .png."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+    def run(self) -> int:
+        """Check everything, chain, write, tell."""
+        compute_on_one()
+        options.check_seed(self.seed)
+        from mapctl import formats
+
+        formats.check_ending(self.out)
+        outputs.check_files(options.given(self.out, self.video))
+        if self.video is not None:
+            outputs.check_film(self.video, (1280, 720))
+        import torch
+
+        import priors
+        from controllers.chain import ChainSettings, chain
+        from controllers.filling import InfillSettings
+
+        settings = ChainSettings(piece=self.piece, gap=self._gap())
+        infiller = None if self.method == "linear" else priors.load_infiller(self.infiller)
+        done = chain([options.read_motion(path, None) for path in self.clips], infiller, settings=settings,
+                     filling=InfillSettings(method=self.method),
+                     generator=torch.Generator().manual_seed(self.seed))  # fmt: skip
+        formats.save(done.motion, self.out)
+        if self.video is not None:
+            from mapctl.progress import bar
+            from mapctl.retarget import to_canonical
+            from scenes.film import film
+
+            with bar("filming", quiet=self.quiet) as progress:
+                film([(to_canonical(done.motion)[0], None)], self.video, progress=progress)
+        if not self.quiet:
+            filled = int(done.lost.frames.sum())
+            print(f"{self.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(self.clips)}"
+                  f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame")  # fmt: skip
+        return 0
+
+    def _gap(self) -> tuple[int, int]:
+        low, colon, high = self.gap.partition(":")
+        if not (colon and low.isdecimal() and high.isdecimal()):
+            raise RequestError(f"--gap is A:B, frames as in 50:100; got {self.gap!r}")
+        return int(low), int(high)
