@@ -16,6 +16,7 @@ from mapctl import contacts
 from mapctl.capture.masks import ALL, Mask
 from mapctl.features import PRIOR_FPS
 from mapctl.gaps import PositionImage
+from mapctl.gaps.guess import led, slerped
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -113,7 +114,8 @@ def _raw(clip: Motion, task: Task, network: Inbetweener, generator: torch.Genera
     seen = truth + task.noise * torch.randn(truth.shape, generator=generator)
     facing = heading(clip.local_quat_xyzw[:, 0]).float()
     stands = contacts.planted(truth[:, list(_TOES)], PRIOR_FPS).float()
-    image = PositionImage.of_world(seen[None], facing[None], stands[None], known=known[None],
+    guess = slerped(seen[None], clip.local_quat_xyzw.float()[None], known[None])
+    image = PositionImage.of_world(guess, led(facing[None], known[None]), stands[None], known=known[None],
                                    present=torch.ones(1, len(truth), dtype=torch.bool), toes=_TOES)  # fmt: skip
     places = image.to_world(network.propose(image).places)[0]
     return _result(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))

@@ -17,10 +17,12 @@ from mapctl import contacts, gaussian, inverse_kinematics, rotations
 from mapctl.capture import Capture
 from mapctl.capture.bands import upsampled
 from mapctl.capture.faults import runs
+from mapctl.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.gaps import PositionImage
 from mapctl.gaps.closing import closed_places, closed_rotations
+from mapctl.gaps.course import along
 from mapctl.gaps.lost import Lost, put_back, straight
 from mapctl.gaps.targets import Targets, missed, reached
 from mapctl.kinematics import heading
@@ -35,6 +37,7 @@ from mapctl.terms.footing import TOES
 Method = Literal["infiller", "map", "linear"]
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 _TREMBLE = 0.8  # frames at the prior's rate
+_SWAY = 10  # frames at the prior's rate: slower than a step
 _SURE = 4.0  # log odds of contacts that are known
 _SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
 _MISSED = 0.001  # metres from a wanted place that are worth a word
@@ -84,10 +87,12 @@ class Infilled:
 def fill(
     motion: Motion, lost: Lost, infiller: Inbetweener | None, *, settings: InfillSettings | None = None,
     densities: Sequence[Any] = (), rig: Rig | None = None, targets: Targets | None = None,
+    course: Curve | None = None,
 ) -> Infilled:  # fmt: skip
     """What is lost of a motion, filled in; RequestError for a method without its network.
 
-    `targets` are places that canonical joints are wanted at in frames in which they are lost.
+    `targets` are places that canonical joints are wanted at in frames in which they are lost; along `course` the hips
+    go while they are.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
     if infiller is None and settings.method != "linear":
@@ -97,9 +102,11 @@ def fill(
         nothing = torch.zeros(0, 2, dtype=torch.bool)
         return Infilled(put_back(base, motion, lost), lost, nothing, Ledger(), time.perf_counter() - began)
     canonical, rigmap = to_canonical(base, rig)
+    if course is not None:
+        canonical = along(canonical, lost.root, course)
     gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
     shown = None if targets is None else targets.shown(gap.seconds, fps=float(motion.fps))
-    proposal, bits = _proposed(gap, infiller, shown)
+    proposal, bits = _proposed(gap, infiller, shown, held=course is not None)
     stands, ledger = contacts.steadied(bits > 0), Ledger()
     if settings.method == "map":
         proposal, ledger = _stood(proposal, bits, gap, settings.standing, densities, shown)
@@ -112,9 +119,11 @@ def fill(
 
 
 def _proposed(
-    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None
+    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool
 ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-    """The infiller's motion on rigid bones, its seams closed, and the log odds of its contacts."""
+    """The infiller's motion on rigid bones, its seams closed, and the log odds of its contacts; `held` to its guess of
+    where the hips go, but for their sway.
+    """
     shown = gap.motion
     body = Motion(CANONICAL, shown.fps, shown.root_position / gap.scale, shown.local_quat_xyzw)
     places, known = body.joint_positions(), gap.places_known()
@@ -128,6 +137,8 @@ def _proposed(
     )  # fmt: skip
     proposed = infiller.propose(image)
     wanted = image.to_world(_without_tremble(proposed.places, image))[0].double()
+    if held:
+        wanted = wanted - _slow_way_off(wanted[:, 0] - body.root_position, gap.root)[:, None]
     root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
     quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root)
     quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
@@ -145,6 +156,13 @@ def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: Position
     change = (places - image.places)[0].flatten(1)
     smooth = gaussian.convolved(change, gaussian.kernel(_TREMBLE, 3), "repeated").unflatten(1, (-1, 3))
     return torch.where(image.known[..., None], places, image.places + smooth)
+
+
+def _slow_way_off(off: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
+    """What hips stray by over the ground, without their sway; nothing where they are known."""
+    off = torch.where(lost[:, None], off, 0.0) * torch.tensor([1.0, 0.0, 1.0], dtype=off.dtype)
+    slow = gaussian.convolved(off, gaussian.kernel(_SWAY, 4 * _SWAY), "repeated")
+    return torch.where(lost[:, None], slow, 0.0)
 
 
 def _toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:

@@ -6,6 +6,7 @@ from typing import Any
 
 from controllers.filling import Infilled, InfillSettings, Method, fill
 from mapctl.capture.masks import Mask
+from mapctl.curve import Curve
 from mapctl.gaps.lost import Lost
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -18,13 +19,15 @@ __all__ = ["InfillSettings", "Infilled", "Method", "infill"]
 def infill(
     motion: Motion, infiller: Inbetweener | None, masks: Sequence[Mask], *,
     settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
+    course: Curve | None = None,
 ) -> Infilled:  # fmt: skip
     """Fill what the masks say is missing. RequestError for masks that do not fit, or a method without its network.
 
-    What stands in a gap does not matter. A gap at the motion's beginning or end is extended into.
+    What stands in a gap does not matter. A gap at the motion's beginning or end is extended into. On a
+    `course` the hips go along it while they are lost.
     """
     lost = Lost.of_masks(motion, masks, to_canonical(motion, rig)[1])
-    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig)
+    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course)
     return replace(done, notes=_notes(lost))
 
 

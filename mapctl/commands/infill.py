@@ -9,6 +9,7 @@ from tyro.conf import UseAppendAction, arg
 from mapctl.commands import options, outputs
 from mapctl.commands.frames import parse_ranges
 from mapctl.commands.threads import compute_on_one
+from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from controllers.infill import Infilled
@@ -31,6 +32,9 @@ class Infill:
     """Only these joints of the rig are lost: in the gaps, or throughout if there are none."""
     method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
+    curve: options.MaybeCurve = None
+    """Where the hips go in the gaps: a CSV or SVG file, or a shape, that passes within 1 m of where each begins and
+    ends."""
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     infiller: options.Name = "infiller"
@@ -81,6 +85,8 @@ class Infill:
     def _check(self) -> None:
         from mapctl import formats
 
+        if self.curve is not None and self.method == "linear":
+            raise RequestError("--curve needs a network's steps; leave --method linear out")
         formats.check_ending(self.out)
         outputs.check_files(options.given(self.out, self.report, self.video))
         if self.video is not None:
@@ -105,7 +111,8 @@ class Infill:
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller)
         densities = priors.load_choice(self.prior)
         settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
-        return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig)
+        course = None if self.curve is None else options.read_curve(self.curve, None)
+        return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course)
 
     def _tell(self, done: "Infilled") -> None:
         summary = done.summary()

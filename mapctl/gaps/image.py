@@ -2,8 +2,8 @@
 
 The paper looks at every frame from its own root, and gives the way of the root by its velocities. In a gap the root is
 not known, and the integral of proposed velocities does not end where the motion goes on. So positions here are seen
-from a reference that is the root where it is known, and leads straight from one known root to the next where it is not:
-what is proposed fits both ends.
+from a reference that is the root where it is known, and a guess at it where it is not (as straight from one known root to the
+next): what is proposed fits both ends.
 """
 
 from dataclasses import dataclass, replace
@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.capture.observed import filled, last_seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +38,12 @@ class PositionImage:
         contacts: Float[Tensor, "batch frames 2"], *, known: Bool[Tensor, "batch frames joints"],
         present: Bool[Tensor, "batch frames"], toes: tuple[int, int],
     ) -> "PositionImage":  # fmt: skip
-        """From world positions (metres), guesses where they are not known, and the hips' heading (radians), which may
-        be anything finite there.
+        """From world positions (metres) and the hips' heading (radians), guesses where they are not known; the
+        reference is their root. Contacts of toes that are not known may be anything finite.
         """
         known = known & present[..., None]
-        rooted = known[..., 0]
-        ground = filled(places_world[..., 0, ::2], rooted)
-        # Whole turns are counted from one known frame to the next: what lies between tells nothing.
-        held = torch.take_along_dim(heading, last_seen(rooted), dim=1)
-        facing = filled(rotations.unwrap_angle(held)[..., None], rooted)[..., 0]
         bits = torch.where(known[..., list(toes)], contacts, 0.5)
+        ground, facing = places_world[..., 0, ::2], rotations.unwrap_angle(heading)
         image = PositionImage(places_world, bits, known, present, ground, facing)
         return replace(image, places=image.from_world(places_world))
 

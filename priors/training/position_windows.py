@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.capture.observed import filled, last_seen, next_seen
 from mapctl.features import LAYOUT, Place, local_rotations, root_places
 from mapctl.gaps import PositionImage
+from mapctl.gaps.guess import led, slerped
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus, folder_of_clips
 
@@ -35,28 +35,9 @@ class Window:
     def image(self, known: Bool[Tensor, "batch frames joints"]) -> PositionImage:
         """With gaps, in which the guess is slerp's."""
         known = known & self.present[..., None]
-        places = torch.where(known[..., None], self.places, self._slerped(known))
-        return PositionImage.of_world(places, self.heading, self.contacts, known=known, present=self.present,
-                                      toes=_TOES)  # fmt: skip
-
-    def _slerped(self, known: Bool[Tensor, "batch frames joints"]) -> Float[Tensor, "batch frames joints 3"]:
-        """Where joints are if rotations that they no longer show go the short way between those that they do."""
-        shown = known.clone()
-        for joint, parent in enumerate(CANONICAL.parents):
-            if parent >= 0:
-                shown[..., parent] &= known[..., joint]
-        batch, frames, joints = shown.shape
-        columns = shown.transpose(1, 2).flatten(0, 1)
-        before, after = last_seen(columns), next_seen(columns)
-        weight = (torch.arange(frames) - before).to(self.places) / (after - before).clamp_min(1)
-        quats = self.quats.transpose(1, 2).flatten(0, 1)
-        lost = ~columns
-        row, frame = lost.nonzero(as_tuple=True)
-        between = rotations.slerp(quats[row, before[lost]], quats[row, after[lost]], weight[row, frame].clamp(0, 1))
-        quats = quats.index_put((row, frame), between)
-        turns = rotations.to_matrix(quats.unflatten(0, (batch, joints)).transpose(1, 2))
-        root = filled(self.places[:, :, 0], known[..., 0])
-        return kinematics.positions_from_matrices(CANONICAL, turns) + root[:, :, None]
+        places = slerped(self.places, self.quats, known)
+        return PositionImage.of_world(places, led(self.heading, known), self.contacts, known=known,
+                                      present=self.present, toes=_TOES)  # fmt: skip
 
 
 class PositionWindows:
