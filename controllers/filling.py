@@ -37,7 +37,7 @@ from mapctl.terms.footing import TOES
 Method = Literal["infiller", "map", "linear"]
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 _TREMBLE = 0.8  # frames at the prior's rate
-_SWAY = 10  # frames at the prior's rate: slower than a step
+_SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
 _SURE = 4.0  # log odds of contacts that are known
 _SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
 _MISSED = 0.001  # metres from a wanted place that are worth a word
@@ -161,8 +161,10 @@ def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: Position
 def _slow_way_off(off: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
     """What hips stray by over the ground, without their sway; nothing where they are known."""
     off = torch.where(lost[:, None], off, 0.0) * torch.tensor([1.0, 0.0, 1.0], dtype=off.dtype)
-    slow = gaussian.convolved(off, gaussian.kernel(_SWAY, 4 * _SWAY), "repeated")
-    return torch.where(lost[:, None], slow, 0.0)
+    slow, taps = torch.zeros_like(off), gaussian.kernel(_SWAY, 4 * _SWAY)
+    for _ in range(_PASSES):  # each takes the slow part of what the ones before it left
+        slow = slow + torch.where(lost[:, None], gaussian.convolved(off - slow, taps, "repeated"), 0.0)
+    return slow
 
 
 def _toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
