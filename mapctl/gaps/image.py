@@ -2,8 +2,8 @@
 
 The paper looks at every frame from its own root, and gives the way of the root by its velocities. In a gap the root is
 not known, and the integral of proposed velocities does not end where the motion goes on. So positions here are seen
-from a reference that is the root where it is known and a guess at it where it is not, as straight from one known root to the
-next: what is proposed fits both ends.
+from a reference that is the root where it is known and a guess at it where it is not (straight from one known root to
+the next): what is proposed fits both ends.
 """
 
 from dataclasses import dataclass, replace
