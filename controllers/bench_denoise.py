@@ -13,12 +13,13 @@ from torch import Tensor
 
 from controllers.denoise import denoise
 from controllers.denoised import Denoised
+from controllers.infill import infill
 from controllers.spoiling import CONDITIONS, Spoilt, true_contacts
 from mapctl import metrics, rotations
 from mapctl.capture.examine import Examined, examine
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
-from mapctl.protocols import Denoiser
+from mapctl.protocols import Denoiser, Inbetweener
 
 Row = dict[str, Any]
 
@@ -56,7 +57,7 @@ def shortened(motion: Motion, *, skip_first: bool) -> Motion:
 
 
 def table(
-    clips: Sequence[Clip], denoiser: Denoiser, *, densities: Sequence[Any] = (),
+    clips: Sequence[Clip], denoiser: Denoiser, *, infiller: Inbetweener | None = None, densities: Sequence[Any] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:  # fmt: skip
     """By condition over all clips, then by kind of clip in the standard condition, then clean clips."""
@@ -66,7 +67,7 @@ def table(
         found = []
         for number, clip in enumerate(clips):
             spoilt = CONDITIONS[name](clip.motion, torch.Generator().manual_seed(number))
-            found.append(judged(clip.motion, spoilt, denoiser, densities))
+            found.append(judged(clip.motion, spoilt, denoiser, densities, infiller))
             if name == STANDARD:
                 by_kind.setdefault(clip.kind, []).append(found[-1])
             done += 1
@@ -83,10 +84,16 @@ def table(
     return [*rows, {"what": "clean, change", "clips": len(clips), **_mean(clean)}]
 
 
-def judged(truth: Motion, spoilt: Spoilt, denoiser: Denoiser, densities: Sequence[Any] = ()) -> Row:
+def judged(
+    truth: Motion, spoilt: Spoilt, denoiser: Denoiser, densities: Sequence[Any] = (),
+    infiller: Inbetweener | None = None,
+) -> Row:  # fmt: skip
     """Mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside mocap's,
-    milliseconds a frame.
+    milliseconds a frame; where joints are masked and there is an infiller, its error too.
     """
+    filled = float("nan")
+    if infiller is not None and spoilt.masks:
+        filled = _error(truth, infill(spoilt.motion, infiller, spoilt.masks).motion)
     began = time.perf_counter()
     done = denoise(spoilt.motion, denoiser, masks=spoilt.masks, densities=densities)
     seconds = time.perf_counter() - began
@@ -95,6 +102,7 @@ def judged(truth: Motion, spoilt: Spoilt, denoiser: Denoiser, densities: Sequenc
     out = _error(truth, done.motion)
     return {
         "in_cm": _error(truth, spoilt.motion), "out_cm": out, "butterworth_cm": butterworth, "savgol_cm": savgol,
+        "infiller_cm": filled,
         "ratio": out / min(butterworth, savgol), "contact_f1": contact_f1(truth, done),
         "skate_cm_s": ours["skate_cm_s"], "mocap_skate": mocap["skate_cm_s"],
         "jitter_ratio": ours["jitter_m_s3"] / mocap["jitter_m_s3"], "believed": float(done.believed.mean()),
@@ -148,4 +156,9 @@ def _error(truth: Motion, other: Motion) -> float:
 
 
 def _mean(rows: Sequence[Row]) -> Row:
-    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
+    """NaN, where a clip cannot give a figure, is left out; of none it stays."""
+    means = {}
+    for name in rows[0]:
+        column = np.array([row[name] for row in rows])
+        means[name] = float(np.nanmean(column)) if np.isfinite(column).any() else float("nan")
+    return means

@@ -43,7 +43,8 @@ class Bench:
     denoiser: options.Name = "denoiser"
     """For `denoise`: the bundled denoiser, or the file or run folder of a trained one."""
     infiller: options.Name = "infiller"
-    """For `infill`: the bundled infiller, or the file or run folder of a trained one."""
+    """For `infill`, and in `denoise` for joints that are lost: the bundled infiller, or the file or run folder of a
+    trained one."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """For `infill`: other trained infillers, to compare as they are."""
     refiner: options.Name = "auto"
@@ -89,10 +90,11 @@ class Bench:
         from controllers.bench_denoise import table
 
         denoiser = priors.load_denoiser(self.denoiser)
+        infiller = priors.load_infiller(self.infiller)
         clips = self._clips_by_kind(denoiser.card)
         densities = priors.load_choice(self.prior)
         with bar("denoising") as progress:
-            return table(clips, denoiser, densities=densities, progress=progress)
+            return table(clips, denoiser, infiller=infiller, densities=densities, progress=progress)
 
     def _infill(self) -> list[dict[str, Any]]:
         import priors
