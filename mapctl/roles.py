@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 from mapctl.errors import RequestError
 from mapctl.skeleton import Skeleton
@@ -39,6 +39,7 @@ def find_upper_legs(skeleton: Skeleton) -> tuple[int, int]:
     return _find_pair(skeleton, _UPPER_LEGS, "upper leg")
 
 
+@lru_cache(maxsize=4096)
 def plain_name(name: str) -> str:
     """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
     strip = partial(_PREFIX.sub, "")

@@ -6,20 +6,50 @@ import os
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[_name] = "1"
 
+from collections.abc import Iterator
+from functools import partial
+from inspect import isclass, isfunction, isgeneratorfunction
 from pathlib import Path
+from typing import ForwardRef, get_args
 
+import jaxtyping
 import pytest
 import torch
 from beartype import BeartypeConf, beartype
-from jaxtyping import install_import_hook
+from jaxtyping import AbstractArray, TypeCheckError, install_import_hook
 
 torch.set_num_threads(1)
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 
-# An int where a float is asked for is fine, as PEP 484 says.
-checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
+# An int where a float is asked for is fine, as PEP 484 says. One error for all that does not fit, a TypeError.
+checked = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeCheckError))
+
+
+def _parts(hint) -> Iterator:
+    """An annotation and all that it is made of."""
+    yield hint
+    for part in hint if isinstance(hint, list) else get_args(hint):  # a list: the arguments of a Callable
+        yield from _parts(part)
+
+
+def _jaxtyped(whole, function=None, *, typechecker):
+    """jaxtyping's decorator at a fraction of its cost: it would check arguments before a call and again after it.
+
+    Here beartype checks once, in the scope that jaxtyping gives to dimensions, and alone where no shape is told. Two
+    kinds are left to jaxtyping: names in quotes, since it passes over those that exist for type checkers alone, and
+    generators, which beartype checks when they begin, outside of their scope.
+    """
+    if function is None:
+        return partial(_jaxtyped, whole, typechecker=typechecker)
+    hints = [part for hint in getattr(function, "__annotations__", {}).values() for part in _parts(hint)]
+    quoted = any(isinstance(hint, str | ForwardRef) for hint in hints)
+    if not isfunction(function) or isgeneratorfunction(function) or quoted:
+        return whole(function, typechecker=typechecker)
+    once = typechecker(function)
+    shapes = any(isclass(hint) and issubclass(hint, AbstractArray) for hint in hints)
+    return whole(once, typechecker=None) if shapes else once
 
 
 def _annotated_modules() -> list[str]:
@@ -29,6 +59,7 @@ def _annotated_modules() -> list[str]:
     return [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in plain]
 
 
+jaxtyping.jaxtyped = partial(_jaxtyped, jaxtyping.jaxtyped)
 install_import_hook(_annotated_modules(), "conftest.checked")
 
 

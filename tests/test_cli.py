@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -102,8 +103,9 @@ def test_same_seed_same_bytes(prior, tmp_path):
         assert run("follow", "s:2", "-o", path, "--seconds", 1, "--seed", seed, "--prior", prior) == 0
         return path.read_bytes()
 
-    assert written("a.bvh", 5) == written("b.bvh", 5)
-    assert len({written(f"{seed}.bvh", seed) for seed in range(6)}) > 1
+    first = written("a.bvh", 5)
+    assert written("b.bvh", 5) == first
+    assert any(written(f"{seed}.bvh", seed) != first for seed in range(5))
 
 
 def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
@@ -142,11 +144,12 @@ def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
     assert float((ends - begins).norm()) < 0.2
 
 
-def test_long_motion_comes_in_pieces(prior, tmp_path):
-    """45 s are three pieces; the header was written before the last of them was drawn."""
-    assert run("generate", "-o", tmp_path, "--seconds", 45, "--prior", prior, "--quiet") == 0
+def test_long_motion_comes_in_pieces(prior, tmp_path, monkeypatch):
+    """Of two seconds here: 4.5 s are three; the header was written before the last of them was drawn."""
+    monkeypatch.setattr(import_module("controllers.generate"), "_CHUNK", 60)
+    assert run("generate", "-o", tmp_path, "--seconds", 4.5, "--prior", prior, "--quiet") == 0
     motion = mapctl.load(tmp_path / "generated_000.bvh")
-    assert motion.num_frames == 1350
+    assert motion.num_frames == 135
     steps = motion.root_position.diff(dim=0).norm(dim=-1)
     assert float(steps.max()) < 0.2
 
@@ -338,7 +341,7 @@ def test_an_interrupted_demo_and_scene_are_written_without_films(prior, tmp_path
 def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_path):
     words = ("follow", "circle:4", "-o", tmp_path / "walk.bvh", "--seconds", 3000, "--prior", prior)
     process = _started(words)
-    time.sleep(8)
+    time.sleep(5)
     process.send_signal(signal.SIGINT)
     _, told = _ended(process)
     assert process.returncode == 130

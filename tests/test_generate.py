@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import bandai_skeleton, generator, tiny_density, turn_between, walk
 
-from controllers.generate import _CHUNK, GenerateSettings, begin, generate, spread_starts, stream, stream_features
+from controllers.generate import GenerateSettings, begin, generate, spread_starts, stream, stream_features
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place, decode, encode
@@ -16,9 +16,13 @@ from mapctl.kinematics import heading
 from mapctl.skeleton import CANONICAL
 
 DENSITY = tiny_density()
-
-
 RAW = GenerateSettings(finishing=None)
+
+
+@pytest.fixture(autouse=True)
+def short_pieces(monkeypatch):
+    """Draws are made a piece at a time: the whole piece of 20 s for one second of motion else."""
+    monkeypatch.setattr(sys.modules["controllers.generate"], "_CHUNK", 100)
 
 
 def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):
@@ -63,7 +67,7 @@ def test_it_is_what_the_prior_samples_from_the_chosen_start():
     draws = generator(3)
     torch.multinomial(DENSITY.starts.weight, 1, generator=draws)
     state = DENSITY.starts.state.pick(torch.tensor([2]))
-    features, _ = DENSITY.sample(state, _CHUNK, draws, temperature=0.5)
+    features, _ = DENSITY.sample(state, 20, draws, temperature=0.5)
     torch.testing.assert_close(encode(motion)[0][1:, 2:66], features[0, 1:15, 2:66].double(), atol=1e-5, rtol=0)
 
 

@@ -73,7 +73,7 @@ def browser():
         opened.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def page(browser, live):
     opened = browser.new_page(viewport=SIZE, accept_downloads=True)
     faults: list[str] = []
@@ -186,6 +186,7 @@ def test_pause_holds_the_frames(page):
     assert shown() > before
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_said_and_another_one_serves(prior, live):
     second = Live("--prior", prior, port=live.port)
     assert f"port {live.port} is in use" in second.lines[0]

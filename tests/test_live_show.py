@@ -1,14 +1,17 @@
 """The live viewer without a browser: what controls do to characters, what is shown, recorded and drawn."""
 
 import math
+import socket
 import time
 
 import numpy as np
 import pytest
 import trimesh
+from helpers import run as run_command
 from helpers import walk
 
 from mapctl import formats
+from mapctl.commands.live import Live
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
 from mapctl.steering import Command
@@ -84,6 +87,23 @@ def test_it_listens_on_this_machine_only(show):
     assert show.url.startswith("http://127.0.0.1:")
     assert show.server.get_host() == "127.0.0.1"
     assert isinstance(Actor(), LiveCharacter)
+
+
+def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys, prior):
+    """As `mapctl live` does it; the process of a character is left out."""
+    actor = Actor()
+    monkeypatch.setattr(Live, "_characters", lambda live: [actor])
+    monkeypatch.setattr(Show, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert run_command("live", "--port", port, "--prior", prior) == 0
+    taken, opened, _ = capsys.readouterr().out.split("\n", 2)
+    assert taken == f"port {port} is in use"
+    assert opened.startswith("open http://127.0.0.1:")
+    assert f":{port} " not in opened
+    assert actor.heard[-1] == ("close",)
 
 
 def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):

@@ -80,19 +80,17 @@ def _given(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
     """Joints by a rig's names, in the version that fits best; spelling counts only where it must."""
     exact = {name: joint for joint, name in enumerate(skeleton.names)}
     plain = {plain_name(name): joint for joint, name in reversed(list(enumerate(skeleton.names)))}
-
-    def joint(name: str) -> int | None:
-        return exact.get(name, plain.get(plain_name(name)))
+    listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
+    joint_of = {name: exact.get(name, plain.get(plain_name(name))) for names in listed.values() for name in names}
 
     best: dict[str, int] = {}
     versions = 1 + max((len(others) for others in rig.aliases.values()), default=0)
     for version in range(versions):
         found: dict[str, int] = {}
-        listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
         for first in (True, False):
             for canonical, names in listed.items():
                 tried = [names[min(version, len(names) - 1)]] if first else names
-                hits = [hit for hit in map(joint, tried) if hit is not None and hit not in found.values()]
+                hits = [hit for hit in map(joint_of.get, tried) if hit is not None and hit not in found.values()]
                 if hits and canonical not in found:
                     found[canonical] = hits[0]
         if len(found) > len(best):
