@@ -17,10 +17,8 @@ from priors.training.position_windows import PositionWindows, Window
 from priors.training.trainer import Trainer
 
 TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
-_EVEN_OFF, _MOST_OFF = (
-    0.5,
-    4.0,
-)  # cm: how far straight lines may be off before a window's weight falls, and falls no more
+_EVEN_OFF = 0.5  # cm that the guess may be off by before a window's weight falls
+_MOST_OFF = 4.0  # cm beyond which it falls no more
 _LEAST_SPREAD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
 
 
@@ -81,21 +79,22 @@ class InfillerTrainer(Trainer[InfillerNetwork]):
 def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: InfillerSettings) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
-    L1 over the whole motion (section 3.3), divided by the number of coordinates that had to be made; a network that
-    keeps what is known is so judged on the gaps, an autoencoder on everything. A window in which straight lines would
-    do counts for more, or a network learns to fidget where nobody moves.
+    L1 over the whole motion (section 3.3), window by window divided by the number of coordinates that had to be made:
+    two joints that are lost count as much as a gap. A network that keeps what is known is so judged on what is not, an
+    autoencoder on everything. A window in which the guess would do counts for more, or a network learns to fidget where
+    nobody moves.
     """
     image = window.image(known)
     wanted = image.from_world(window.places)
     proposed = network(image)
     lacking = window.present[..., None] & ~known
     made = lacking if network.keeps else window.present[..., None].expand_as(known)
-    wrong, count = 100 * (proposed.places - wanted), 3 * made.sum().clamp_min(1)
-    weight = _weights(image.places, wanted, lacking)
-    place = (weight * (wrong.abs().sum(-1) * made).sum(dim=(1, 2))).sum() / count
+    wrong = 100 * (proposed.places - wanted)
+    weight = _weights(image.places, wanted, lacking) / (3 * made.sum(dim=(1, 2)).clamp_min(1))
+    place = (weight * (wrong.abs().sum(-1) * made).sum(dim=(1, 2))).mean()
     pairs = window.present[:, 1:] & window.present[:, :-1]
     slip = torch.diff(wrong, dim=1) * pairs[..., None, None]
-    pace = (weight * slip.abs().sum(dim=(1, 2, 3))).sum() / count
+    pace = (weight * slip.abs().sum(dim=(1, 2, 3))).mean()
     planted = window.contacts[:, 1:] * window.contacts[:, :-1]
     feet = (slip[..., list(TOES), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
     unsure = made[..., list(TOES)]
@@ -107,9 +106,9 @@ def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: In
             "error_cm": error}  # fmt: skip
 
 
-def _weights(straight: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
-    """Of windows: the less, the more straight lines are off (mean over coordinates, cm); 1 at 2 cm."""
-    off = (100 * (straight - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
+def _weights(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
+    """Of windows: the less, the more the guess is off (mean over coordinates, cm); 1 at 2 cm."""
+    off = (100 * (guess - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
     return (2 + _EVEN_OFF) / (off.clamp(max=_MOST_OFF) + _EVEN_OFF)
 
 
