@@ -36,7 +36,8 @@ from mapctl.terms.footing import TOES
 
 Method = Literal["infiller", "map", "linear"]
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
-_TREMBLE = 0.8  # frames at the prior's rate
+_TREMBLE, _MOMENT = 0.8, 10  # frames at the prior's rate
+_FIDGET = 0.005  # metres
 _SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
 _SURE = 4.0  # log odds of contacts that are known
 _SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
@@ -150,11 +151,13 @@ def _proposed(
 
 
 def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
-    """A network's frames are each a little off on their own: what it changes is smoothed over about a frame. What it
-    leaves alone stays.
+    """A network's frames are each a little off on their own: what it changes is smoothed over about a frame. Where it
+    changes next to nothing it only fidgets, and the guess is as good. What it leaves alone stays.
     """
-    change = (places - image.places)[0].flatten(1)
-    smooth = gaussian.convolved(change, gaussian.kernel(_TREMBLE, 3), "repeated").unflatten(1, (-1, 3))
+    change = (places - image.places)[0]
+    smooth = gaussian.convolved(change, gaussian.kernel(_TREMBLE, 3), "repeated")
+    power = gaussian.convolved(smooth.square().sum(dim=-1), gaussian.kernel(_MOMENT, 3 * _MOMENT), "repeated")
+    smooth = smooth * (power / (power + _FIDGET**2))[..., None]
     return torch.where(image.known[..., None], places, image.places + smooth)
 
 
