@@ -182,8 +182,7 @@ def _stood(
 ) -> tuple[Motion, Ledger]:  # fmt: skip
     """The proposal with its feet put down, gap by gap; and the ledger of these."""
     quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
-    for _, start, stop in runs((gap.turns.any(dim=1) | gap.root)[:, None]):
-        first, last = max(0, start - _BESIDE), min(proposal.num_frames, stop + _BESIDE)
+    for first, last in _surroundings(gap.turns.any(dim=1) | gap.root):
         if last - first < 2:
             continue
         part = slice(first, last)
@@ -197,6 +196,14 @@ def _stood(
         root[part] = torch.where(gap.root[part, None], stood.motion.root_position, root[part])
         ledger = ledger.join(stood.ledger)
     return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
+
+
+def _surroundings(lost: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+    """First frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
+    near = lost.clone()
+    for _, start, stop in runs(lost[:, None]):
+        near[max(0, start - _BESIDE) : stop + _BESIDE] = True
+    return [(start, stop) for _, start, stop in runs(near[:, None])]
 
 
 def _at_rate_of(canonical: Motion, proposal: Motion, seconds: Float[Tensor, " shown"]) -> Motion:

@@ -26,7 +26,7 @@ from mapctl.solver.lbfgs import LbfgsSettings, minimise
 from mapctl.solver.objective import Objective
 from mapctl.solver.poses import Guide, Poses
 from mapctl.solver.result import Ledger
-from mapctl.terms import Footing, Keyframe, Likelihood, Noise, Term
+from mapctl.terms import Footing, Keyframe, Likelihood, Noise, Seam, Term
 from mapctl.terms.footing import TOES
 
 _DRIFT = 3.0  # frames, sigma, over which the travel of planted toes is averaged
@@ -39,6 +39,8 @@ class StandingSettings:
     footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.1, sigma_height=0.03, sigma_below=0.02))
     """Planted feet; the rest height is the performer's own. Loose, since mocap's own planted toes move by 6 cm/s, and
     not every floor is level."""
+    seam: Seam | None = None
+    """Jerk, if it is to cost something: of as many frames of each window as the term says."""
     share: float = 0.35
     """Doubt about a proposal that was seen, as a share of the capture's noise."""
     unseen_deg: float = 5.0
@@ -106,6 +108,8 @@ def stand(
             poses, done, choice = _judged(poses, done, judges)
             terms.append(Likelihood(settings.temperature / choice.weight))
             stretches.append(Stretch(first, first + count, choice.density.name, choice.nats, choice.weight))
+        if settings.seam is not None:
+            terms.append(settings.seam)
         if targets is not None:
             terms.append(Keyframe(targets.places[first:stop], targets.wanted[first:stop]))
         features, used, entries, done = _window(poses, terms, count, settings, done, judges)

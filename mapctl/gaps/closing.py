@@ -17,6 +17,7 @@ from mapctl.capture.faults import runs
 
 _SECOND = (1.0, -2.0, 1.0)
 _REACH = 0.12  # seconds over which an offset fades away from its edge
+_CALM = 0.3
 _ANY_BODY, _ANY_JOINT = 4.0, 30.0  # m/s^2 and rad/s^2 that are nothing unusual in any motion
 
 
@@ -64,12 +65,14 @@ def _turning_bends(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "be
 def _usual(
     bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"], least: float
 ) -> Float[Tensor, " joints"]:
-    """By joint, the bend that one in a hundred exceeds where nothing was put in; `least`, where that is less."""
+    """By joint, the bend that one in a hundred exceeds where nothing was put in; `least`, where that is less. Where
+    nothing shows how the motion bends, as at single keys, it is calm.
+    """
     sizes = bends.norm(dim=-1)
     own = ~(put[:-2] | put[1:-1] | put[2:])
     whole = [sizes[own[:, joint], joint] for joint in range(sizes.shape[1])]
-    found = torch.stack([part.quantile(0.99) if len(part) else sizes.new_tensor(least) for part in whole])
-    return found.clamp_min(least)
+    calm = sizes.new_tensor(_CALM * least)
+    return torch.stack([part.quantile(0.99).clamp_min(least) if len(part) else calm for part in whole])
 
 
 def _rows(start: int, stop: int, frames: int) -> range:
