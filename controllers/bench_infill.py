@@ -63,7 +63,8 @@ def table(
     clips: Sequence[Motion], networks: Mapping[str, Inbetweener], *, ours: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:  # fmt: skip
-    """Every task for every method, over all clips that are long enough; `ours` is the network that MAP finishes.
+    """Every task for every method, over all clips that are long enough, if there are any; `ours` is the network that
+    MAP finishes.
 
     Root-aligned joint error over what was missing (over everything where nothing was), cm, mean and standard deviation
     over joints and frames; deviation of six bones' lengths, mm. Clips are on canonical joints.
@@ -72,7 +73,8 @@ def table(
     clips = [on_canonical_bones(clip) for clip in clips]
     for number, task in enumerate(TASKS):
         shown = [middle(clip, task.frames) for clip in clips if clip.num_frames >= task.frames]
-        rows += [{"task": task.name, "clips": len(shown), **row} for row in _of_task(task, shown, networks, ours)]
+        done = _of_task(task, shown, networks, ours) if shown else []
+        rows += [{"task": task.name, "clips": len(shown), **row} for row in done]
         if progress is not None:
             progress(number + 1, len(TASKS))
     return rows

@@ -1,7 +1,9 @@
 """What a motion lacks, as priors see it: at their rate, on canonical joints."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +14,8 @@ from mapctl.features import PRIOR_FPS
 from mapctl.gaps.lost import Lost
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, leg_length
+
+_TIE = 1e-6  # frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,20 +32,19 @@ class CanonicalGap:
 
     @staticmethod
     def of(canonical: Motion, lost: Lost, joint_of: Sequence[int | None]) -> "CanonicalGap":
-        """From the rig's rate. A frame between two of which one is lost shows the other, if that is near enough."""
-        whole = canonical.resample(PRIOR_FPS)
+        """From the rig's rate. A frame between two shows the one near it that lacks least, if they lack more."""
+        whole = _to_the_end(canonical)
         at = torch.arange(whole.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
+        at = at.clamp(max=canonical.num_frames - 1)
         low = (at + 1e-9).floor().long()
-        high = torch.where(at - low > 1e-6, low + 1, low).clamp(max=canonical.num_frames - 1)
-        nearest, reach = _nearest_known(at, ~lost.frames), 0.5 * float(canonical.fps) / PRIOR_FPS
-        between = lost.frames[low] | lost.frames[high]
-        # Half open: a key in the middle of two moments is that of one.
-        snapped = between & (nearest - at <= reach) & (nearest - at > -reach)
-        nearest = nearest.clamp_min(0)
-        at = torch.where(snapped, nearest.to(at), at)
-        low, high = torch.where(snapped, nearest, low), torch.where(snapped, nearest, high)
-        quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[nearest], whole.local_quat_xyzw)
-        root = torch.where(snapped[:, None], canonical.root_position[nearest], whole.root_position)
+        high = torch.where(at - low > _TIE, low + 1, low).clamp(max=canonical.num_frames - 1)
+        lacking = torch.cat([lost.joints, lost.root[:, None]], dim=1)
+        best = _least_lacking(at, lacking.sum(dim=1))
+        snapped = lacking[best].sum(dim=1) < (lacking[low] | lacking[high]).sum(dim=1)
+        at = torch.where(snapped, best.to(at), at)
+        low, high = torch.where(snapped, best, low), torch.where(snapped, best, high)
+        quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[best], whole.local_quat_xyzw)
+        root = torch.where(snapped[:, None], canonical.root_position[best], whole.root_position)
         shown = replace(whole, root_position=root, local_quat_xyzw=rotations.sign_continuous(quats))
         columns = [torch.zeros(canonical.num_frames, dtype=torch.bool) if joint is None else lost.joints[:, joint]
                    for joint in joint_of]  # fmt: skip
@@ -66,12 +69,31 @@ class CanonicalGap:
         return leg_length(self.motion.skeleton) / leg_length(CANONICAL)
 
 
-def _nearest_known(at: Float[Tensor, " shown"], known: Bool[Tensor, " frames"]) -> Int[Tensor, " shown"]:
-    """For each moment, in frames, the nearest one that is known whole; one that is far away if none is."""
-    frames = known.nonzero()[:, 0]
-    if not len(frames):
-        return torch.full_like(at, -len(known), dtype=torch.long)
-    after = torch.searchsorted(frames.to(at), at).clamp(max=len(frames) - 1)
-    before = (after - 1).clamp_min(0)
-    nearer = (frames[before] - at).abs() <= (frames[after] - at).abs()
-    return torch.where(nearer, frames[before], frames[after])
+def _to_the_end(canonical: Motion) -> Motion:
+    """At the prior's rate. Where the very end is far from the last moment it has one of its own."""
+    last = canonical.num_frames - 1
+    moments = int(last * PRIOR_FPS / canonical.fps) + 1
+    over = last * PRIOR_FPS / canonical.fps - (moments - 1)
+    if over <= Fraction(1, 2):
+        return canonical.resample(PRIOR_FPS)
+    frame = torch.arange(canonical.num_frames + math.ceil(canonical.fps / PRIOR_FPS)).clamp(max=last)
+    held = replace(canonical, root_position=canonical.root_position[frame],
+                   local_quat_xyzw=canonical.local_quat_xyzw[frame])  # fmt: skip
+    return held.resample(PRIOR_FPS).slice(0, moments + 1)
+
+
+def _least_lacking(at: Float[Tensor, " shown"], lacking: Int[Tensor, " frames"]) -> Int[Tensor, " shown"]:
+    """For each moment, in frames, the one that lacks least of those that are nearer to it than to another moment; the
+    nearest of several; any other frame if there is none.
+    """
+    edges = (at[1:] + at[:-1]) / 2 + _TIE  # a frame in the middle of two is the earlier one's
+    beyond = at.new_full((1,), torch.inf)
+    own, last = at.round().long(), len(lacking) - 1
+    reach = math.ceil(float(torch.diff(at).max()) / 2) + 1 if len(at) > 1 else last
+    frames = own[:, None] + torch.arange(-reach, reach + 1)
+    near = (frames > torch.cat([-beyond, edges])[:, None]) & (frames <= torch.cat([edges, beyond])[:, None])
+    inside = near & (frames >= 0) & (frames <= last)
+    frames = frames.clamp(0, last)
+    cost = lacking[frames] + (frames - at[:, None]).abs() / (2 * reach + 2)
+    best = torch.where(inside, cost, torch.inf).argmin(dim=1, keepdim=True)
+    return torch.where(inside.any(dim=1), frames.gather(1, best)[:, 0], lacking.argmax())

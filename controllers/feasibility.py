@@ -1,9 +1,13 @@
 """Wishes that cannot hold, named with numbers: before the solve from the data, after it from what was missed."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl import rotations
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.intent import Follow
@@ -13,6 +17,8 @@ from mapctl.protocols import Abilities
 _TOLERATED_CM = 15.0
 _OVERSHOOT = 0.15  # metres: the last frame of a walk may lie a step of one frame beyond the end
 _CORNER_SECONDS = 1.0
+_SPRINT = 10.0  # m/s of the hips
+_WHIP = 30.0  # rad/s of a joint
 
 
 def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
@@ -42,6 +48,28 @@ def after_the_fact(motion: Motion, curve: Curve, joint: str) -> list[str]:
         return []
     first, last = (float(frame / motion.fps) for frame in _stretch(error * 100 > _TOLERATED_CM, int(error.argmax())))
     return [f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first:.1f} and {last:.1f} s"]
+
+
+def between_keys(
+    motion: Motion, hips: Float[Tensor, "frames 3"], *, told: Bool[Tensor, "frames joints"], keys: Sequence[int]
+) -> tuple[str, ...]:
+    """Sentences about neighbouring keys that even the shortest way between them is too fast for, by place of the hips
+    (world, metres) or by rotation of the joints that both of them tell.
+    """
+    notes = []
+    for start, stop in pairwise(keys):
+        seconds = float((stop - start) / motion.fps)
+        speed = float((hips[stop] - hips[start]).norm()) / seconds
+        if speed > _SPRINT:
+            notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, which nobody runs")
+        quats = motion.local_quat_xyzw[[start, stop]]
+        turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[0]), quats[1])).norm(dim=-1)
+        rates = turns * (told[start] & told[stop]) / seconds
+        worst = int(rates.argmax())
+        if float(rates[worst]) > _WHIP:
+            notes.append(f"{motion.skeleton.names[worst]} needs {float(rates[worst]):.0f} rad/s between frames {start} "
+                         f"and {stop}, which nobody turns")  # fmt: skip
+    return tuple(notes)
 
 
 def _stretch(off: Bool[Tensor, " frames"], worst: int) -> tuple[int, int]:

@@ -28,7 +28,7 @@ from mapctl.gaps.targets import Targets, missed, reached
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
-from mapctl.retarget import from_canonical, to_canonical
+from mapctl.retarget import from_canonical, places_on_rig, to_canonical
 from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.result import Ledger
@@ -42,6 +42,8 @@ _SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
 _SURE = 4.0  # log odds of contacts that are known
 _SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
 _MISSED = 0.001  # metres from a wanted place that are worth a word
+_HAIR = 1e-4  # metres from it that are nothing
+_AIMS = 6  # tries at most
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 
 
@@ -92,8 +94,8 @@ def fill(
 ) -> Infilled:  # fmt: skip
     """What is lost of a motion, filled in; RequestError for a method without its network.
 
-    `targets` are places that canonical joints are wanted at in frames in which they are lost; along `course` the hips
-    go while they are.
+    `targets` are places that the rig's hands and feet are wanted at in frames in which they are lost; along `course`
+    the hips go while they are.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
     if infiller is None and settings.method != "linear":
@@ -101,7 +103,8 @@ def fill(
     base = straight(motion, lost)
     if settings.method == "linear" or infiller is None:
         nothing = torch.zeros(0, 2, dtype=torch.bool)
-        return Infilled(put_back(base, motion, lost), lost, nothing, Ledger(), time.perf_counter() - began)
+        done, notes = _on_target(put_back(base, motion, lost), targets, lost, motion, rig)
+        return Infilled(done, lost, nothing, Ledger(), time.perf_counter() - began, notes)
     canonical, rigmap = to_canonical(base, rig)
     if course is not None:
         canonical = along(canonical, lost.root, course)
@@ -113,9 +116,8 @@ def fill(
         proposal, ledger = _stood(proposal, bits, gap, settings.standing, densities, shown)
     whole = _at_rate_of(canonical, proposal, gap.seconds)
     filled = from_canonical(whole, rigmap, base)
-    done, notes = _closed(put_back(filled, base, lost), lost, motion), ()
-    if targets is not None:
-        done, notes = _on_target(done, targets, lost, motion, rig)
+    done = _closed(put_back(filled, base, lost), lost, motion)
+    done, notes = _on_target(done, targets, lost, motion, rig)
     return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes)
 
 
@@ -228,14 +230,24 @@ def _closed(filled: Motion, lost: Lost, original: Motion) -> Motion:
 
 
 def _on_target(
-    filled: Motion, targets: Targets, lost: Lost, original: Motion, rig: Rig | None
+    filled: Motion, targets: Targets | None, lost: Lost, original: Motion, rig: Rig | None
 ) -> tuple[Motion, tuple[str, ...]]:
     """With limbs that are at their places to the hair; and a word on those that do not reach."""
+    if targets is None:
+        return filled, ()
     canonical, rigmap = to_canonical(filled, rig)
-    there = reached(canonical, targets, lost.frames)
-    away = missed(there, targets)
+    aim, done, away = targets, filled, torch.full((1,), torch.inf)
+    for _ in range(_AIMS):
+        there = reached(canonical, aim, lost.frames)
+        done = put_back(from_canonical(there, rigmap, filled), original, lost)
+        found = places_on_rig(done, rigmap)
+        before, away = away, missed(found, targets)
+        if float(away.max()) < _HAIR or float((away - before).abs().max()) < _HAIR:
+            break
+        # Joints that only the rig has carry a limb's end elsewhere than on canonical joints.
+        aim = Targets(targets.places + there.joint_positions() - found, targets.wanted)
     notes = ()
     if float(away.max()) > _MISSED:
         worst = int(away.argmax())
         notes = (f"frame {worst}: a limb stays {100 * float(away.max()):.1f} cm from its place, out of reach",)
-    return put_back(from_canonical(there, rigmap, filled), original, lost), notes
+    return done, notes

@@ -149,6 +149,18 @@ def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap
     return Motion(rigmap.skeleton, motion.fps, hips, rotations.sign_continuous(local)), rigmap
 
 
+def places_on_rig(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:
+    """Where the rig's own joints are, by canonical joint, in a world that stands along Y; 0 for joints it lacks.
+
+    Joints that only the rig has, as those of twist, carry them elsewhere than the canonical motion tells.
+    """
+    places = motion.joint_positions()
+    picked = [torch.zeros_like(places[:, 0]) if joint is None else places[:, joint] for joint in rigmap.joint_of]
+    found = torch.stack(picked, dim=1)
+    upright = rigmap.upright_quat_xyzw
+    return found if upright is None else rotations.rotate(upright.expand(*found.shape[:2], 4), found)
+
+
 def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = None) -> Motion:
     """The canonical motion on the rig. Joints the canonical skeleton lacks keep the original's rotation.
 

@@ -105,7 +105,9 @@ class Bench:
         networks = {infiller.card.config["architecture"]: infiller}
         for name in filter(None, self.baselines.split(",")):
             other = priors.load_infiller(name)
-            networks[other.card.config["architecture"]] = other
+            architecture = other.card.config["architecture"]
+            # Two of one kind are told apart by their names.
+            networks[f"{architecture} {name}" if architecture in networks else architecture] = other
         clips = [retarget.to_canonical(clip.motion)[0] for clip in self._clips_by_kind(infiller.card)]
         with bar("filling") as progress:
             return table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)

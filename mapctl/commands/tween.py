@@ -108,5 +108,5 @@ class Tween:
 
         request = {key: value for key, value in options.as_request("tween", self).items() if value is not None}
         return {"mapctl": __version__, "request": request, "versions": report.versions(),
-                "keys": key_errors(done.motion, motion, keys), **done.summary(),
+                "keys": key_errors(done.motion, motion, keys, options.read_rig(self.rig)), **done.summary(),
                 "measures": metrics.measure(done.motion)}  # fmt: skip

@@ -53,9 +53,9 @@ class Targets:
         return Targets(places, wanted)
 
 
-def missed(motion: Motion, targets: Targets) -> Float[Tensor, " frames"]:
+def missed(places: Float[Tensor, "frames joints 3"], targets: Targets) -> Float[Tensor, " frames"]:
     """By frame, how far the worst joint is from its place, metres."""
-    away = (motion.joint_positions() - targets.places).norm(dim=-1)
+    away = (places - targets.places).norm(dim=-1)
     return (away * targets.wanted).amax(dim=1)
 
 
@@ -65,12 +65,12 @@ def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> 
     """
     for name, (upper, lower) in LIMBS.items():
         end = CANONICAL.index(name)
-        wanted = targets.wanted[:, end]
+        wanted = targets.wanted[:, end] & free
         if not bool(wanted.any()):
             continue
         places = motion.joint_positions()
         away = torch.where(wanted[:, None], targets.places[:, end] - places[:, end], 0.0)
-        offset = _smooth(away, wanted | ~free, fps=float(motion.fps))
+        offset = torch.where(free[:, None], _smooth(away, wanted | ~free, fps=float(motion.fps)), 0.0)
         chain = [CANONICAL.index(joint) for joint in (upper, lower)]
         motion = _bent(motion, places, chain[0], chain[1], end, offset)
     return motion

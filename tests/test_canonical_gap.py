@@ -1,0 +1,150 @@
+"""What a motion lacks at the prior's rate: every key is shown with its own pose at its own time, or another one is."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import apart_deg, on_rig
+from helpers import walk
+
+from controllers.canonical_gap import CanonicalGap
+from mapctl import retarget
+from mapctl.capture.masks import ALL, ROOT, Mask
+from mapctl.gaps.lost import Lost
+from mapctl.skeleton import CANONICAL
+
+RATES = (10, 24, 25, 30, 50, 60, 120)
+EVERY = tuple(range(CANONICAL.num_joints))
+
+
+def keyed(motion, keys, *, hips=()):
+    """All is lost but whole poses, and the hips alone in some frames."""
+    free = torch.ones(motion.num_frames, dtype=torch.bool)
+    free[list(keys)] = False
+    joints, root = free[:, None].expand(-1, motion.num_joints).clone(), free.clone()
+    joints[list(hips), 0] = False
+    root[list(hips)] = False
+    return Lost(joints, root)
+
+
+def gap_of(motion, lost):
+    return CanonicalGap.of(motion, lost, EVERY)
+
+
+def known(gap):
+    """Moments of which nothing is lost."""
+    return (~(gap.root | gap.turns.any(dim=1))).nonzero()[:, 0].tolist()
+
+
+@pytest.mark.parametrize("fps", RATES)
+@pytest.mark.parametrize("spare", [0, 1, 2, 3])
+def test_times_rise_and_reach_the_end(fps, spare):
+    motion = walk(fps + spare, fps=fps)
+    gap = gap_of(motion, keyed(motion, (0, motion.num_frames - 1)))
+    steps = torch.diff(gap.seconds)
+    assert len(gap.seconds) == gap.motion.num_frames == len(gap.turns) == len(gap.root)
+    assert 0.4 / 30 < steps.min() <= steps.max() < 1.6 / 30
+    assert gap.seconds[0] == 0
+    assert gap.seconds[-1] * fps == pytest.approx(motion.num_frames - 1)
+    assert known(gap) == [0, gap.motion.num_frames - 1]
+
+
+@pytest.mark.parametrize("fps", RATES)
+def test_a_key_at_any_frame_is_one_moment_with_its_own_pose_and_time(fps):
+    motion = walk(fps, fps=fps, turn_rate=0.5)
+    for key in range(2 * max(1, fps // 30), fps - 2 * max(1, fps // 30)):
+        gap = gap_of(motion, keyed(motion, (0, key, fps - 1)))
+        assert (torch.diff(gap.seconds) > 0).all()
+        _, moment, _ = known(gap)
+        assert gap.seconds[moment] * fps == pytest.approx(key)
+        assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
+        assert apart_deg(gap.motion.local_quat_xyzw[moment], motion.local_quat_xyzw[key]).max() < 1e-5
+        assert not gap.root[moment]
+        assert gap.places_known()[moment].all()
+
+
+@pytest.mark.parametrize("fps", [24, 30, 120])
+def test_several_keys_are_each_shown_and_runs_of_them_too(fps):
+    motion = walk(2 * fps, fps=fps)
+    keys = (0, fps // 3, fps // 2 + 1, fps + 1, *range(fps + fps // 2, fps + fps // 2 + fps // 10), 2 * fps - 1)
+    gap = gap_of(motion, keyed(motion, keys))
+    assert (torch.diff(gap.seconds) > 0).all()
+    shown = gap.seconds[known(gap)] * fps
+    at_a_moment = [key for key in keys if (shown - key).abs().min() < 1e-9]
+    assert set(keys[:4]) <= set(at_a_moment)
+    assert all((shown - key).abs().min() <= 0.5 * fps / 30 + 1e-9 for key in keys)
+
+
+@pytest.mark.parametrize("key", [60, 61, 62, 63])
+def test_a_frame_that_tells_the_hips_alone_is_shown_too(key):
+    motion = walk(120, fps=120)
+    gap = gap_of(motion, keyed(motion, (0, 119), hips=(key,)))
+    (moment,) = ((gap.seconds * 120 - key).abs() < 1e-9).nonzero()[:, 0].tolist()
+    assert not gap.root[moment]
+    assert not gap.turns[moment, 0]
+    assert gap.turns[moment, 1:].all()
+    assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
+
+
+def test_a_frame_that_tells_all_is_shown_rather_than_a_nearer_one_that_tells_less():
+    motion = walk(120, fps=120)
+    gap = gap_of(motion, keyed(motion, (0, 62, 119), hips=(61,)))
+    assert 62 in (gap.seconds[known(gap)] * 120).round().tolist()
+
+
+@pytest.mark.parametrize("fps", [30, 50, 120])
+def test_where_nothing_is_lost_it_is_the_motion_at_the_priors_rate(fps):
+    motion = walk(fps, fps=fps)
+    gap = gap_of(motion, keyed(motion, range(fps)))
+    whole = motion.resample(30)
+    frames = slice(0, whole.num_frames)
+    assert torch.equal(gap.motion.root_position[frames], whole.root_position)
+    assert torch.allclose(gap.seconds[frames], torch.arange(whole.num_frames).double() / 30)
+    assert known(gap) == list(range(gap.motion.num_frames))
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+@pytest.mark.parametrize("rig", ["canonical", "daz"])
+def test_joints_that_are_lost_throughout_are_lost_in_every_moment(rig, fps):
+    motion = on_rig(rig, fps, fps=fps)
+    canonical, rigmap = retarget.to_canonical(motion)
+    hand = {"canonical": "leftHand", "daz": "lHand"}[rig]
+    lost = Lost.of_masks(motion, [Mask(hand, 0, fps)], rigmap)
+    gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
+    assert known(gap) == []
+    taken = {CANONICAL.names[joint] for joint in gap.turns.all(dim=0).nonzero()[:, 0].tolist()}
+    assert taken == {"leftHand", "leftLowerArm"}
+    assert gap.turns.any(dim=0).sum() == 2
+    assert not gap.root.any()
+    places = gap.places_known()
+    assert not places[:, CANONICAL.index("leftHand")].any()
+    assert places[:, CANONICAL.index("rightHand")].all()
+
+
+def test_the_edges_of_a_gap_are_shown_while_a_joint_is_lost_throughout():
+    motion = walk(120, fps=120)
+    _, rigmap = retarget.to_canonical(motion)
+    lost = Lost.of_masks(motion, [Mask("leftHand", 0, 120), Mask(ALL, 50, 70)], rigmap)
+    gap = gap_of(motion, lost)
+    at = gap.seconds * 120
+    inside = (at > 49.5) & (at < 69.5)
+    assert (gap.root == inside).all()
+    assert at[~inside].round().tolist()[12:14] == [48, 70]
+
+
+def test_a_place_is_known_only_with_all_that_carries_it():
+    motion = walk(30)
+    _, rigmap = retarget.to_canonical(motion)
+    gap = gap_of(motion, Lost.of_masks(motion, [Mask(ROOT, 5, 9)], rigmap))
+    assert not gap.places_known()[5:9].any()
+    assert gap.places_known()[9:].all()
+    gap = gap_of(motion, Lost.of_masks(motion, [Mask("chest", 5, 9)], rigmap))
+    unknown = {CANONICAL.names[joint] for joint in (~gap.places_known()[6]).nonzero()[:, 0].tolist()}
+    assert {"head", "leftHand", "neck"} <= unknown
+    assert not unknown & {"hips", "leftFoot", "rightToes"}
+
+
+def test_a_larger_performer_is_told():
+    motion = walk(30)
+    large = replace(motion, skeleton=replace(motion.skeleton, offsets=1.3 * motion.skeleton.offsets))
+    assert gap_of(large, keyed(large, (0, 29))).scale == pytest.approx(1.3)

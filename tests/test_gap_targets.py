@@ -1,0 +1,216 @@
+"""Places that hands and feet are wanted at: met to the hair, nothing else moved, smoothly there and back."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import apart_deg
+from helpers import generator, quat_xyzw, walk
+
+from mapctl.errors import RequestError
+from mapctl.gaps.targets import LIMBS, Targets, missed, reached
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+
+JOINTS = CANONICAL.num_joints
+HAIR = 1e-4
+
+
+def at(motion, wanted):
+    """Targets by (frame, limb) to place."""
+    places = torch.zeros(motion.num_frames, JOINTS, 3).double()
+    mask = torch.zeros(motion.num_frames, JOINTS, dtype=torch.bool)
+    for (frame, limb), place in wanted.items():
+        places[frame, CANONICAL.index(limb)] = place
+        mask[frame, CANONICAL.index(limb)] = True
+    return Targets(places, mask)
+
+
+def place_of(motion, frame, joint):
+    return motion.joint_positions()[frame, CANONICAL.index(joint)]
+
+
+def nearer(motion, frame, limb, share=0.15, aside=0.05):
+    """A place in reach: toward where the limb begins, and somewhat aside."""
+    begins, ends = place_of(motion, frame, LIMBS[limb][0]), place_of(motion, frame, limb)
+    aside = aside * torch.randn(3, generator=generator(frame)).double()
+    place = ends + share * (begins - ends) + aside
+    length = CANONICAL.offsets[[CANONICAL.index(LIMBS[limb][1]), CANONICAL.index(limb)]].norm(dim=-1).sum()
+    return begins + (place - begins) * min(1.0, 0.98 * float(length) / float((place - begins).norm()))
+
+
+def all_free(motion):
+    return torch.ones(motion.num_frames, dtype=torch.bool)
+
+
+def lengths(motion):
+    """Of every bone in every frame."""
+    places = motion.joint_positions()
+    return (places[:, 1:] - places[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
+
+
+def standing(**angles):
+    """Frames in the rest pose, joints turned by rotation vectors."""
+    frames = 31
+    vectors = torch.zeros(frames, JOINTS, 3).double()
+    for joint, vector in angles.items():
+        vectors[:, CANONICAL.index(joint)] = torch.tensor(vector).double()
+    root = torch.tensor([0.0, 1.0, 0.0]).double().expand(frames, 3).clone()
+    return Motion(CANONICAL, walk(2).fps, root, quat_xyzw(vectors))
+
+
+@pytest.mark.parametrize("limb", LIMBS)
+@pytest.mark.parametrize("fps", [30, 120])
+def test_places_in_reach_are_met_and_bones_stay_rigid(limb, fps):
+    motion = walk(2 * fps, fps=fps, turn_rate=0.4)
+    frames = (fps // 2, fps, fps + fps // 3)
+    targets = at(motion, {(frame, limb): nearer(motion, frame, limb) for frame in frames})
+    assert missed(motion.joint_positions(), targets).max() > 0.03
+    made = reached(motion, targets, all_free(motion))
+    assert missed(made.joint_positions(), targets).max() < HAIR
+    assert (lengths(made) - lengths(motion)).abs().max() < 1e-12
+
+
+def test_several_limbs_are_met_at_once():
+    motion = walk(60)
+    targets = at(motion, {(30, limb): nearer(motion, 30, limb) for limb in LIMBS})
+    assert missed(reached(motion, targets, all_free(motion)).joint_positions(), targets).max() < HAIR
+
+
+@pytest.mark.parametrize("limb", LIMBS)
+def test_only_the_limb_turns_and_only_where_it_is_free(limb):
+    motion, free = walk(60), torch.zeros(60, dtype=torch.bool)
+    free[20:40] = True
+    made = reached(motion, at(motion, {(30, limb): nearer(motion, 30, limb)}), free)
+    turned = (made.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1)
+    assert set(turned.any(dim=0).nonzero()[:, 0].tolist()) == {CANONICAL.index(joint) for joint in LIMBS[limb]}
+    assert torch.equal(made.local_quat_xyzw[~free], motion.local_quat_xyzw[~free])
+    assert torch.equal(made.root_position, motion.root_position)
+
+
+def test_a_place_in_a_frame_that_is_not_free_is_let_be():
+    motion, free = walk(40), torch.zeros(40, dtype=torch.bool)
+    free[10:20] = True
+    made = reached(motion, at(motion, {(30, "leftHand"): nearer(motion, 30, "leftHand")}), free)
+    assert torch.equal(made.local_quat_xyzw, motion.local_quat_xyzw)
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+def test_a_limb_goes_there_and_back_smoothly(fps):
+    """Far away nothing is left of the offset, and no step is a leap."""
+    motion, frame = walk(4 * fps, fps=fps), 2 * fps
+    made = reached(motion, at(motion, {(frame, "leftHand"): nearer(motion, frame, "leftHand")}), all_free(motion))
+    offset = (made.joint_positions() - motion.joint_positions())[:, CANONICAL.index("leftHand")]
+    peak = offset[frame].norm()
+    assert offset[: frame - fps].norm(dim=-1).max() < 0.02 * peak
+    assert offset[frame + fps :].norm(dim=-1).max() < 0.02 * peak
+    assert torch.diff(offset, dim=0).norm(dim=-1).max() * fps < 8 * peak
+    assert torch.diff(offset, n=2, dim=0).norm(dim=-1).max() * fps**2 < 120 * peak
+
+
+@pytest.mark.parametrize("count", [2, 15])
+def test_runs_of_places_are_met_in_every_frame(count):
+    motion = walk(60)
+    frames = range(20, 20 + count)
+    start = nearer(motion, 20, "rightHand")
+    targets = at(motion, {(frame, "rightHand"): start + place_of(motion, frame, "chest") - place_of(motion, 20, "chest")
+                          for frame in frames})  # fmt: skip
+    made = reached(motion, targets, all_free(motion))
+    assert missed(made.joint_positions(), targets).max() < HAIR
+
+
+@pytest.mark.parametrize("limb", LIMBS)
+def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(limb):
+    motion = walk(31)
+    begins, ends = (place_of(motion, 15, joint) for joint in (LIMBS[limb][0], limb))
+    length = float(lengths(motion)[15, [CANONICAL.index(joint) - 1 for joint in (LIMBS[limb][1], limb)]].sum())
+    way = torch.nn.functional.normalize(ends - begins + torch.tensor([0.1, 0.05, 0.1]).double(), dim=-1)
+    targets = at(motion, {(15, limb): begins + (length + 0.3) * way})
+    made = reached(motion, targets, all_free(motion)).joint_positions()
+    assert (made[15, CANONICAL.index(limb)] - (begins + length * way)).norm() < 2 * HAIR
+    wrong = missed(made, targets)
+    assert wrong[15] == pytest.approx(0.3, abs=2 * HAIR)
+    assert wrong[:15].max() == wrong[16:].max() == 0
+
+
+@pytest.mark.parametrize("limb", LIMBS)
+def test_a_place_where_the_limb_begins_breaks_nothing(limb):
+    motion = walk(31)
+    made = reached(motion, at(motion, {(15, limb): place_of(motion, 15, LIMBS[limb][0])}), all_free(motion))
+    assert made.joint_positions().isfinite().all()
+
+
+@pytest.mark.parametrize(("limb", "forward"), [("leftFoot", 1), ("rightFoot", 1), ("leftHand", -1), ("rightHand", -1)])
+def test_straight_limbs_bend_knees_forward_and_elbows_back(limb, forward):
+    motion = standing()
+    upper, lower = LIMBS[limb]
+    begins, ends = place_of(motion, 15, upper), place_of(motion, 15, limb)
+    made = reached(motion, at(motion, {(15, limb): ends + 0.2 * (begins - ends)}), all_free(motion))
+    bent = place_of(made, 15, lower) - begins
+    axis = torch.nn.functional.normalize(ends - begins, dim=-1)
+    across = bent - (bent @ axis) * axis
+    assert float(across[2]) * forward > 0.05
+    assert abs(float(across[2])) == pytest.approx(float(across.norm()), rel=0.02)
+
+
+def test_a_bent_limb_stays_in_its_plane():
+    """Knees that point outward do not swing to the front."""
+    motion = standing(leftUpperLeg=(0.0, 1.2, 0.0), leftLowerLeg=(0.6, 0.0, 0.0))
+    begins, ends = place_of(motion, 15, "leftUpperLeg"), place_of(motion, 15, "leftFoot")
+    made = reached(motion, at(motion, {(15, "leftFoot"): ends + 0.1 * (begins - ends)}), all_free(motion))
+    axis = torch.nn.functional.normalize(ends - begins, dim=-1)
+    knees = [place_of(each, 15, "leftLowerLeg") - begins for each in (motion, made)]
+    before, after = (knee - (knee @ axis) * axis for knee in knees)
+    assert float(after.norm()) > float(before.norm()) > 0.05
+    assert float(after @ before) == pytest.approx(float(after.norm() * before.norm()), rel=1e-9)
+    assert float(after[0]) > 2 * float(after[2])
+
+
+def test_a_place_where_the_limb_is_turns_nothing():
+    motion = walk(31)
+    made = reached(motion, at(motion, {(15, "leftFoot"): place_of(motion, 15, "leftFoot")}), all_free(motion))
+    assert apart_deg(made.local_quat_xyzw, motion.local_quat_xyzw).max() < 1e-6
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4])
+def test_motions_of_a_few_frames_are_met_too(frames):
+    motion = walk(frames)
+    targets = at(motion, {(frames - 1, "leftHand"): nearer(motion, frames - 1, "leftHand")})
+    assert missed(reached(motion, targets, all_free(motion)).joint_positions(), targets).max() < HAIR
+
+
+@pytest.mark.parametrize("joint", ["hips", "head", "leftLowerArm", "rightToes"])
+def test_joints_that_are_no_hand_or_foot_are_refused(joint):
+    with pytest.raises(RequestError, match=f"places are for leftHand, .*; {joint} has none"):
+        at(walk(5), {(2, joint): torch.zeros(3).double()})
+
+
+@pytest.mark.parametrize("fps", [24, 30, 120])
+def test_every_wanted_place_is_shown_at_the_moment_nearest_to_it(fps):
+    motion = walk(2 * fps, fps=fps)
+    frames = [1, fps // 2, fps // 2 + 5, fps, 2 * fps - 1]
+    targets = at(motion, {(frame, "leftHand"): torch.full((3,), float(frame)).double() for frame in frames})
+    moments = torch.arange(60).double() / 30
+    shown, hand = targets.shown(moments, fps=fps), CANONICAL.index("leftHand")
+    assert int(shown.wanted.sum()) == len(frames)
+    for frame in frames:
+        (moment,) = (shown.places[:, hand, 0] == frame).nonzero()[:, 0].tolist()
+        assert shown.wanted[moment, hand]
+        assert abs(moments[moment] - frame / fps) <= (moments - frame / fps).abs().min() + 1e-12
+
+
+def test_at_the_same_moments_the_same_places_are_shown():
+    motion = walk(30)
+    targets = at(motion, {(7, "leftHand"): torch.ones(3).double(), (9, "rightFoot"): torch.zeros(3).double()})
+    shown = targets.shown(torch.arange(30).double() / 30, fps=30)
+    assert torch.equal(shown.wanted, targets.wanted)
+    assert torch.equal(shown.places, targets.places)
+
+
+def test_what_stands_where_no_place_is_wanted_does_not_matter():
+    motion = walk(40)
+    targets = at(motion, {(20, "leftHand"): nearer(motion, 20, "leftHand")})
+    wild = replace(targets, places=torch.where(targets.wanted[..., None], targets.places, 50.0))
+    made, other = (reached(motion, each, all_free(motion)) for each in (targets, wild))
+    assert torch.equal(made.local_quat_xyzw, other.local_quat_xyzw)
+    assert torch.equal(missed(motion.joint_positions(), targets), missed(motion.joint_positions(), wild))

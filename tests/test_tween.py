@@ -1,0 +1,276 @@
+"""A few keys to a whole motion: keys are met, nothing else counts, what cannot be is said or refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import apart_deg, on_rig
+from helpers import random_motion, walk
+from rig_maker import Make, make, names_of
+from tiny_infiller import tiny_infiller
+
+from controllers.filling import InfillSettings
+from controllers.tween import Keys, key_errors, tween
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.gaps.lost import Lost, put_back, straight
+
+RIGS = ("canonical", "bandai", "daz")
+ON_RIGS = [*((rig, 30) for rig in RIGS), ("daz", 120)]
+LIMBS = {"canonical": ("leftHand", "rightFoot"), "bandai": ("Hand_L", "Foot_R"), "daz": ("lHand", "rFoot")}
+HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
+
+
+def made_of(motion, frames, *, method="infiller", drawn=0.02, **told):
+    return tween(motion, Keys(tuple(frames), **told), tiny_infiller(drawn=drawn),
+                 settings=InfillSettings(method=method))  # fmt: skip
+
+
+def frames_of(fps):
+    """Of keys in 1.5 seconds: neither evenly spread nor on the prior's moments."""
+    return 0, fps // 2 + 1, fps + 3, round(1.5 * fps) - 1
+
+
+def keyed(motion, frames):
+    free = torch.ones(motion.num_frames, dtype=torch.bool)
+    free[list(frames)] = False
+    return Lost(free[:, None].expand(-1, motion.num_joints).clone(), free)
+
+
+def spoilt(motion, frames):
+    """Nonsense between the keys."""
+    wild = random_motion(motion.skeleton, motion.num_frames, seed=3)
+    wild = replace(wild, moving_offsets={joint: wild.root_position for joint in motion.moving_offsets})
+    return put_back(wild, motion, keyed(motion, frames))
+
+
+def assert_met(made, motion, frames):
+    """To the bit."""
+    frames = list(frames)
+    assert (made.num_frames, made.fps, made.skeleton) == (motion.num_frames, motion.fps, motion.skeleton)
+    assert torch.equal(made.local_quat_xyzw[frames], motion.local_quat_xyzw[frames])
+    assert torch.equal(made.root_position[frames], motion.root_position[frames])
+    for joint, values in motion.moving_offsets.items():
+        assert torch.equal(made.moving_offsets[joint][frames], values[frames])
+    assert made.joint_positions().isfinite().all()
+
+
+def same(first, second):
+    quats = torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
+    return quats and torch.equal(first.joint_positions(), second.joint_positions())
+
+
+def missed_cm(made, motion, frame, names):
+    joints = [motion.skeleton.index(name) for name in names]
+    return 100 * float((made.joint_positions() - motion.joint_positions())[frame, joints].norm(dim=-1).max())
+
+
+@pytest.mark.parametrize(("rig", "fps"), [*ON_RIGS, ("bandai", 120), ("canonical", 24)])
+def test_poses_that_are_keys_are_met_to_the_bit(rig, fps):
+    motion = on_rig(rig, round(1.5 * fps), fps=fps)
+    made = made_of(motion, frames_of(fps)).motion
+    assert_met(made, motion, frames_of(fps))
+    apart = (made.joint_positions() - motion.joint_positions()).norm(dim=-1).amax(dim=1)
+    assert (apart > 1e-4).sum() > motion.num_frames // 2
+
+
+@pytest.mark.parametrize(("rig", "method"), [*((rig, "map") for rig in RIGS), ("daz", "linear")])
+def test_by_every_method(rig, method):
+    motion = on_rig(rig, 45)
+    assert_met(made_of(motion, frames_of(30), method=method).motion, motion, frames_of(30))
+
+
+@pytest.mark.parametrize("told", [{}, {"limbs": True}, {"root_only": True}])
+@pytest.mark.parametrize(("rig", "method"), [("canonical", "infiller"), ("bandai", "map"), ("daz", "linear")])
+def test_other_frames_change_nothing(rig, method, told):
+    motion, frames = on_rig(rig, 45), frames_of(30)
+    told = {"limbs": LIMBS[rig]} if "limbs" in told else told
+    other = spoilt(motion, frames)
+    assert not same(motion, other)
+    assert same(*(made_of(each, frames, method=method, **told).motion for each in (motion, other)))
+
+
+@pytest.mark.parametrize("method", ["infiller", "linear"])
+def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either(method):
+    """Its T-pose is found from the keys; joints that only it has carry hands elsewhere, and these are met all the
+    same.
+    """
+    made = make(Make(names_of("ue4"), bones_along_x=True, zup=True, root="root"))
+    motion, frames = made.motion(walk(45, turn_rate=0.3)), (0, 11, 30, 44)
+    limbs = (made.joint["leftHand"],)
+    first, second = (made_of(each, frames, method=method, limbs=limbs) for each in (motion, spoilt(motion, frames)))
+    assert same(first.motion, second.motion)
+    assert max(missed_cm(first.motion, motion, frame, limbs) for frame in (11, 30)) < 0.1
+    assert first.notes == ()
+
+
+@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "map")])
+def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
+    motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
+    done = made_of(motion, frames, method=method, limbs=LIMBS[rig])
+    assert_met(done.motion, motion, [frames[0], frames[-1]])
+    assert done.notes == ()
+    for frame in frames[1:-1]:
+        assert missed_cm(done.motion, motion, frame, LIMBS[rig]) < 0.1
+        assert missed_cm(done.motion, motion, frame, motion.skeleton.names) > 1
+
+
+def test_slerp_meets_hands_too():
+    motion = on_rig("bandai", 45)
+    done = made_of(motion, frames_of(30), method="linear", limbs=("Hand_L",))
+    assert max(missed_cm(done.motion, motion, frame, ("Hand_L",)) for frame in frames_of(30)) < 0.1
+    plain = straight(motion, keyed(motion, (0, 44)))
+    arm = [motion.skeleton.index(name) for name in ("UpperArm_L", "LowerArm_L")]
+    others = [joint for joint in range(motion.num_joints) if joint not in arm]
+    assert apart_deg(done.motion.local_quat_xyzw, plain.local_quat_xyzw)[:, others].max() < 1e-4
+
+
+def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
+    motion = on_rig("canonical", 45)
+    root = motion.root_position.clone()
+    root[22] += torch.tensor([0.0, 1.5, 0.0]).double()
+    done = made_of(replace(motion, root_position=root), (0, 22, 44), limbs=("leftHand",))
+    (note,) = done.notes
+    assert note.startswith("frame 22: a limb stays ")
+    assert note.endswith(" cm from its place, out of reach")
+
+
+@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "map")])
+def test_the_place_and_rotation_of_the_hips_are_met_to_the_bit(rig, fps, method):
+    motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
+    made = made_of(motion, frames, method=method, root_only=True).motion
+    assert_met(made, motion, [frames[0], frames[-1]])
+    hips, between = motion.skeleton.index(HIPS[rig]), list(frames[1:-1])
+    assert torch.equal(made.joint_positions()[between, hips], motion.joint_positions()[between, hips])
+    assert torch.equal(made.joint_rotations()[between, hips], motion.joint_rotations()[between, hips])
+    assert not torch.equal(made.local_quat_xyzw[between], motion.local_quat_xyzw[between])
+
+
+@pytest.mark.parametrize("fps", [24, 120])
+@pytest.mark.parametrize("aside", [1, 2])
+def test_hips_that_are_keys_between_two_moments_do_not_leap(fps, aside):
+    """At every frame of a fast curve the hips go about as straight lines from key to key do, corners cut."""
+    motion = walk(2 * fps, fps=fps, turn_rate=1.5)
+    frames = (0, fps // 2 + aside, fps + fps // 3 + aside, 2 * fps - 1)
+    made = made_of(motion, frames, drawn=0.0, root_only=True).motion
+    lines = straight(motion, keyed(motion, frames))
+    assert (made.root_position - lines.root_position).norm(dim=-1).max() < 0.08
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+@pytest.mark.parametrize("keys", [(0, 1, 22, 23, 43, 44), (3, 4)])
+def test_keys_may_be_one_frame_apart(fps, keys):
+    motion = on_rig("bandai", 45, fps=fps)
+    assert_met(made_of(motion, keys).motion, motion, keys)
+
+
+def test_beyond_the_first_and_the_last_key_the_motion_goes_on():
+    motion = on_rig("canonical", 45)
+    made = made_of(motion, (10, 20, 34)).motion
+    assert_met(made, motion, (10, 20, 34))
+    steps = torch.diff(made.joint_positions(), dim=0).norm(dim=-1).amax(dim=1)
+    assert steps.max() < 0.5
+
+
+def test_keys_come_in_any_order_and_may_be_repeated():
+    motion = on_rig("bandai", 45)
+    assert same(*(made_of(motion, keys).motion for keys in ((0, 16, 33, 44), (33, 0, 44, 16, 33, 0))))
+
+
+def test_the_same_comes_twice():
+    motion = on_rig("daz", 45)
+    first, second = (made_of(motion, frames_of(30), method="map", limbs=LIMBS["daz"]).motion for _ in range(2))
+    assert same(first, second)
+
+
+@pytest.mark.parametrize(("keys", "message"), [
+    (Keys((0,)), "at least two keys, got 1"), (Keys((7, 7, 7)), "at least two keys, got 1"),
+    (Keys(()), "at least two keys, got 0"),
+    (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
+    (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
+    (Keys((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+    (Keys((0, 20, 44), limbs=("Foot_R", "foot_l")), "no hand or foot 'foot_l'; the nearest is Foot_L"),
+    (Keys((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
+])  # fmt: skip
+def test_keys_that_cannot_be_are_refused(keys, message):
+    with pytest.raises(RequestError, match=message):
+        tween(on_rig("bandai", 45), keys, tiny_infiller())
+
+
+def test_keys_of_two_kinds_at_once_are_refused():
+    with pytest.raises(RequestError, match="two kinds; choose one"):
+        Keys((0, 20, 44), limbs=("Hand_L",), root_only=True)
+
+
+def test_a_network_is_needed_but_for_slerp():
+    motion = on_rig("canonical", 30)
+    with pytest.raises(RequestError, match="method map needs an infiller"):
+        tween(motion, Keys((0, 29)), None)
+    made = tween(motion, Keys((0, 29)), None, settings=InfillSettings(method="linear")).motion
+    assert same(made, straight(motion, keyed(motion, (0, 29))))
+
+
+@pytest.mark.parametrize("told", [{}, {"root_only": True}])
+def test_neighbouring_keys_that_no_hips_could_join_are_named_with_numbers(told):
+    motion = on_rig("bandai", 45)
+    hips = motion.skeleton.index("Hips")
+    moved = motion.moving_offsets[hips].clone()
+    moved[21:] += torch.tensor([1.5, 0.0, 0.0]).double()
+    leaping = replace(motion, moving_offsets={hips: moved})
+    apart = float((leaping.joint_positions()[21] - leaping.joint_positions()[20])[hips].norm())
+    done = made_of(leaping, (0, 20, 21, 44), **told)
+    assert done.notes == (f"the hips need {30 * apart:.1f} m/s between frames 20 and 21, which nobody runs",)
+    assert made_of(leaping, (0, 18, 24, 44), **told).notes == ()
+    assert made_of(leaping, (0, 20, 21, 44), limbs=("Hand_L",)).notes[:1] != done.notes
+
+
+@pytest.mark.parametrize(("joint", "told", "said"), [
+    ("UpperArm_L", {}, True), ("UpperArm_L", {"root_only": True}, False), ("Hips", {"root_only": True}, True),
+])  # fmt: skip
+def test_neighbouring_keys_that_no_joint_could_join_are_named_with_numbers(joint, told, said):
+    motion = on_rig("bandai", 45)
+    half, quats = torch.tensor(0.75).double(), motion.local_quat_xyzw.clone()
+    turn = torch.stack([torch.sin(half), half * 0, half * 0, torch.cos(half)])
+    index = motion.skeleton.index(joint)
+    quats[20, index] = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
+    quats[21, index] = turn
+    done = made_of(replace(motion, local_quat_xyzw=quats), (0, 20, 21, 44), **told)
+    expected = (f"{joint} needs 45 rad/s between frames 20 and 21, which nobody turns",)
+    assert done.notes == (expected if said else ())
+
+
+def test_keys_of_a_walk_need_nothing_that_nobody_does():
+    motion = on_rig("canonical", 45)
+    assert made_of(motion, range(0, 45, 4)).notes == ()
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_errors_at_keys_are_told_for_what_they_tell(rig):
+    motion, frames = on_rig(rig, 45), frames_of(30)
+    told = {"pose": {}, "limbs": {"limbs": LIMBS[rig]}, "root": {"root_only": True}}
+    for what, kind in told.items():
+        keys = Keys(frames, **kind)
+        rows = key_errors(motion, motion, keys)
+        assert [row["frame"] for row in rows] == list(frames)
+        assert [row["what"] for row in rows] == ["pose", what, what, "pose"]
+        assert max(row["missed_cm"] for row in rows) == 0
+        assert [("missed_deg" in row) for row in rows] == [True, what != "limbs", what != "limbs", True]
+        wrong = spoilt(motion, (0, 44))
+        rows = key_errors(wrong, motion, keys)
+        picked = {"pose": motion.skeleton.names, "limbs": LIMBS[rig], "root": (HIPS[rig],)}[what]
+        assert rows[1]["missed_cm"] == pytest.approx(missed_cm(wrong, motion, frames[1], picked))
+        assert rows[1]["missed_cm"] > 1
+        if what == "root":
+            hips = motion.skeleton.index(HIPS[rig])
+            turned = apart_deg(wrong.joint_rotations(), motion.joint_rotations())[frames[1], hips]
+            assert rows[1]["missed_deg"] == pytest.approx(float(turned), rel=1e-6)
+
+
+def test_places_on_the_rig_are_those_of_its_own_joints():
+    motion = on_rig("daz", 20)
+    canonical, rigmap = retarget.to_canonical(motion)
+    places = retarget.places_on_rig(motion, rigmap)
+    for name, own in (("leftHand", "lHand"), ("hips", "hip")):
+        joint = canonical.skeleton.index(name)
+        assert torch.equal(places[:, joint], motion.joint_positions()[:, motion.skeleton.index(own)])
+    assert not places[:, canonical.skeleton.index("leftToes")].any()  # it has none

@@ -1,0 +1,175 @@
+"""`mapctl tween` as a user types it: keys in frames and seconds, reports, and what is refused."""
+
+import json
+from importlib.util import find_spec
+
+import pytest
+from captures import on_rig
+from helpers import run, walk
+from tiny_denoiser import save_tiny_denoiser
+from tiny_infiller import save_tiny_infiller
+from tiny_prior import save_tiny_prior
+
+import mapctl
+
+FRAMES = 45
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.02)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A walk of 1.5 seconds on the Bandai rig."""
+    path = tmp_path_factory.mktemp("source") / "in.bvh"
+    on_rig("bandai", FRAMES).save(path)
+    return path
+
+
+@pytest.fixture
+def tween(tiny):
+    """Runs the command; returns the exit status."""
+    return lambda *words: run("tween", *words, "--infiller", tiny)
+
+
+def away_cm(source, out, frames):
+    """Of the worst joint in these frames."""
+    first, second = (mapctl.load(path).joint_positions()[list(frames)] for path in (source, out))
+    return 100 * float((first - second).norm(dim=-1).max())
+
+
+@pytest.mark.parametrize("method", ["map", "infiller", "slerp"])
+def test_keys_are_met_in_the_file(tween, source, tmp_path, method):
+    out = tmp_path / "out.bvh"
+    assert tween(source, "-o", out, "--keyframes", "0,17,30,44", "--method", method, "--quiet") == 0
+    assert mapctl.load(out).num_frames == FRAMES
+    assert away_cm(source, out, (0, 17, 30, 44)) < 1e-4
+    assert away_cm(source, out, range(FRAMES)) > 1
+
+
+def test_keys_may_be_seconds(tween, source, tmp_path):
+    found = set()
+    for keys in ("0,15,30,44", "0s,0.5s, 1s ,44", "44,30,0,15"):
+        words = ["--keyframes", keys, "--method", "infiller", "--quiet"]
+        assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+
+
+def test_the_same_bytes_come_twice_and_quiet_says_nothing(tween, source, tmp_path, capsys):
+    found = set()
+    for _ in range(2):
+        assert tween(source, "-o", tmp_path / "out.bvh", "--keyframes", "0,20,44", "--quiet") == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
+    motion = on_rig("bandai", FRAMES)
+    (hips,) = motion.moving_offsets
+    motion.moving_offsets[hips][21:, 0] += 2.0
+    motion.save(tmp_path / "leaping.bvh")
+    words = ["--keyframes", "0,20,21,44", "--method", "infiller"]
+    assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words) == 0
+    told = capsys.readouterr()
+    first, note = told.out.splitlines()
+    assert first.startswith(f"{tmp_path / 'out.bvh'}: 45 frames through 4 keys; ")
+    assert note.startswith("the hips need ")
+    assert note.endswith(" m/s between frames 20 and 21, which nobody runs")
+    assert told.err == ""
+
+
+@pytest.mark.parametrize(("words", "what"), [
+    ([], "pose"), (["--joints", "Hand_L, Foot_R"], "limbs"), (["--root-only"], "root"),
+])  # fmt: skip
+def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_path, words, what):
+    report = tmp_path / "r.json"
+    words = [*words, "--keyframes", "0,16,33,44", "--method", "infiller", "--report", report, "--quiet"]
+    assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
+    told = json.loads(report.read_text())
+    assert [(row["frame"], row["what"]) for row in told["keys"]] == [(0, "pose"), (16, what), (33, what), (44, "pose")]
+    assert all(row["missed_cm"] < 0.1 for row in told["keys"])
+    assert all(row.get("missed_deg", 0) < 1e-4 for row in told["keys"])
+    assert told["request"]["command"] == "tween"
+    assert (told["request"]["keyframes"], told["request"]["method"]) == ("0,16,33,44", "infiller")
+    assert {"mapctl", "versions", "frames", "fps", "gaps", "ledger", "seconds", "frame_ms", "notes"} <= set(told)
+    assert "skate_cm_s" in told["measures"]
+
+
+def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_path):
+    report, prior = tmp_path / "r.json", save_tiny_prior(tmp_path / "prior.safetensors")
+    words = ["--keyframes", "0,20,44", "--joints", "Hand_L", "--report", report, "--prior", prior, "--quiet"]
+    assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
+    assert {"footing", "keyframe", "likelihood"} <= set(json.loads(report.read_text())["ledger"])
+
+
+def test_slerp_needs_no_network(source, tmp_path):
+    words = ["tween", source, "-o", tmp_path / "out.bvh", "--keyframes", "0,20,44", "--method", "slerp"]
+    assert run(*words, "--infiller", "nobody", "--quiet") == 0
+    assert away_cm(source, tmp_path / "out.bvh", (0, 20, 44)) < 1e-4
+
+
+@pytest.mark.skipif(any(find_spec(name) is None for name in ("matplotlib", "PIL")), reason="needs mapctl[render]")
+def test_a_film_is_made(tween, tmp_path):
+    on_rig("canonical", 5).save(tmp_path / "in.bvh")
+    words = ["--keyframes", "0,2,4", "--method", "slerp", "--video", tmp_path / "v.png", "--quiet"]
+    assert tween(tmp_path / "in.bvh", "-o", tmp_path / "out.bvh", *words) == 0
+    assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_other_formats_come_and_go(tween, tmp_path):
+    walk(30).save(tmp_path / "in.npz")
+    for out in ("out.glb", "out.bvh", "out.npz"):
+        words = ["--keyframes", "0,10,29", "--method", "slerp", "--quiet"]
+        assert tween(tmp_path / "in.npz", "-o", tmp_path / out, *words) == 0
+    assert mapctl.load(tmp_path / "out.npz").num_frames == 30
+    assert (tmp_path / "out.glb").stat().st_size > 0
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["gone.bvh", "-o", "a.bvh", "--keyframes", "0,9"], "gone.bvh"),
+    (["broken.bvh", "-o", "a.bvh", "--keyframes", "0,9"], "broken.bvh"),
+    (["in.bvh", "-o", "a.bvh"], "--keyframes"),
+    (["in.bvh", "--keyframes", "0,9"], "--out"),
+    (["in.bvh", "-o", "a.mp3", "--keyframes", "0,9"], ".mp3"),
+    (["in.bvh", "-o", "gone/a.bvh", "--keyframes", "0,9"], "gone"),
+    (["in.bvh", "-o", "a.bvh", "--report", "a.bvh", "--keyframes", "0,9"], "asked for twice"),
+    (["in.bvh", "-o", "a.bvh", "--video", "p.avi", "--keyframes", "0,9"], ".mp4"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "9"], "at least two keys, got 1"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "9,9"], "at least two keys, got 1"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,45"], "the key 45 is not one of the motion's frames 0:45"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,1.5s"], "the key 45 is not one of the motion's frames 0:45"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,x"], "a frame is a whole number from 0, or seconds as in 1.5s"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,,9"], "a frame is a whole number from 0"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hnad_L"], "no hand or foot 'Hnad_L'; the nearest is"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", ""], "no hand or foot ''"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L", "--root-only"], "choose one"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "best"], "--method"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--rig", "nobody"], "nobody"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--prior", "nobody"], "no prior 'nobody'"),
+], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
+    tween, source, tmp_path, monkeypatch, capsys, words, said
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in.bvh").write_bytes(source.read_bytes())
+    (tmp_path / "broken.bvh").write_text("HIERARCHY\nnonsense")
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert tween(*words) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("mapctl: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_an_infiller_that_is_none_is_refused(source, tmp_path, capsys):
+    denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
+    for name, said in ((denoiser, "a denoiser, not an infiller"), ("nobody", "no prior 'nobody'")):
+        assert run("tween", source, "-o", tmp_path / "a.bvh", "--keyframes", "0,9", "--infiller", name) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
