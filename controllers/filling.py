@@ -31,7 +31,10 @@ from mapctl.protocols import Inbetweener
 from mapctl.retarget import from_canonical, places_on_rig, to_canonical
 from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.result import Ledger
+from mapctl.terms import Footing, Seam
 from mapctl.terms.footing import TOES
 
 Method = Literal["infiller", "map", "linear"]
@@ -47,13 +50,21 @@ _AIMS = 6  # tries at most
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 
 
+FINISHING = StandingSettings(
+    ease=5.0, footing=Footing(sigma_speed=0.1, sigma_height=0.1, sigma_below=0.1), seam=Seam(sigma=50.0, frames=96),
+    budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
+)  # fmt: skip
+"""Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
+network's, since styles differ in them; jerk costs something; and it may take twice the evaluations."""
+
+
 @dataclass(frozen=True)
 class InfillSettings:
     """How gaps are filled."""
 
     method: Method = "map"
     """`infiller` leaves the proposal as it is, but for rigid bones; `map` finishes it; `linear` knows no network."""
-    standing: StandingSettings = field(default_factory=lambda: StandingSettings(ease=5.0))
+    standing: StandingSettings = field(default_factory=lambda: FINISHING)
     """The MAP stage."""
 
 
