@@ -119,7 +119,7 @@ _ROOM = 8  # frames of a window that a gap must leave
 
 @torch.no_grad()
 def validate(network: InfillerNetwork, corpus: Corpus, settings: InfillerSettings) -> dict[str, Any]:
-    """Root-aligned joint error over a gap in the middle of unseen windows, cm, beside that of straight lines."""
+    """Root-aligned joint error over a gap in the middle of unseen windows, cm, beside that of the guess."""
     windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
     row = {}
     for gap in [gap for gap in VALIDATED if gap + _ROOM <= settings.window]:
@@ -129,7 +129,7 @@ def validate(network: InfillerNetwork, corpus: Corpus, settings: InfillerSetting
         known[:, middle : middle + gap] = False
         image = window.image(known)
         wanted = image.from_world(window.places)
-        for name, places in (("error", network(image).places), ("straight", image.places)):
+        for name, places in (("error", network(image).places), ("guess", image.places)):
             wrong = 100 * (places - wanted)
             wrong = (wrong - wrong[..., :1, :]).norm(dim=-1) * (window.present[..., None] & ~known)
             row[f"{name}_{gap}_cm"] = float(wrong.sum() / (window.present[..., None] & ~known).sum())
