@@ -39,7 +39,7 @@ def test_a_true_proposal_costs_nothing_but_contacts():
     assert parts["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)  # untrained it does not know
 
 
-def test_the_error_is_that_of_straight_lines_while_it_is_untrained():
+def test_the_error_is_that_of_the_guess_while_it_is_untrained():
     """Root-aligned, over what was missing, in centimetres."""
     window = windows_of(corpus(2, 60))
     known = with_hole(window, 20, 40)
@@ -109,20 +109,20 @@ def test_gaps_grow_in_the_course_of_training():
     assert errors[0] < errors[2]
 
 
-def test_validation_is_the_same_each_time_and_compares_with_straight_lines():
+def test_validation_is_the_same_each_time_and_compares_with_the_guess():
     settings = replace(SETTINGS, window=80)
     trainer = InfillerTrainer(CONFIG, settings, corpus(1, 100))
     first, again = (validate(trainer.network, corpus(2, 100), settings) for _ in range(2))
     assert first == again
-    assert set(first) == {f"{name}_{gap}_cm" for name in ("error", "straight") for gap in (15, 30, 60)}
-    assert all(first[f"error_{gap}_cm"] == first[f"straight_{gap}_cm"] for gap in (15, 30, 60))  # untrained
-    assert 0 < first["straight_15_cm"] < first["straight_60_cm"]
+    assert set(first) == {f"{name}_{gap}_cm" for name in ("error", "guess") for gap in (15, 30, 60)}
+    assert all(first[f"error_{gap}_cm"] == first[f"guess_{gap}_cm"] for gap in (15, 30, 60))  # untrained
+    assert 0 < first["guess_15_cm"] < first["guess_60_cm"]
 
 
 def test_validation_leaves_out_gaps_that_leave_nothing_of_a_window():
     trainer = InfillerTrainer(CONFIG, SETTINGS, corpus(1, 40))
     found = validate(trainer.network, corpus(2, 40), SETTINGS)
-    assert set(found) == {"error_15_cm", "straight_15_cm"}
+    assert set(found) == {"error_15_cm", "guess_15_cm"}
 
 
 def test_in_bfloat16_it_trains_too():
