@@ -29,6 +29,7 @@ WINDOW = 120
 """Frames of a clip that are looked at: the paper's 4 s."""
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 _CONTEXT = 40  # frames on either side while the gap's length is varied
+_COMPARED: tuple[Method, Method] = ("linear", "map")
 _BONES = tuple(CANONICAL.index(side + part) for side in ("left", "right") for part in ("LowerArm", "Hand", "Foot"))
 
 
@@ -77,6 +78,25 @@ def table(
         rows += [{"task": task.name, "clips": len(shown), **row} for row in done]
         if progress is not None:
             progress(number + 1, len(TASKS))
+    return rows
+
+
+def by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
+    """Gaps of 0.5, 1 and 2 s by kind of clip: error of slerp and of MAP, cm, and their ratio. A longer and more lively
+    clip counts no more than another: the ratio is the mean of the clips' own.
+    """
+    rows = []
+    for kind, clips in kinds.items():
+        for task in TASKS[1:4]:
+            shown = [middle(on_canonical_bones(clip), WINDOW) for clip in clips if clip.seconds * PRIOR_FPS > WINDOW]
+            masks = [Mask(ALL, (WINDOW - task.gap) // 2, (WINDOW + task.gap) // 2)]
+            pairs = [[float(_filled(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
+                      for method in _COMPARED] for clip in shown]  # fmt: skip
+            if pairs:
+                errors = 100 * torch.tensor(pairs)
+                slerp, ours = errors.mean(dim=0).tolist()
+                rows.append({"task": task.name, "clips": len(pairs), "method": f"MAP on {kind}", "error_cm": ours,
+                             "slerp_cm": slerp, "ratio": float((errors[:, 1] / errors[:, 0]).mean())})  # fmt: skip
     return rows
 
 

@@ -15,6 +15,7 @@ from mapctl.progress import bar
 
 if TYPE_CHECKING:
     from controllers.bench_denoise import Clip
+    from mapctl.motion import Motion
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Bench:
 
     def _infill(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_infill import table
+        from controllers.bench_infill import by_kind, table
         from mapctl import retarget
 
         infiller = priors.load_infiller(self.infiller)
@@ -108,9 +109,13 @@ class Bench:
             architecture = other.card.config["architecture"]
             # Two of one kind are told apart by their names.
             networks[f"{architecture} {name}" if architecture in networks else architecture] = other
-        clips = [retarget.to_canonical(clip.motion)[0] for clip in self._clips_by_kind(infiller.card)]
+        kinds: dict[str, list[Motion]] = {}
+        for clip in self._clips_by_kind(infiller.card):
+            kinds.setdefault(clip.kind, []).append(retarget.to_canonical(clip.motion)[0])
+        clips = [clip for found in kinds.values() for clip in found]
         with bar("filling") as progress:
-            return table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
+            rows = table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
+        return [*rows, *by_kind(kinds, infiller)]
 
     def _clips_by_kind(self, card: Any) -> "list[Clip]":
         """Unseen clips, as many of each kind, without their T-poses."""
