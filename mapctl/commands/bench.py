@@ -99,7 +99,7 @@ class Bench:
 
     def _infill(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_infill import by_kind, table
+        from controllers.bench_infill import by_kind, lost_joints, table
         from mapctl import retarget
 
         infiller = priors.load_infiller(self.infiller)
@@ -115,7 +115,7 @@ class Bench:
         clips = [clip for found in kinds.values() for clip in found]
         with bar("filling") as progress:
             rows = table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
-        return [*rows, *by_kind(kinds, infiller)]
+        return [*rows, *by_kind(kinds, infiller), *lost_joints(kinds, infiller)]
 
     def _clips_by_kind(self, card: Any) -> "list[Clip]":
         """Unseen clips, as many of each kind, without their T-poses."""

@@ -16,9 +16,8 @@ from mapctl import rotations
 from mapctl.capture.faults import runs
 
 _SECOND = (1.0, -2.0, 1.0)
-_REACH = 0.12  # seconds over which an offset fades away from its edge
-_CALM = 0.3
-_ANY_BODY, _ANY_JOINT = 4.0, 30.0  # m/s^2 and rad/s^2 that are nothing unusual in any motion
+_REACH = 0.1  # seconds over which an offset fades away from its edge
+_CALM_PLACE, _CALM_JOINT = 1.2, 9.0  # m/s^2 and rad/s^2 that are nothing unusual in any motion
 
 
 def closed_places(
@@ -26,7 +25,7 @@ def closed_places(
 ) -> Float[Tensor, "frames width"]:
     """Places whose frames `put` were put in; all others stay."""
     values = values.clone()
-    usual = _usual(torch.diff(values, n=2, dim=0)[:, None], put[:, None], _ANY_BODY / fps**2)
+    usual = _usual(torch.diff(values, n=2, dim=0)[:, None], put[:, None], _CALM_PLACE / fps**2)
     for _, start, stop in runs(put[:, None]):
         rows = _rows(start, stop, len(values))
         bends = torch.diff(values[rows.start : rows.stop + 2], n=2, dim=0)[:, None] if len(rows) else values[:0, None]
@@ -40,7 +39,7 @@ def closed_rotations(
 ) -> Float[Tensor, "frames joints 4"]:
     """Local rotations (xyzw) whose frames `put` were put in, joint by joint; all others stay."""
     quats = rotations.sign_continuous(quats)
-    usual = _usual(_turning_bends(quats), put, _ANY_JOINT / fps**2)
+    usual = _usual(_turning_bends(quats), put, _CALM_JOINT / fps**2)
     spans: dict[tuple[int, int], list[int]] = {}
     for joint, start, stop in runs(put):
         spans.setdefault((start, stop), []).append(joint)
@@ -63,16 +62,15 @@ def _turning_bends(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "be
 
 
 def _usual(
-    bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"], least: float
+    bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"], calm: float
 ) -> Float[Tensor, " joints"]:
-    """By joint, the bend that one in a hundred exceeds where nothing was put in; `least`, where that is less. Where
-    nothing shows how the motion bends, as at single keys, it is calm.
+    """By joint, the bend that one in five exceeds where nothing was put in; a calm one where nothing shows how motion
+    bends there, as at single keys.
     """
     sizes = bends.norm(dim=-1)
     own = ~(put[:-2] | put[1:-1] | put[2:])
     whole = [sizes[own[:, joint], joint] for joint in range(sizes.shape[1])]
-    calm = sizes.new_tensor(_CALM * least)
-    return torch.stack([part.quantile(0.99).clamp_min(least) if len(part) else calm for part in whole])
+    return torch.stack([part.quantile(0.8) if len(part) else sizes.new_tensor(calm) for part in whole])
 
 
 def _rows(start: int, stop: int, frames: int) -> range:
