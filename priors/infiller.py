@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mapctl import rotations
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.gaps import PositionImage, Proposed
+from mapctl.gaps.image import mirrored_places
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.infiller_networks import AUTOENCODERS, Architecture, Skips
@@ -120,8 +121,11 @@ class ConvInfiller:
 
     @torch.no_grad()
     def propose(self, image: PositionImage) -> Proposed:
-        """The whole motion, of any length."""
-        return self.network(image)
+        """The whole motion, of any length: what the network makes of it and of its mirror image, on average."""
+        one, other = self.network(image), self.network(image.mirrored())
+        places = (one.places + mirrored_places(other.places)) / 2
+        contacts = (one.contacts + other.contacts.flip(-1)) / 2
+        return Proposed(torch.where(image.known[..., None] & self.network.keeps, image.places, places), contacts)
 
 
 def load(name: str = "infiller") -> ConvInfiller:

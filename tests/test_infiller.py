@@ -11,6 +11,7 @@ from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infill
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
+from mapctl.gaps.image import mirrored_places
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
@@ -111,12 +112,32 @@ def test_as_a_controller_takes_it_it_is_an_inbetweener_without_gradients():
     assert isinstance(infiller, Inbetweener)
     proposed = infiller.propose(holed())
     assert not proposed.places.requires_grad
-    assert torch.equal(proposed.places, infiller.network(holed()).places)
+
+
+def test_what_it_proposes_for_the_mirror_image_is_the_mirror_image():
+    """Its network alone does not: a left step is not a right one to it."""
+    infiller, image = tiny_infiller(drawn=DRAWN), holed()
+    there, here = infiller.propose(image.mirrored()), infiller.propose(image)
+    assert torch.allclose(there.places, mirrored_places(here.places), atol=1e-5)
+    assert torch.allclose(there.contacts, here.contacts.flip(-1), atol=1e-5)
+    alone = infiller.network(image.mirrored()).places
+    assert not torch.allclose(alone, mirrored_places(infiller.network(image).places), atol=1e-3)
+    assert torch.equal(here.places[image.known], image.places[image.known])
+
+
+def test_a_mirror_image_is_that_of_the_mirrored_motion():
+    motion, known = walk(40, turn_rate=0.8), torch.ones(1, 40, JOINTS, dtype=torch.bool)
+    known[:, 10:20, 8] = False
+    other = shown(motion.mirror(), known[..., CANONICAL.mirror_partners()])
+    image = shown(motion, known).mirrored()
+    for name in ("places", "ground", "heading", "contacts"):
+        assert torch.allclose(getattr(image, name), getattr(other, name), atol=1e-9), name
+    assert torch.equal(image.known, other.known)
 
 
 def test_a_saved_infiller_loads_as_it_was(tmp_path):
     path = save_tiny_infiller(tmp_path / "run" / "model.safetensors", drawn=DRAWN)
-    wanted = network(drawn=DRAWN)(holed())
+    wanted = tiny_infiller(drawn=DRAWN).propose(holed())
     for name in (path, path.parent):
         loaded = priors.load_infiller(str(name))
         assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "infiller")

@@ -13,6 +13,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.skeleton import CANONICAL
+
+_PARTNERS = CANONICAL.mirror_partners()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,12 @@ class PositionImage:
         ground = rotations.rotate_ground(places[..., ::2], self.heading[..., None])
         return _with_ground(places, ground + self.ground[..., None, :])
 
+    def mirrored(self) -> "PositionImage":
+        """Left and right exchanged."""
+        flip = self.ground.new_tensor([-1.0, 1.0])
+        return PositionImage(mirrored_places(self.places), self.contacts.flip(-1), self.known[..., _PARTNERS],
+                             self.present, self.ground * flip, -self.heading)  # fmt: skip
+
     @property
     def ever_known(self) -> Bool[Tensor, "batch joints"]:
         """Whether a joint is known in any frame."""
@@ -71,6 +80,11 @@ class Proposed:
     """Of all joints, seen from the image's reference, metres. Bones may have changed their lengths a little."""
     contacts: Float[Tensor, "batch frames 2"]
     """Log odds that the left and the right toe are planted."""
+
+
+def mirrored_places(places: Float[Tensor, "*batch joints 3"]) -> Float[Tensor, "*batch joints 3"]:
+    """Seen in a mirror that stands along the reference's way."""
+    return places[..., _PARTNERS, :] * places.new_tensor([-1.0, 1.0, 1.0])
 
 
 def _with_ground(places: Float[Tensor, "batch frames joints 3"], ground: Float[Tensor, "batch frames joints 2"]):
