@@ -9,7 +9,7 @@ from helpers import corpus, generator
 
 from mapctl import cli
 from mapctl.capture import Capture
-from mapctl.commands import train_denoiser
+from mapctl.commands import train_windows
 from mapctl.commands.train import Train
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
@@ -33,7 +33,7 @@ def test_a_width_of_nothing_is_refused():
     given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", "--width", "0"])
     assert isinstance(given, Train)
     with pytest.raises(RequestError, match="--width must be at least 1"):
-        train_denoiser.request(given)
+        train_windows.request(given)
 
 
 def test_windows_are_clips_mirrored_half_of_the_time():

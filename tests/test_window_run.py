@@ -15,7 +15,7 @@ from helpers import killing, run
 
 import priors
 from mapctl import cli
-from mapctl.commands import train_denoiser, train_infiller
+from mapctl.commands import train_windows
 from mapctl.commands.train import Train
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors.denoiser import DenoiserConfig
@@ -58,10 +58,10 @@ class Model:
 
 
 MODELS = (
-    Model(denoiser_run, denoiser_run.DenoiserRequest, train_denoiser.request, priors.load_denoiser,
+    Model(denoiser_run, denoiser_run.DenoiserRequest, train_windows.request, priors.load_denoiser,
           tiny_denoiser.CONFIG, replace(tiny_denoiser.CONFIG, width=7), DenoiserSettings(),
           (("--width", "12"), DenoiserConfig(width=12))),
-    Model(infiller_run, infiller_run.InfillerRequest, train_infiller.request, priors.load_infiller,
+    Model(infiller_run, infiller_run.InfillerRequest, train_windows.request, priors.load_infiller,
           tiny_infiller.CONFIG, replace(tiny_infiller.CONFIG, kernel=5), InfillerSettings(),
           (("--architecture", "manifold"), InfillerConfig(architecture="manifold"))),
 )  # fmt: skip

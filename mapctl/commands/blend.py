@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import beside, options
 from mapctl.commands.frames import parse_frame, parse_range
 from mapctl.commands.threads import compute_on_one
 
@@ -45,10 +45,7 @@ class Blend:
         compute_on_one()
         from mapctl import formats
 
-        formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.video))
-        if self.video is not None:
-            outputs.check_film(self.video, (1280, 720))
+        beside.check(self.out, self.video)
         rig = options.read_rig(self.rig)
         motion, other = options.read_motion(self.source, rig), options.read_motion(self.other, None)
         import priors
@@ -63,12 +60,7 @@ class Blend:
         settings = InfillSettings(method=self.method)
         done = blend(motion, other, borrowed, priors.load_infiller(self.infiller), settings=settings, rig=rig)
         formats.save(done.motion, self.out)
-        if self.video is not None:
-            from mapctl.progress import bar
-            from scenes.denoise_plot import side_by_side
-
-            with bar("filming", quiet=self.quiet) as progress:
-                side_by_side(motion, done.motion, self.video, rig=rig, progress=progress)
+        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             print("\n".join((f"{self.out}: {done.motion.num_frames} frames", *done.notes)))
         return 0

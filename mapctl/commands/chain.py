@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import beside, options
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
 
@@ -41,10 +41,7 @@ class Chain:
         options.check_seed(self.seed)
         from mapctl import formats
 
-        formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.video))
-        if self.video is not None:
-            outputs.check_film(self.video, (1280, 720))
+        beside.check(self.out, self.video)
         import torch
 
         import priors

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import beside, options
 from mapctl.commands.frames import parse_ranges
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
@@ -64,33 +64,19 @@ class Infill:
             from mapctl import report
 
             report.write(self.as_report(done), self.report)
-        if self.video is not None:
-            from mapctl.progress import bar
-            from scenes.denoise_plot import side_by_side
-
-            with bar("filming", quiet=self.quiet) as progress:
-                side_by_side(motion, done.motion, self.video, rig=rig, progress=progress)
+        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             self._tell(done)
         return 0
 
     def as_report(self, done: "Infilled") -> dict[str, object]:
         """The request, versions, and what the result says of itself."""
-        from mapctl import __version__, metrics, report
-
-        request = {key: value for key, value in options.as_request("infill", self).items() if value is not None}
-        return {"mapctl": __version__, "request": request, "versions": report.versions(), **done.summary(),
-                "measures": metrics.measure(done.motion)}  # fmt: skip
+        return beside.report("infill", self, done.motion, done.summary())
 
     def _check(self) -> None:
-        from mapctl import formats
-
         if self.curve is not None and self.method == "linear":
             raise RequestError("--curve needs a network's steps; leave --method linear out")
-        formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.report, self.video))
-        if self.video is not None:
-            outputs.check_film(self.video, (1280, 720))
+        beside.check(self.out, self.video, self.report)
 
     def _masks(self, motion: "Motion") -> Sequence["Mask"]:
         """What is lost; RequestError for what cannot be, or where nothing was asked for and nothing is wrong."""

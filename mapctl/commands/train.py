@@ -78,14 +78,10 @@ class Train:
             from mapctl.commands import train_refiner
 
             path, use = train_refiner.run(self, say), "--refiner"
-        elif self.model == "denoiser":
-            from mapctl.commands import train_denoiser
+        elif self.model in ("denoiser", "infiller"):
+            from mapctl.commands import train_windows
 
-            path, use = train_denoiser.run(self, say), "--denoiser"
-        elif self.model == "infiller":
-            from mapctl.commands import train_infiller
-
-            path, use = train_infiller.run(self, say), "--infiller"
+            path, use = train_windows.run(self, say), f"--{self.model}"
         else:
             request = self.request()
             outputs.check_folder(self.out)

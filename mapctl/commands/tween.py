@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import beside, options
 from mapctl.commands.frames import parse_frame
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
@@ -61,12 +61,7 @@ class Tween:
             from mapctl import report
 
             report.write(self._as_report(done, motion, keys), self.report)
-        if self.video is not None:
-            from mapctl.progress import bar
-            from scenes.denoise_plot import side_by_side
-
-            with bar("filming", quiet=self.quiet) as progress:
-                side_by_side(motion, done.motion, self.video, rig=rig, progress=progress)
+        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             ms = 1000 * done.seconds / done.motion.num_frames
             print(f"{self.out}: {done.motion.num_frames} frames through {len(keys.frames)} keys; {ms:.1f} ms a frame")
@@ -75,14 +70,9 @@ class Tween:
         return 0
 
     def _check(self) -> None:
-        from mapctl import formats
-
         if self.joints is not None and self.root_only:
             raise RequestError("--joints and --root-only are two kinds of keys; choose one")
-        formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.report, self.video))
-        if self.video is not None:
-            outputs.check_film(self.video, (1280, 720))
+        beside.check(self.out, self.video, self.report)
 
     def _keys(self, motion: "Motion") -> "Keys":
         from controllers.tween import Keys
@@ -104,9 +94,6 @@ class Tween:
 
     def _as_report(self, done: "Infilled", motion: "Motion", keys: "Keys") -> dict[str, object]:
         from controllers.tween import key_errors
-        from mapctl import __version__, metrics, report
 
-        request = {key: value for key, value in options.as_request("tween", self).items() if value is not None}
-        return {"mapctl": __version__, "request": request, "versions": report.versions(),
-                "keys": key_errors(done.motion, motion, keys, options.read_rig(self.rig)), **done.summary(),
-                "measures": metrics.measure(done.motion)}  # fmt: skip
+        missed = key_errors(done.motion, motion, keys, options.read_rig(self.rig))
+        return beside.report("tween", self, done.motion, {"keys": missed, **done.summary()})

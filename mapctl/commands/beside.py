@@ -1,0 +1,43 @@
+"""What commands that give a motion back share: checks of where it goes, and a film of it beside the given one."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapctl.commands import options, outputs
+
+if TYPE_CHECKING:
+    from mapctl.motion import Motion
+    from mapctl.rigs import Rig
+
+_SIZE = (1280, 720)
+
+
+def check(out: Path, video: Path | None, *others: Path | None) -> None:
+    """RequestError unless the motion, its film and the other files can be written; leaves no trace."""
+    from mapctl import formats
+
+    formats.check_ending(out)
+    outputs.check_files(options.given(out, video, *others))
+    if video is not None:
+        outputs.check_film(video, _SIZE)
+
+
+def film(before: "Motion", after: "Motion", video: Path | None, *, rig: "Rig | None", quiet: bool) -> None:
+    """Both side by side, if a film is asked for."""
+    if video is None:
+        return
+    from mapctl.progress import bar
+    from scenes.denoise_plot import side_by_side
+
+    with bar("filming", quiet=quiet) as progress:
+        side_by_side(before, after, video, rig=rig, progress=progress)
+
+
+def report(name: str, command: Any, motion: "Motion", found: dict[str, Any]) -> dict[str, Any]:
+    """The request, versions, what was found, and the motion's measures."""
+    from mapctl import __version__, metrics
+    from mapctl import report as reports
+
+    request = {key: value for key, value in options.as_request(name, command).items() if value is not None}
+    return {"mapctl": __version__, "request": request, "versions": reports.versions(), **found,
+            "measures": metrics.measure(motion)}  # fmt: skip
