@@ -12,50 +12,29 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.canonical_gap import CanonicalGap
-from controllers.standing import StandingSettings, stand
-from mapctl import contacts, gaussian, inverse_kinematics, rotations
-from mapctl.capture import Capture
+from controllers.gap_standing import FINISHING, stood
+from controllers.proposing import proposed
+from controllers.standing import StandingSettings
+from mapctl import contacts, rotations
 from mapctl.capture.bands import upsampled
 from mapctl.capture.faults import runs
 from mapctl.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.gaps import PositionImage
 from mapctl.gaps.closing import closed_places, closed_rotations
 from mapctl.gaps.course import along
 from mapctl.gaps.lost import Lost, put_back, straight
 from mapctl.gaps.targets import Targets, missed, reached
-from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import from_canonical, places_on_rig, to_canonical
 from mapctl.rigs import Rig
-from mapctl.skeleton import CANONICAL
-from mapctl.solver.budget import Budget
-from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.result import Ledger
-from mapctl.terms import Footing, Seam
-from mapctl.terms.footing import TOES
 
 Method = Literal["infiller", "map", "linear"]
-_TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
-_TREMBLE, _MOMENT = 0.8, 10  # frames at the prior's rate
-_FIDGET = 0.005  # metres
-_SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
-_SURE = 4.0  # log odds of contacts that are known
-_SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
 _MISSED = 0.001  # metres from a wanted place that are worth a word
 _HAIR = 1e-4  # metres from it that are nothing
 _AIMS = 6  # tries at most
-_BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
-
-
-FINISHING = StandingSettings(
-    ease=5.0, footing=Footing(sigma_speed=0.1, sigma_height=0.1, sigma_below=0.1), seam=Seam(sigma=50.0, frames=96),
-    budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
-)  # fmt: skip
-"""Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
-network's, since styles differ in them; jerk costs something; and it may take twice the evaluations."""
 
 
 @dataclass(frozen=True)
@@ -121,102 +100,15 @@ def fill(
         canonical = along(canonical, lost.root, course)
     gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
     shown = None if targets is None else targets.shown(gap.seconds, fps=float(motion.fps))
-    proposal, bits = _proposed(gap, infiller, shown, held=course is not None)
+    proposal, bits = proposed(gap, infiller, shown, held=course is not None)
     stands, ledger = contacts.steadied(bits > 0), Ledger()
     if settings.method == "map":
-        proposal, ledger = _stood(proposal, bits, gap, settings.standing, densities, shown)
+        proposal, ledger = stood(proposal, bits, gap, settings.standing, densities, shown)
     whole = _at_rate_of(canonical, proposal, gap.seconds)
     filled = from_canonical(whole, rigmap, base)
     done = _closed(put_back(filled, base, lost), lost, motion)
     done, notes = _on_target(done, targets, lost, motion, rig)
     return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes)
-
-
-def _proposed(
-    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool
-) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-    """The infiller's motion on rigid bones, its seams closed, and the log odds of its contacts; `held` to its guess of
-    where the hips go, but for their sway.
-    """
-    shown = gap.motion
-    body = Motion(CANONICAL, shown.fps, shown.root_position / gap.scale, shown.local_quat_xyzw)
-    places, known = body.joint_positions(), gap.places_known()
-    if targets is not None:
-        places = torch.where(targets.wanted[..., None], targets.places / gap.scale, places)
-        known = known | targets.wanted
-    stands = contacts.planted(places[:, list(_TOES)], PRIOR_FPS).float()
-    image = PositionImage.of_world(
-        places.float()[None], heading(shown.local_quat_xyzw[:, 0]).float()[None], stands[None],
-        known=known[None], present=torch.ones(1, len(places), dtype=torch.bool), toes=_TOES,
-    )  # fmt: skip
-    proposed = infiller.propose(image)
-    wanted = image.to_world(_without_tremble(proposed.places, image))[0].double()
-    if held:
-        wanted = wanted - _slow_way_off(wanted[:, 0] - body.root_position, gap.root)[:, None]
-    root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
-    quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root)
-    quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
-    quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
-    root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
-    made = replace(shown, root_position=root, local_quat_xyzw=quats)
-    bits = torch.where(_toe_speeds(made) < _SWINGS * gap.scale, proposed.contacts[0], -_SURE)
-    return made, torch.where(image.known[0][:, list(_TOES)], _SURE * (2 * stands - 1), bits)
-
-
-def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
-    """A network's frames are each a little off on their own: what it changes is smoothed over about a frame. Where it
-    changes next to nothing it only fidgets, and the guess is as good. What it leaves alone stays.
-    """
-    change = (places - image.places)[0]
-    smooth = gaussian.convolved(change, gaussian.kernel(_TREMBLE, 3), "repeated")
-    power = gaussian.convolved(smooth.square().sum(dim=-1), gaussian.kernel(_MOMENT, 3 * _MOMENT), "repeated")
-    smooth = smooth * (power / (power + _FIDGET**2))[..., None]
-    return torch.where(image.known[..., None], places, image.places + smooth)
-
-
-def _slow_way_off(off: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
-    """What hips stray by over the ground, without their sway; nothing where they are known."""
-    off = torch.where(lost[:, None], off, 0.0) * torch.tensor([1.0, 0.0, 1.0], dtype=off.dtype)
-    slow, taps = torch.zeros_like(off), gaussian.kernel(_SWAY, 4 * _SWAY)
-    for _ in range(_PASSES):  # each takes the slow part of what the ones before it left
-        slow = slow + torch.where(lost[:, None], gaussian.convolved(off - slow, taps, "repeated"), 0.0)
-    return slow
-
-
-def _toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
-    """Over the ground, m/s."""
-    toes = motion.joint_positions()[:, list(_TOES)][..., ::2]
-    return torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)
-
-
-def _stood(
-    proposal: Motion, bits: Tensor, gap: CanonicalGap, settings: StandingSettings, densities: Sequence[Any],
-    targets: Targets | None,
-) -> tuple[Motion, Ledger]:  # fmt: skip
-    """The proposal with its feet put down, gap by gap; and the ledger of these."""
-    quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
-    for first, last in _surroundings(gap.turns.any(dim=1) | gap.root):
-        if last - first < 2:
-            continue
-        part = slice(first, last)
-        capture = Capture.of_motion(
-            proposal.slice(first, last), seen=~gap.turns[part], seen_root=~gap.root[part],
-            sigma=torch.zeros(CANONICAL.num_joints), sigma_root=0.0,
-        )  # fmt: skip
-        wanted = None if targets is None else Targets(targets.places[part], targets.wanted[part])
-        stood = stand(proposal.slice(first, last), bits[part], capture, settings, densities=densities, targets=wanted)
-        quats[part] = torch.where(gap.turns[part, :, None], stood.motion.local_quat_xyzw, quats[part])
-        root[part] = torch.where(gap.root[part, None], stood.motion.root_position, root[part])
-        ledger = ledger.join(stood.ledger)
-    return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
-
-
-def _surroundings(lost: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
-    """First frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
-    near = lost.clone()
-    for _, start, stop in runs(lost[:, None]):
-        near[max(0, start - _BESIDE) : stop + _BESIDE] = True
-    return [(start, stop) for _, start, stop in runs(near[:, None])]
 
 
 def _at_rate_of(canonical: Motion, proposal: Motion, seconds: Float[Tensor, " shown"]) -> Motion:

@@ -22,7 +22,7 @@ class GapSettings:
 
     keys: float = 0.15
     """Share of windows of which only single frames are known, now and then."""
-    joints: float = 0.25
+    joints: float = 0.4
     """Share of windows that lose joints (paper: half)."""
     shortest: float = 5.0
     """Mean length of a gap when training begins, frames (paper: 10 at 60 fps)."""
@@ -36,7 +36,7 @@ class GapSettings:
     """Gaps in a window, at most."""
     partial: float = 0.3
     """Share of windows with gaps, in which some joints stay known for some frames."""
-    dropout: float = 0.25
+    dropout: float = 0.2
     """Share of windows with lost joints that drop them frame by frame, half of them at most."""
 
     def mean_length(self, progress: float) -> float:
@@ -113,7 +113,7 @@ def _partly(draw: _Draw, settings: GapSettings) -> Bool[Tensor, "batch frames jo
 def _without_joints(draw: _Draw, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """All known but 1 to 3 joints, or a limb, throughout or for a stretch; or any joint now and then."""
     lost = _some_joints(draw)[:, None].expand(-1, draw.frames, -1)
-    during = draw.stretch(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.6)
+    during = draw.stretch(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     lost = torch.where((draw.uniform() < settings.dropout)[:, None, None], dropped, lost & during[..., None])
     return ~lost
