@@ -22,7 +22,8 @@ from mapctl.terms import Footing, Seam
 
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 FINISHING = StandingSettings(
-    ease=5.0, footing=Footing(sigma_speed=0.1, sigma_height=0.1, sigma_below=0.1), seam=Seam(sigma=50.0, frames=96),
+    ease=5.0, unseen_deg=2.0, unseen_cm=2.0, seam=Seam(sigma=150.0, frames=96),
+    footing=Footing(sigma_speed=0.1, sigma_height=0.1, sigma_below=0.1),
     budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
 )  # fmt: skip
 """Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
