@@ -29,11 +29,6 @@ WINDOW = 120
 """Frames of a clip that are looked at: the paper's 4 s."""
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 _CONTEXT = 40  # frames on either side while the gap's length is varied
-LIMBS_LOST = {
-    "elbow and hand": ("leftLowerArm", "leftHand"),
-    "knee, foot and toes": ("rightLowerLeg", "rightFoot", "rightToes"),
-}
-"""As in figure 8 of the paper."""
 _COMPARED: tuple[Method, Method] = ("linear", "map")
 _BONES = tuple(CANONICAL.index(side + part) for side in ("left", "right") for part in ("LowerArm", "Hand", "Foot"))
 
@@ -103,44 +98,6 @@ def by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> lis
                 rows.append({"task": task.name, "clips": len(pairs), "method": f"MAP on {kind}", "error_cm": ours,
                              "slerp_cm": slerp, "ratio": float((errors[:, 1] / errors[:, 0]).mean())})  # fmt: skip
     return rows
-
-
-def lost_joints(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
-    """Joints that are lost throughout up to 240 frames, by kind of clip: their mean error in the world, cm, by MAP and
-    by the mean pose of the clip itself in the joints above (which no user knows), and the ratio of the two.
-    """
-    rows = []
-    for kind, clips in kinds.items():
-        for name, joints in LIMBS_LOST.items():
-            pairs = []
-            for clip in (on_canonical_bones(clip) for clip in clips):
-                if clip.num_frames >= WINDOW:
-                    shown = middle(clip, min(clip.num_frames, 2 * WINDOW))
-                    masks = [Mask(joint, 0, shown.num_frames) for joint in joints]
-                    made = infill(shown, infiller, masks).motion
-                    pairs.append([_away(other, shown, joints) for other in (_at_mean_pose(shown, joints), made)])
-            if pairs:
-                mean, ours = (100 * torch.tensor(pairs)).mean(dim=0).tolist()
-                rows.append({"task": f"{name} lost", "clips": len(pairs), "method": f"MAP on {kind}", "error_cm": ours,
-                             "mean_pose_cm": mean, "ratio": ours / mean})  # fmt: skip
-    return rows
-
-
-def _at_mean_pose(motion: Motion, joints: Sequence[str]) -> Motion:
-    """With the joints, and those above the first of them, at their mean rotation."""
-    indices = [CANONICAL.index(name) for name in joints]
-    quats = motion.local_quat_xyzw.clone()
-    for joint in {CANONICAL.parents[indices[0]], *indices}:
-        # Markley's mean: the eigenvector of the largest eigenvalue of the summed outer products.
-        outer = torch.einsum("ti,tj->ij", quats[:, joint], quats[:, joint])
-        quats[:, joint] = torch.linalg.eigh(outer)[1][:, -1]
-    return Motion(motion.skeleton, motion.fps, motion.root_position, quats)
-
-
-def _away(motion: Motion, truth: Motion, joints: Sequence[str]) -> float:
-    """Mean distance of the joints, metres."""
-    indices = [CANONICAL.index(name) for name in joints]
-    return float((motion.joint_positions() - truth.joint_positions())[:, indices].norm(dim=-1).mean())
 
 
 def _of_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, Inbetweener], ours: str) -> list[Row]:

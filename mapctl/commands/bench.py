@@ -99,7 +99,8 @@ class Bench:
 
     def _infill(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_infill import by_kind, lost_joints, table
+        from controllers.bench_infill import by_kind, table
+        from controllers.bench_lost import lost_joints
         from mapctl import retarget
 
         infiller = priors.load_infiller(self.infiller)
