@@ -10,7 +10,8 @@ from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 from controllers.filling import InfillSettings
-from controllers.tween import Keys, key_errors, tween
+from controllers.keys import Keys
+from controllers.tween import key_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost, put_back, straight
@@ -22,7 +23,7 @@ HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
 def made_of(motion, frames, *, method="infiller", drawn=0.02, **told):
-    return tween(motion, Keys(tuple(frames), **told), tiny_infiller(drawn=drawn),
+    return tween(motion, Keys.of(tuple(frames), **told), tiny_infiller(drawn=drawn),
                  settings=InfillSettings(method=method))  # fmt: skip
 
 
@@ -188,9 +189,9 @@ def test_the_same_comes_twice():
     (Keys(()), "at least two keys, got 0"),
     (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
     (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
-    (Keys((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (Keys((0, 20, 44), limbs=("Foot_R", "foot_l")), "no hand or foot 'foot_l'; the nearest is Foot_L"),
-    (Keys((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
+    (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+    (Keys.of((0, 20, 44), limbs=("Foot_R", "foot_l")), "no hand or foot 'foot_l'; the nearest is Foot_L"),
+    (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
 ])  # fmt: skip
 def test_keys_that_cannot_be_are_refused(keys, message):
     with pytest.raises(RequestError, match=message):
@@ -199,7 +200,7 @@ def test_keys_that_cannot_be_are_refused(keys, message):
 
 def test_keys_of_two_kinds_at_once_are_refused():
     with pytest.raises(RequestError, match="two kinds; choose one"):
-        Keys((0, 20, 44), limbs=("Hand_L",), root_only=True)
+        Keys.of((0, 20, 44), limbs=("Hand_L",), root_only=True)
 
 
 def test_a_network_is_needed_but_for_slerp():
@@ -249,7 +250,7 @@ def test_errors_at_keys_are_told_for_what_they_tell(rig):
     motion, frames = on_rig(rig, 45), frames_of(30)
     told = {"pose": {}, "limbs": {"limbs": LIMBS[rig]}, "root": {"root_only": True}}
     for what, kind in told.items():
-        keys = Keys(frames, **kind)
+        keys = Keys.of(frames, **kind)
         rows = key_errors(motion, motion, keys)
         assert [row["frame"] for row in rows] == list(frames)
         assert [row["what"] for row in rows] == ["pose", what, what, "pose"]
