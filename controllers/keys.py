@@ -12,7 +12,8 @@ from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost
 from mapctl.gaps.targets import LIMBS, Targets
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, places_on_rig
+from mapctl.retarget import RigMap, places_on_rig, to_canonical
+from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
 Place = tuple[float, float, float]
@@ -142,6 +143,13 @@ def key_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list
         rows.append(row | {"missed_cm": float(away[key.frame, joints].max()),
                            "missed_deg": float(turned[key.frame, joints].max())})  # fmt: skip
     return rows
+
+
+def check_limbs(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
+    """RequestError for a name that is no hand or foot of the motion's rig."""
+    rigmap = to_canonical(motion, rig)[1]
+    for name in names:
+        limb_end(name, rigmap)
 
 
 def limb_end(name: str, rigmap: RigMap) -> int:

@@ -64,7 +64,7 @@ class KeyRequest:
 
     __pydantic_config__ = _STRICT
 
-    key: Annotated[tuple[PlacedKey, ...], Field(min_length=2, max_length=10_000)]
+    key: Annotated[tuple[PlacedKey, ...], Field(max_length=10_000)]
     """One [[key]] table each, in any order."""
     body: Name | None = None
     """The motion file whose skeleton moves; the first pose's if not given."""
@@ -72,6 +72,8 @@ class KeyRequest:
     """Frame rate of the motion that is made."""
 
     def __post_init__(self):
+        if len(self.key) < 2:
+            raise RequestError(f"in-betweening needs at least two keys, got {len(self.key)}")
         for number, key in enumerate(self.key):
             fault = _fault(key, self.body)
             if fault is not None:

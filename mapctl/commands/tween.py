@@ -89,7 +89,7 @@ class Tween:
 
     def _asked(self) -> "tuple[Motion, Keys, Rig | None]":
         """The motion that holds the keys, these, and its rig where it is known."""
-        from controllers.keys import Keys
+        from controllers.keys import Keys, check_limbs
 
         rig = options.read_rig(self.rig)
         if self._of_file:
@@ -97,6 +97,8 @@ class Tween:
         motion = options.read_motion(self.source, rig)
         frames = [parse_frame(word, fps=float(motion.fps)) for word in (self.keyframes or "").split(",")]
         limbs = () if self.joints is None else tuple(name.strip() for name in self.joints.split(","))
+        if limbs:  # also where there is no key between the first and the last
+            check_limbs(limbs, motion, rig)
         return motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig
 
     def _of_key_file(self, rig: "Rig | None") -> "tuple[Motion, Keys, Rig | None]":
