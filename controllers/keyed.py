@@ -31,8 +31,8 @@ class Keyed:
     """On the body's rig, at the wanted rate: the poses at their keys, straight lines between them."""
     keys: Keys
     """What counts of it."""
-    rig: Rig
-    """The body's, as it was found in its own file."""
+    rig: Rig | None
+    """The body's, where it is known."""
 
 
 def keyed(request: KeyRequest, rig: Rig | None = None) -> Keyed:

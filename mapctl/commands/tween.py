@@ -1,5 +1,6 @@
 """`mapctl tween`: a few keys to a whole motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -7,13 +8,14 @@ from tyro.conf import arg
 
 from mapctl.commands import beside, options
 from mapctl.commands.frames import parse_frame
+from mapctl.commands.tables import print_table
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import FileFormatError, RequestError
 
 if TYPE_CHECKING:
     from controllers.filling import Infilled
-    from controllers.keys import Keys
-    from mapctl.motion import Motion
+    from controllers.keyed import Keyed
+    from controllers.timing import Interval
     from mapctl.rigs import Rig
 
 
@@ -34,6 +36,9 @@ class Tween:
     """Keys between the first and the last only tell where these hands or feet are."""
     root_only: bool = False
     """Keys between the first and the last only tell where the hips are and which way they face."""
+    suggest_timing: bool = False
+    """Tell how many frames the way from each whole pose to the next takes in mocap, beside what is given; the motion
+    keeps the given timing."""
     method: Annotated[Literal["map", "infiller", "slerp"], arg(metavar="map|infiller|slerp")] = "map"
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. slerp: none of it."""
     rig: options.MaybeRig = None
@@ -54,22 +59,34 @@ class Tween:
         """Check everything, make, write, tell."""
         compute_on_one()
         self._check()
-        motion, keys, rig = self._asked()
-        done = self._made(motion, keys, rig)
+        asked = self._asked()
+        intervals = self._timing(asked)
+        done = self._made(asked)
         from mapctl import formats
 
         formats.save(done.motion, self.out)
         if self.report is not None:
             from mapctl import report
 
-            report.write(self._as_report(done, motion, keys, rig), self.report)
-        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
+            report.write(self._as_report(done, asked, intervals), self.report)
+        beside.film(asked.motion, done.motion, self.video, rig=asked.rig, quiet=self.quiet)
         if not self.quiet:
-            ms = 1000 * done.seconds / done.motion.num_frames
-            print(f"{self.out}: {done.motion.num_frames} frames through {len(keys.frames)} keys; {ms:.1f} ms a frame")
-            for note in done.notes:
-                print(note)
+            self._tell(done, asked, intervals)
         return 0
+
+    def _tell(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> None:
+        ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
+        print(f"{self.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
+        for note in done.notes:
+            print(note)
+        if intervals:
+            rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
+            print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
+
+    def _timing(self, asked: "Keyed") -> "list[Interval]":
+        from controllers.timing import suggest
+
+        return suggest(asked.motion, asked.keys, asked.rig) if self.suggest_timing else []
 
     @property
     def _of_file(self) -> bool:
@@ -87,8 +104,9 @@ class Tween:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
         beside.check(self.out, self.video, self.report)
 
-    def _asked(self) -> "tuple[Motion, Keys, Rig | None]":
+    def _asked(self) -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""
+        from controllers.keyed import Keyed
         from controllers.keys import Keys, check_limbs
 
         rig = options.read_rig(self.rig)
@@ -99,20 +117,19 @@ class Tween:
         limbs = () if self.joints is None else tuple(name.strip() for name in self.joints.split(","))
         if limbs:  # also where there is no key between the first and the last
             check_limbs(limbs, motion, rig)
-        return motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig
+        return Keyed(motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig)
 
-    def _of_key_file(self, rig: "Rig | None") -> "tuple[Motion, Keys, Rig | None]":
+    def _of_key_file(self, rig: "Rig | None") -> "Keyed":
         from controllers.keyed import keyed
         from mapctl.key_files import read_keys
 
         request = read_keys(self.source)
         try:
-            found = keyed(request, rig)
+            return keyed(request, rig)
         except RequestError as error:
             raise FileFormatError(self.source, str(error)) from error
-        return found.motion, found.keys, found.rig
 
-    def _made(self, motion: "Motion", keys: "Keys", rig: "Rig | None") -> "Infilled":
+    def _made(self, asked: "Keyed") -> "Infilled":
         import priors
         from controllers.filling import InfillSettings
         from controllers.tween import tween
@@ -121,10 +138,11 @@ class Tween:
         infiller = None if method == "linear" else priors.load_infiller(self.infiller)
         densities = priors.load_choice(self.prior)
         settings = InfillSettings(method=method)
-        return tween(motion, keys, infiller, settings=settings, densities=densities, rig=rig)
+        return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig)
 
-    def _as_report(self, done: "Infilled", motion: "Motion", keys: "Keys", rig: "Rig | None") -> dict[str, object]:
+    def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:
         from controllers.tween import key_errors
 
-        missed = key_errors(done.motion, motion, keys, rig)
-        return beside.report("tween", self, done.motion, {"keys": missed, **done.summary()})
+        missed = key_errors(done.motion, asked.motion, asked.keys, asked.rig)
+        timing = {"timing": [interval.summary() for interval in intervals]} if self.suggest_timing else {}
+        return beside.report("tween", self, done.motion, {"keys": missed, **timing, **done.summary()})
