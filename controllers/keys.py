@@ -1,5 +1,6 @@
 """Keys of in-betweening: which frames of a motion count, what of each does, and how far a motion misses them."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -36,6 +37,9 @@ class Key:
     def __post_init__(self):
         if self.ends and self.root_only:
             raise RequestError("keys of limbs and keys of the root only are two kinds; choose one")
+        for name, place in self.places.items():
+            if not all(map(math.isfinite, place)):
+                raise RequestError(f"the place of {name} at frame {self.frame} is no three numbers, got {place}")
 
     @property
     def ends(self) -> tuple[str, ...]:
