@@ -73,12 +73,12 @@ class Interval:
     def reason(self) -> str:
         """Why, in numbers."""
         low, high = self.usual
-        verdict = "too short" if self.given < low else "too long" if self.given > high else "usual"
+        verdict = "short" if self.given < low else "long" if self.given > high else "usual"
         if self.metres < GOING:
-            return (f"{verdict}: about in place ({self.metres:.2f} m), joints {self.apart_cm:.0f} cm apart; mocap takes"
-                    f" {low} to {high} frames")  # fmt: skip
+            return (f"{verdict}: about in place ({self.metres:.2f} m), joints {self.apart_cm:.0f} cm apart; mocap "
+                    f"mostly takes {low} to {high} frames")  # fmt: skip
         return (f"{verdict}: {self.metres:.2f} m at {self.given_speed:.2f} m/s, where poses like these go at "
-                f"{self.suggested_speed:.2f} m/s; mocap takes {low} to {high} frames")  # fmt: skip
+                f"{self.suggested_speed:.2f} m/s; mocap mostly takes {low} to {high} frames")  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """For a report."""

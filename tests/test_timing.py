@@ -74,11 +74,11 @@ def test_farther_takes_longer_and_very_far_goes_on_at_one_speed():
     assert found[-1].suggested_speed == pytest.approx(found[-2].suggested_speed, rel=0.05)
 
 
-@pytest.mark.parametrize(("metres", "verdict"), [(6.0, "too short: 7."), (0.0, "usual: 1."), (-0.9, "too long: 0.3")])
+@pytest.mark.parametrize(("metres", "verdict"), [(6.0, "short: 7."), (0.0, "usual: 1."), (-0.9, "long: 0.3")])
 def test_a_timing_that_nobody_would_take_is_named_with_numbers(metres, verdict):
     (interval,) = suggest(shifted_from(walk(40), 31, metres), Keys((0, 31)))
     assert interval.reason.startswith(verdict)
-    assert f"mocap takes {interval.usual[0]} to {interval.usual[1]} frames" in interval.reason
+    assert f"mocap mostly takes {interval.usual[0]} to {interval.usual[1]} frames" in interval.reason
     assert interval.summary()["reason"] == interval.reason
     assert interval.given_speed == pytest.approx(interval.metres * 30 / 31)
 
