@@ -5,7 +5,8 @@ from controllers.denoise import DenoiseSettings, denoise
 from controllers.follow import FollowSettings, follow
 from controllers.generate import GenerateSettings, generate
 from controllers.infill import InfillSettings, infill
-from controllers.tween import Keys, tween
+from controllers.keys import Key, Keys
+from controllers.tween import tween
 
-__all__ = ["DenoiseSettings", "FollowSettings", "GenerateSettings", "InfillSettings", "Keys", "denoise", "follow",
-           "generate", "infill", "tween"]  # fmt: skip
+__all__ = ["DenoiseSettings", "FollowSettings", "GenerateSettings", "InfillSettings", "Key", "Keys", "denoise",
+           "follow", "generate", "infill", "tween"]  # fmt: skip

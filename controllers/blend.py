@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from controllers.filling import Infilled, InfillSettings, fill
-from controllers.tween import limb_end
+from controllers.keys import limb_end
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost
@@ -49,7 +49,7 @@ def blend(
     _check(motion, source, borrowed)
     own, rigmap = to_canonical(motion, rig)
     other, _ = to_canonical(source)
-    ends = [limb_end(name, motion, rigmap) for name in borrowed.limbs]
+    ends = [limb_end(name, rigmap) for name in borrowed.limbs]
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
     margin = round(borrowed.margin * float(motion.fps))
     free = slice(max(0, there.start - margin), min(motion.num_frames, there.stop + margin))

@@ -1,6 +1,5 @@
 """Wishes that cannot hold, named with numbers: before the solve from the data, after it from what was missed."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -10,15 +9,19 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
+from mapctl.gaps.lost import Lost
+from mapctl.gaps.targets import Targets
 from mapctl.intent import Follow
 from mapctl.motion import Motion
 from mapctl.protocols import Abilities
+from mapctl.retarget import RigMap, places_on_rig
 
 _TOLERATED_CM = 15.0
 _OVERSHOOT = 0.15  # metres: the last frame of a walk may lie a step of one frame beyond the end
 _CORNER_SECONDS = 1.0
 _SPRINT = 10.0  # m/s of the hips
 _WHIP = 30.0  # rad/s of a joint
+_FLING = 25.0  # m/s of a hand or a foot: beyond what kicks and throws reach
 
 
 def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
@@ -51,25 +54,41 @@ def after_the_fact(motion: Motion, curve: Curve, joint: str) -> list[str]:
 
 
 def between_keys(
-    motion: Motion, hips: Float[Tensor, "frames 3"], *, told: Bool[Tensor, "frames joints"], keys: Sequence[int]
+    motion: Motion, canonical: Motion, rigmap: RigMap, lost: Lost, targets: Targets | None
 ) -> tuple[str, ...]:
-    """Sentences about neighbouring keys that even the shortest way between them is too fast for, by place of the hips
-    (world, metres) or by rotation of the joints that both of them tell.
+    """Sentences about neighbouring keys that even the shortest way between them is too fast for: by place of the hips
+    (metres), by rotation of the joints that both of them tell, or by places that hands and feet are to reach.
+
+    The motion is right where something is known, on its rig and on canonical joints.
     """
-    notes = []
-    for start, stop in pairwise(keys):
+    notes, hips = [], canonical.root_position
+    for start, stop in pairwise((~lost.root).nonzero()[:, 0].tolist()):
         seconds = float((stop - start) / motion.fps)
         speed = float((hips[stop] - hips[start]).norm()) / seconds
         if speed > _SPRINT:
             notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, which nobody runs")
         quats = motion.local_quat_xyzw[[start, stop]]
         turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[0]), quats[1])).norm(dim=-1)
-        rates = turns * (told[start] & told[stop]) / seconds
+        rates = turns * ~(lost.joints[start] | lost.joints[stop]) / seconds
         worst = int(rates.argmax())
         if float(rates[worst]) > _WHIP:
             notes.append(f"{motion.skeleton.names[worst]} needs {float(rates[worst]):.0f} rad/s between frames {start} "
                          f"and {stop}, which nobody turns")  # fmt: skip
-    return tuple(notes)
+    return (*notes, *([] if targets is None else _limbs(motion, rigmap, lost, targets)))
+
+
+def _limbs(motion: Motion, rigmap: RigMap, lost: Lost, targets: Targets) -> list[str]:
+    """Of hands and feet whose place is all that one of two neighbouring keys tells."""
+    notes, whole, own = [], ~lost.frames, places_on_rig(motion, rigmap)
+    for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
+        wanted = targets.wanted[:, limb]
+        places = torch.where(wanted[:, None], targets.places[:, limb], own[:, limb])
+        for start, stop in pairwise((wanted | whole).nonzero()[:, 0].tolist()):
+            speed = float((places[stop] - places[start]).norm()) * float(motion.fps) / (stop - start)
+            if speed > _FLING and bool(wanted[start] | wanted[stop]):
+                name = motion.skeleton.names[rigmap.joint_of[limb] or 0]
+                notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, which nobody reaches")
+    return notes
 
 
 def _stretch(off: Bool[Tensor, " frames"], worst: int) -> tuple[int, int]:

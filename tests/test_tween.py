@@ -10,7 +10,8 @@ from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 from controllers.filling import InfillSettings
-from controllers.tween import Keys, key_errors, tween
+from controllers.keys import Key, Keys
+from controllers.tween import key_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost, put_back, straight
@@ -22,7 +23,7 @@ HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
 def made_of(motion, frames, *, method="infiller", drawn=0.02, **told):
-    return tween(motion, Keys(tuple(frames), **told), tiny_infiller(drawn=drawn),
+    return tween(motion, Keys.of(tuple(frames), **told), tiny_infiller(drawn=drawn),
                  settings=InfillSettings(method=method))  # fmt: skip
 
 
@@ -188,9 +189,13 @@ def test_the_same_comes_twice():
     (Keys(()), "at least two keys, got 0"),
     (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
     (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
-    (Keys((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (Keys((0, 20, 44), limbs=("Foot_R", "foot_l")), "no hand or foot 'foot_l'; the nearest is Foot_L"),
-    (Keys((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
+    (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+    (Keys.of((0, 20, 44), limbs=("Foot_R", "foot_l")), "no hand or foot 'foot_l'; the nearest is Foot_L"),
+    (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
+    (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
+    (Keys((Key(0, root_only=True), 20, 44)), "first and the last key are whole poses; that at frame 0 tells the root"),
+    (Keys((0, 20, Key(44, limbs=("Hand_L",)))), "that at frame 44 tells the limbs only"),
+    (Keys((0, Key(20, places={"Hnad_L": (0.0, 1.0, 0.0)}), 44)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
 ])  # fmt: skip
 def test_keys_that_cannot_be_are_refused(keys, message):
     with pytest.raises(RequestError, match=message):
@@ -199,7 +204,28 @@ def test_keys_that_cannot_be_are_refused(keys, message):
 
 def test_keys_of_two_kinds_at_once_are_refused():
     with pytest.raises(RequestError, match="two kinds; choose one"):
-        Keys((0, 20, 44), limbs=("Hand_L",), root_only=True)
+        Keys.of((0, 20, 44), limbs=("Hand_L",), root_only=True)
+    with pytest.raises(RequestError, match="two kinds; choose one"):
+        Key(20, places={"Hand_L": (0.0, 1.0, 0.0)}, root_only=True)
+
+
+def test_places_that_are_no_numbers_are_refused():
+    with pytest.raises(RequestError, match="the place of Hand_L at frame 20 is no three numbers"):
+        Key(20, places={"Hand_L": (0.0, float("nan"), 0.0)})
+
+
+def test_keys_of_several_kinds_are_met_each_in_its_own():
+    motion = on_rig("bandai", 45)
+    place = (0.4, 1.1, 0.5)
+    keys = Keys((44, Key(30, root_only=True), Key(12, limbs=("Foot_R",), places={"Hand_L": place}), 20, 0, 20))
+    made = tween(motion, keys, tiny_infiller(drawn=0.02), settings=InfillSettings(method="infiller")).motion
+    assert_met(made, motion, (0, 20, 44))
+    hips = motion.skeleton.index("Hips")
+    assert torch.equal(made.joint_positions()[30, hips], motion.joint_positions()[30, hips])
+    assert missed_cm(made, motion, 12, ("Foot_R",)) < 0.1
+    hand = made.joint_positions()[12, motion.skeleton.index("Hand_L")]
+    assert hand.tolist() == pytest.approx(place, abs=1e-3)
+    assert missed_cm(made, motion, 30, motion.skeleton.names) > 1
 
 
 def test_a_network_is_needed_but_for_slerp():
@@ -249,7 +275,7 @@ def test_errors_at_keys_are_told_for_what_they_tell(rig):
     motion, frames = on_rig(rig, 45), frames_of(30)
     told = {"pose": {}, "limbs": {"limbs": LIMBS[rig]}, "root": {"root_only": True}}
     for what, kind in told.items():
-        keys = Keys(frames, **kind)
+        keys = Keys.of(frames, **kind)
         rows = key_errors(motion, motion, keys)
         assert [row["frame"] for row in rows] == list(frames)
         assert [row["what"] for row in rows] == ["pose", what, what, "pose"]

@@ -24,28 +24,30 @@ class Bench:
 
     what: Positional[
         Annotated[
-            Literal["speed", "ablation", "free-run", "generation", "steer", "live", "denoise", "infill"],
-            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill"),
+            Literal["speed", "ablation", "free-run", "generation", "steer", "live", "denoise", "infill", "timing"],
+            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill|timing"),
         ]
     ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
     `free-run`: 8 random motions of 10,000 frames beside the training data; `generation`: raw, refined and finished
     motion beside mocap that training did not see; `steer`: random commands, which are reached and how soon; `live`: the
     same against the wall clock, for one, two and four characters at once; `denoise`: clips that training did not see,
-    spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out."""
+    spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out; `timing`:
+    pairs of their poses, and the time between them that `mapctl tween --suggest-timing` would suggest."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
     `live`, if not given; for `denoise` as that command takes it."""
     data: options.MaybeFile = None
-    """For `generation`, `denoise` and `infill`: the folder that was trained on, for the clips that were held out."""
+    """For `generation`, `denoise`, `infill` and `timing`: the folder that was trained on, for the clips that were held
+    out."""
     count: options.Count = 48
-    """For `generation`: clips of 10 s to draw; for `steer`: commands to give; for `denoise` and
-    `infill`: clips, spread over the kinds."""
+    """For `generation`: clips of 10 s to draw; for `steer`: commands to give; for `denoise`,
+    `infill` and `timing`: clips, spread over the kinds."""
     denoiser: options.Name = "denoiser"
     """For `denoise`: the bundled denoiser, or the file or run folder of a trained one."""
     infiller: options.Name = "infiller"
-    """For `infill`, and in `denoise` for joints that are lost: the bundled infiller, or the file or run folder of a
-    trained one."""
+    """For `infill` and `timing`, and in `denoise` for joints that are lost: the bundled infiller, or the file or run
+    folder of a trained one."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """For `infill`: other trained infillers, to compare as they are."""
     refiner: options.Name = "auto"
@@ -62,7 +64,7 @@ class Bench:
         compute_on_one()
         from mapctl import report
 
-        others = {"denoise": self._denoise, "infill": self._infill}
+        others = {"denoise": self._denoise, "infill": self._infill, "timing": self._timing}
         rows = others.get(self.what, self._of_a_prior)()
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
@@ -117,6 +119,14 @@ class Bench:
         with bar("filling") as progress:
             rows = table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
         return [*rows, *by_kind(kinds, infiller), *lost_joints(kinds, infiller)]
+
+    def _timing(self) -> list[dict[str, Any]]:
+        import priors
+        from controllers.bench_timing import timing
+        from mapctl import retarget
+
+        clips = self._clips_by_kind(priors.load_infiller(self.infiller).card)
+        return timing([retarget.to_canonical(clip.motion)[0] for clip in clips])
 
     def _clips_by_kind(self, card: Any) -> "list[Clip]":
         """Unseen clips, as many of each kind, without their T-poses."""

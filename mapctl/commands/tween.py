@@ -1,5 +1,6 @@
 """`mapctl tween`: a few keys to a whole motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -7,33 +8,41 @@ from tyro.conf import arg
 
 from mapctl.commands import beside, options
 from mapctl.commands.frames import parse_frame
+from mapctl.commands.tables import print_table
 from mapctl.commands.threads import compute_on_one
-from mapctl.errors import RequestError
+from mapctl.errors import FileFormatError, RequestError
 
 if TYPE_CHECKING:
     from controllers.filling import Infilled
-    from controllers.tween import Keys
-    from mapctl.motion import Motion
+    from controllers.keyed import Keyed
+    from controllers.timing import Interval
+    from mapctl.rigs import Rig
 
 
 @dataclass(frozen=True)
 class Tween:
-    """Frames of a clip are keys, and the motion between them is made anew. On any known rig."""
+    """Frames of a clip are keys, or poses that a file puts in time and place, and the motion between them is made anew.
+    On any known rig."""
 
     source: options.InFile
-    """A motion file."""
+    """A motion file; or a TOML file of [[key]] tables: a frame or seconds, a pose (a motion file and a pose_frame of
+    it), a place = [x, z], height and facing_deg of the hips, and joints, reach or root_only where not all of it counts
+    (docs/infilling.md)."""
     out: options.OutFile
-    """Where the motion goes: as long as IN."""
-    keyframes: Annotated[str, arg(metavar="F,F,...")]
-    """Frames that stay, or seconds as in 1.5s; the first and the last one are whole poses."""
+    """Where the motion goes: as long as IN, or until the last key."""
+    keyframes: Annotated[str | None, arg(metavar="F,F,...")] = None
+    """Of a motion file, frames that stay, or seconds as in 1.5s; the first and the last one are whole poses."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Keys between the first and the last only tell where these hands or feet are."""
     root_only: bool = False
     """Keys between the first and the last only tell where the hips are and which way they face."""
+    suggest_timing: bool = False
+    """Tell how many frames the way from each whole pose to the next takes in mocap, beside what is given; the motion
+    keeps the given timing."""
     method: Annotated[Literal["map", "infiller", "slerp"], arg(metavar="map|infiller|slerp")] = "map"
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. slerp: none of it."""
     rig: options.MaybeRig = None
-    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
+    """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
     infiller: options.Name = "infiller"
     """The bundled infiller, or the file or run folder of a trained one."""
     prior: options.MaybeName = None
@@ -50,38 +59,77 @@ class Tween:
         """Check everything, make, write, tell."""
         compute_on_one()
         self._check()
-        rig = options.read_rig(self.rig)
-        motion = options.read_motion(self.source, rig)
-        keys = self._keys(motion)
-        done = self._made(motion, keys)
+        asked = self._asked()
+        intervals = self._timing(asked)
+        done = self._made(asked)
         from mapctl import formats
 
         formats.save(done.motion, self.out)
         if self.report is not None:
             from mapctl import report
 
-            report.write(self._as_report(done, motion, keys), self.report)
-        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
+            report.write(self._as_report(done, asked, intervals), self.report)
+        beside.film(asked.motion, done.motion, self.video, rig=asked.rig, quiet=self.quiet)
         if not self.quiet:
-            ms = 1000 * done.seconds / done.motion.num_frames
-            print(f"{self.out}: {done.motion.num_frames} frames through {len(keys.frames)} keys; {ms:.1f} ms a frame")
-            for note in done.notes:
-                print(note)
+            self._tell(done, asked, intervals)
         return 0
+
+    def _tell(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> None:
+        ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
+        print(f"{self.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
+        for note in done.notes:
+            print(note)
+        if intervals:
+            rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
+            print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
+
+    def _timing(self, asked: "Keyed") -> "list[Interval]":
+        from controllers.timing import suggest
+
+        return suggest(asked.motion, asked.keys, asked.rig) if self.suggest_timing else []
+
+    @property
+    def _of_file(self) -> bool:
+        """Whether the keys are those of a TOML file."""
+        return self.source.suffix.lower() == ".toml"
 
     def _check(self) -> None:
         if self.joints is not None and self.root_only:
             raise RequestError("--joints and --root-only are two kinds of keys; choose one")
+        given = [name for name, value in (("--keyframes", self.keyframes), ("--joints", self.joints),
+                                          ("--root-only", self.root_only or None)) if value is not None]  # fmt: skip
+        if self._of_file and given:
+            raise RequestError(f"{given[0]} is for motion files; {self.source} says itself what its keys are")
+        if not self._of_file and self.keyframes is None:
+            raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
         beside.check(self.out, self.video, self.report)
 
-    def _keys(self, motion: "Motion") -> "Keys":
-        from controllers.tween import Keys
+    def _asked(self) -> "Keyed":
+        """The motion that holds the keys, these, and its rig where it is known."""
+        from controllers.keyed import Keyed
+        from controllers.keys import Keys, check_limbs
 
-        frames = [parse_frame(word, fps=float(motion.fps)) for word in self.keyframes.split(",")]
+        rig = options.read_rig(self.rig)
+        if self._of_file:
+            return self._of_key_file(rig)
+        motion = options.read_motion(self.source, rig)
+        frames = [parse_frame(word, fps=float(motion.fps)) for word in (self.keyframes or "").split(",")]
         limbs = () if self.joints is None else tuple(name.strip() for name in self.joints.split(","))
-        return Keys(tuple(frames), limbs=limbs, root_only=self.root_only)
+        if limbs:  # also where there is no key between the first and the last
+            check_limbs(limbs, motion, rig)
+        return Keyed(motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig)
 
-    def _made(self, motion: "Motion", keys: "Keys") -> "Infilled":
+    def _of_key_file(self, rig: "Rig | None") -> "Keyed":
+        from controllers.keyed import keyed
+        from mapctl.key_files import read_keys
+
+        request = read_keys(self.source)
+        try:
+            return keyed(request, rig)
+        except RequestError as error:
+            raise FileFormatError(self.source, str(error)) from error
+
+    def _made(self, asked: "Keyed") -> "Infilled":
         import priors
         from controllers.filling import InfillSettings
         from controllers.tween import tween
@@ -89,11 +137,12 @@ class Tween:
         method = "linear" if self.method == "slerp" else self.method
         infiller = None if method == "linear" else priors.load_infiller(self.infiller)
         densities = priors.load_choice(self.prior)
-        settings, rig = InfillSettings(method=method), options.read_rig(self.rig)
-        return tween(motion, keys, infiller, settings=settings, densities=densities, rig=rig)
+        settings = InfillSettings(method=method)
+        return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig)
 
-    def _as_report(self, done: "Infilled", motion: "Motion", keys: "Keys") -> dict[str, object]:
+    def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:
         from controllers.tween import key_errors
 
-        missed = key_errors(done.motion, motion, keys, options.read_rig(self.rig))
-        return beside.report("tween", self, done.motion, {"keys": missed, **done.summary()})
+        missed = key_errors(done.motion, asked.motion, asked.keys, asked.rig)
+        timing = {"timing": [interval.summary() for interval in intervals]} if self.suggest_timing else {}
+        return beside.report("tween", self, done.motion, {"keys": missed, **timing, **done.summary()})

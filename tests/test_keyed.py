@@ -1,0 +1,148 @@
+"""Key files made motions: poses are where they are wanted, on the body's rig, and only what counts is kept."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import apart_deg, on_rig
+from rig_maker import Make, make, names_of
+from tiny_infiller import tiny_infiller
+
+import mapctl
+from controllers.filling import InfillSettings
+from controllers.keyed import keyed
+from controllers.tween import key_errors, tween
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.key_files import KeyRequest, PlacedKey
+from mapctl.kinematics import heading
+from mapctl.skeleton import Skeleton, leg_length
+
+RIGS = ("canonical", "bandai", "daz")
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory):
+    """A walk on every rig, and on one whose world has Z up: paths by name."""
+    folder = tmp_path_factory.mktemp("poses")
+    made = {rig: on_rig(rig, 45) for rig in RIGS}
+    made["zup"] = make(Make(names_of("ue4"), bones_along_x=True, zup=True, root="root")).motion(on_rig("canonical", 45))
+    for rig, motion in made.items():
+        motion.save(folder / f"{rig}.npz")
+    return {rig: str(folder / f"{rig}.npz") for rig in made}
+
+
+def first_and_last(pose, *, frames=30):
+    return PlacedKey(frame=0, pose=pose), PlacedKey(frame=frames, pose=pose, pose_frame=30)
+
+
+def canonical_of(found):
+    return retarget.to_canonical(found.motion, found.rig)[0]
+
+
+def made_of(request):
+    found = keyed(request)
+    done = tween(found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig,
+                 settings=InfillSettings(method="infiller"))  # fmt: skip
+    return found, done
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_poses_of_the_body_that_are_not_moved_come_to_the_bit(poses, rig):
+    clip = on_rig(rig, 45)
+    found = keyed(KeyRequest(first_and_last(poses[rig])))
+    assert (found.motion.num_frames, found.motion.fps) == (31, 30)
+    for frame, pose in ((0, 0), (30, 30)):
+        assert torch.equal(found.motion.local_quat_xyzw[frame].abs(), clip.local_quat_xyzw[pose].abs())
+        assert torch.equal(found.motion.joint_positions()[frame], clip.joint_positions()[pose])
+
+
+@pytest.mark.parametrize("rig", [*RIGS, "zup"])
+def test_hips_are_put_turned_and_lifted_and_the_pose_stays(poses, rig):
+    """In metres with Y up, whatever the file's world is."""
+    key = PlacedKey(frame=30, pose=poses[rig], pose_frame=20, place=(2.0, -1.5), height=0.7, facing_deg=-120)
+    found = keyed(KeyRequest((first_and_last(poses[rig])[0], key)))
+    whole, plain = canonical_of(found), canonical_of(keyed(KeyRequest(first_and_last(poses[rig], frames=20))))
+    assert whole.root_position[30].tolist() == pytest.approx([2.0, 0.7, -1.5], abs=1e-9)
+    assert math.degrees(float(heading(whole.local_quat_xyzw[30, 0]))) == pytest.approx(-120, abs=1e-6)
+    source = retarget.to_canonical(mapctl.load(poses[rig]))[0]
+    assert apart_deg(whole.local_quat_xyzw[30, 1:], source.local_quat_xyzw[20, 1:]).max() < 0.01
+    assert torch.allclose(whole.root_position[0], plain.root_position[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("body", "other"), [("bandai", "daz"), ("daz", "canonical"), ("canonical", "zup"),
+                                             ("zup", "bandai")])  # fmt: skip
+def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
+    """Rotations stay, and the hips' way is in the scale of the legs."""
+    found = keyed(KeyRequest(first_and_last(poses[other]), body=poses[body]))
+    whole = canonical_of(found)
+    source = retarget.to_canonical(mapctl.load(poses[other]))[0]
+    assert found.motion.skeleton.names == keyed(KeyRequest(first_and_last(poses[body]))).motion.skeleton.names
+    legs = leg_length(whole.skeleton) / leg_length(source.skeleton)
+    assert torch.allclose(whole.root_position[30], legs * source.root_position[30], atol=1e-4)
+    known = [joint for joint, name in enumerate(whole.skeleton.names) if "Toes" not in name]
+    turned = apart_deg(whole.joint_rotations()[30], source.joint_rotations()[30])[known]
+    assert turned.max() < 0.01
+
+
+@pytest.mark.parametrize("rig", [*RIGS, "zup"])
+def test_every_kind_of_key_is_met_in_one_motion(poses, rig):
+    rigmap = retarget.to_canonical(keyed(KeyRequest(first_and_last(poses[rig]))).motion)[1]
+    hand, foot = (rigmap.rig_skeleton.names[rigmap.joint_of[rigmap.skeleton.index(name)]]
+                  for name in ("leftHand", "rightFoot"))  # fmt: skip
+    start, stop = first_and_last(poses[rig])
+    between = (PlacedKey(frame=7, reach={hand: (0.4, 1.2, 0.5)}),
+               PlacedKey(frame=13, pose=poses[rig], pose_frame=14, joints=(foot,)),
+               PlacedKey(frame=19, pose=poses[rig], pose_frame=18, root_only=True, place=(0.1, 0.6)),
+               PlacedKey(frame=24, pose=poses[rig], pose_frame=24))  # fmt: skip
+    found, done = made_of(KeyRequest((stop, *between, start)))
+    rows = key_errors(done.motion, found.motion, found.keys, found.rig)
+    assert [row["what"] for row in rows] == ["pose", "limbs", "limbs", "root", "pose", "pose"]
+    assert max(row["missed_cm"] for row in rows) < 0.1
+    assert done.notes == ()
+    canonical, there = retarget.to_canonical(done.motion, found.rig)
+    places = retarget.places_on_rig(done.motion, there)
+    assert places[7, canonical.skeleton.index("leftHand")].tolist() == pytest.approx([0.4, 1.2, 0.5], abs=1e-3)
+    assert canonical.root_position[19, ::2].tolist() == pytest.approx([0.1, 0.6], abs=1e-6)
+
+
+def test_of_a_key_that_only_reaches_no_pose_counts(poses):
+    """Neither that of the file, nor any that it names beside it."""
+    start, stop = first_and_last(poses["bandai"])
+    made = [made_of(KeyRequest((start, PlacedKey(frame=15, reach={"Hand_L": (0.3, 1.3, 0.9)}, **more), stop)))[1].motion
+            for more in ({}, {"pose": poses["daz"], "place": (5.0, 5.0)})]  # fmt: skip
+    assert torch.equal(made[0].local_quat_xyzw, made[1].local_quat_xyzw)
+
+
+@pytest.mark.parametrize(("key", "said"), [
+    (PlacedKey(frame=9, pose="gone.npz"), r"key\[2\]\.pose: gone\.npz"),
+    (PlacedKey(frame=9, pose="clip.mp3"), r"key\[2\]\.pose: clip\.mp3"),
+    (PlacedKey(frame=9, pose_frame=45), r"key\[2\]\.pose_frame: the frame 45 is not one of the pose's 0:45"),
+    (PlacedKey(frame=9, pose_seconds=1.6), r"key\[2\]\.pose_seconds: the frame 48 is not one of the pose's 0:45"),
+    (PlacedKey(frame=9, joints=("Hnad_L",)), r"key\[2\]\.joints: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+    (PlacedKey(frame=9, reach={"foot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'foot_r'; .* Foot_R"),
+])  # fmt: skip
+def test_what_is_not_there_is_named_with_its_key(poses, key, said):
+    with pytest.raises(RequestError, match=said):
+        keyed(KeyRequest((*first_and_last(poses["bandai"]), key), body=poses["bandai"]))
+
+
+def test_a_pose_on_a_skeleton_that_is_no_body_is_refused(poses, tmp_path):
+    clip = on_rig("canonical", 3)
+    names = tuple(f"part{number}" for number in range(clip.num_joints))
+    star = Skeleton(names, (-1, *([0] * (len(names) - 1))), clip.skeleton.offsets)
+    replace(clip, skeleton=star).save(tmp_path / "star.npz")
+    request = KeyRequest((*first_and_last(poses["bandai"]), PlacedKey(frame=9, pose=str(tmp_path / "star.npz"))))
+    with pytest.raises(RequestError, match=r"key\[2\]\.pose: "):
+        keyed(request)
+
+
+def test_limbs_that_no_one_could_bring_there_in_time_are_named_with_numbers(poses):
+    start, stop = first_and_last(poses["bandai"])
+    reaches = (PlacedKey(frame=14, reach={"Hand_L": (0.6, 1.3, 0.5)}),
+               PlacedKey(frame=15, reach={"Hand_L": (-0.4, 1.3, 0.5)}))  # fmt: skip
+    _, done = made_of(KeyRequest((start, *reaches, stop)))
+    assert done.notes[0] == "Hand_L needs 30 m/s between frames 14 and 15, which nobody reaches"
+    slower = (reaches[0], PlacedKey(frame=17, reach=reaches[1].reach))
+    assert not any("Hand_L needs" in note for note in made_of(KeyRequest((start, *slower, stop)))[1].notes)

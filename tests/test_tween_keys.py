@@ -1,0 +1,147 @@
+"""`mapctl tween KEYS.toml` as a user types it: keys of every kind, suggested timing, and what is refused."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from captures import on_rig
+from helpers import run, walk
+from tiny_infiller import save_tiny_infiller
+
+import mapctl
+from mapctl import retarget
+
+DOCS = Path(__file__).parent.parent / "docs"
+GOOD = """
+body = "walk.bvh"
+[[key]]
+frame = 0
+[[key]]
+seconds = 0.5
+reach = { Hand_L = [0.4, 1.2, 0.8] }
+[[key]]
+frame = 22
+pose = "other.bvh"
+pose_frame = 20
+root_only = true
+[[key]]
+frame = 40
+pose_frame = 40
+place = [0.3, 1.5]
+facing_deg = 30
+"""
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.02)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Poses and keys beside them; the current folder is another."""
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "here").mkdir()
+    on_rig("bandai", 45).save(tmp_path / "keys" / "walk.bvh")
+    on_rig("daz", 45).save(tmp_path / "keys" / "other.bvh")
+    (tmp_path / "keys" / "keys.toml").write_text(GOOD)
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path
+
+
+@pytest.fixture
+def tween(tiny):
+    """Runs the command; returns the exit status."""
+    return lambda *words: run("tween", *words, "--infiller", tiny)
+
+
+def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
+    words = [folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", "r.json"]
+    assert tween(*words) == 0
+    assert capsys.readouterr().out.startswith("out.bvh: 41 frames through 4 keys; ")
+    made = mapctl.load("out.bvh")
+    assert (made.num_frames, float(made.fps)) == (41, 30)
+    assert made.skeleton.names == mapctl.load(folder / "keys" / "walk.bvh").skeleton.names
+    assert made.root_position.isfinite().all()
+    told = json.loads(Path("r.json").read_text())
+    assert [(row["frame"], row["what"]) for row in told["keys"]] == [(0, "pose"), (15, "limbs"), (22, "root"),
+                                                                    (40, "pose")]  # fmt: skip
+    assert all(row["missed_cm"] < 0.1 for row in told["keys"])
+    canonical = retarget.to_canonical(made)[0]
+    hand = canonical.joint_positions()[15, canonical.skeleton.index("leftHand")]
+    assert hand.tolist() == pytest.approx([0.4, 1.2, 0.8], abs=2e-3)
+    assert canonical.root_position[40, ::2].tolist() == pytest.approx([0.3, 1.5], abs=1e-4)
+    assert "timing" not in told
+
+
+def test_timing_is_suggested_and_the_given_one_made(tween, folder, capsys):
+    keys = folder / "keys" / "keys.toml"
+    assert tween(keys, "-o", "plain.bvh", "--method", "slerp") == 0
+    capsys.readouterr()
+    words = ["--method", "slerp", "--suggest-timing", "--report", "r.json"]
+    assert tween(keys, "-o", "out.bvh", *words) == 0
+    assert Path("out.bvh").read_bytes() == Path("plain.bvh").read_bytes()
+    (row,) = json.loads(Path("r.json").read_text())["timing"]
+    assert (row["from"], row["to"], row["given"]) == (0, 40, 40)
+    assert row["usual"][0] <= row["suggested"] <= row["usual"][1]
+    told = capsys.readouterr().out
+    assert re.search(rf"\b0 +40 +40 +{row['suggested']} +\w+", told)
+    assert "m/s" in told
+
+
+def test_timing_is_suggested_for_frames_of_a_clip_too(tween, folder, capsys):
+    words = ["-o", "out.bvh", "--keyframes", "0,3,44", "--method", "slerp", "--suggest-timing"]
+    assert tween(folder / "keys" / "walk.bvh", *words) == 0
+    assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()[-3:] if line.strip()] == [
+        ["0", "3", "3"], ["3", "44", "41"]]  # fmt: skip
+
+
+def test_the_same_bytes_come_twice_and_quiet_says_nothing(tween, folder, capsys):
+    found = set()
+    for _ in range(2):
+        words = ["--suggest-timing", "--quiet"]
+        assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", *words) == 0
+        found.add(Path("out.bvh").read_bytes())
+    assert len(found) == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_the_example_runs_on_a_clip_of_its_name(tween, folder):
+    """The clip that it names is made by the command that it tells."""
+    text = (DOCS / "keys.toml").read_text()
+    (named,) = set(re.findall(r'"([\w/]+\.bvh)"', text))
+    clip = folder / "keys" / named
+    clip.parent.mkdir(exist_ok=True)
+    walk(120).save(clip)
+    (folder / "keys" / "example.toml").write_text(text)
+    assert tween(folder / "keys" / "example.toml", "-o", "out.bvh", "--report", "r.json", "--quiet") == 0
+    told = json.loads(Path("r.json").read_text())
+    assert {row["what"] for row in told["keys"]} == {"pose", "limbs", "root"}
+
+
+@pytest.mark.parametrize(("text", "words", "said"), [
+    (GOOD.replace("place =", "plaec ="), [], "key[3].plaec: there is no such key; the nearest is place"),
+    (GOOD.replace("Hand_L", "Hnad_L"), [], "key[1].reach: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+    (GOOD.replace("other.bvh", "gone.bvh"), [], "gone.bvh"),
+    (GOOD.replace("walk.bvh", "gone.bvh"), [], "body: "),
+    (GOOD.replace("pose_frame = 20", "pose_frame = 45"), [], "the frame 45 is not one of the pose's 0:45"),
+    (GOOD.replace("frame = 22", "frame = 40"), [], "key[3]: key[2] is at frame 40 already"),
+    (GOOD.replace("[0.3, 1.5]", "[0.3, nan]"), [], "key[3].place[1]: "),
+    ("", [], "key: this key is needed"),
+    (GOOD, ["--keyframes", "0,9"], "--keyframes is for motion files; "),
+    (GOOD, ["--joints", "Hand_L"], "--joints is for motion files; "),
+    (GOOD, ["--root-only"], "--root-only is for motion files; "),
+    (GOOD, ["--rig", "nobody"], "nobody"),
+], ids=range(12))  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(tween, folder, capsys, text, words, said):
+    keys = folder / "keys" / "keys.toml"
+    keys.write_text(text)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.*")}
+    assert tween(keys, "-o", "out.bvh", "--report", "r.json", "--suggest-timing", *words) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("mapctl: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.*")} == before
