@@ -210,7 +210,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
 
 def test_an_infiller_that_is_none_is_refused(recording, tmp_path, capsys):
     denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
-    for name, said in ((denoiser, "a denoiser, not an infiller"), ("nobody", "no prior 'nobody'")):
+    for name, said in ((denoiser, "a denoiser is no infiller"), ("nobody", "no prior 'nobody'")):
         words = ["infill", recording(), "-o", tmp_path / "a.bvh", "--gap", "5:9", "--infiller", name]
         assert run(*words) == 2
         assert said in capsys.readouterr().err

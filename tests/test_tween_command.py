@@ -169,7 +169,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(
 
 def test_an_infiller_that_is_none_is_refused(source, tmp_path, capsys):
     denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
-    for name, said in ((denoiser, "a denoiser, not an infiller"), ("nobody", "no prior 'nobody'")):
+    for name, said in ((denoiser, "a denoiser is no infiller"), ("nobody", "no prior 'nobody'")):
         assert run("tween", source, "-o", tmp_path / "a.bvh", "--keyframes", "0,9", "--infiller", name) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "a.bvh").exists()
