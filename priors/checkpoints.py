@@ -5,6 +5,8 @@ the measured quality. A card that does not fit the code is refused with both lay
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -14,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from mapctl.errors import CheckpointError
+from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
 from mapctl.formats.atomic import atomic_path
 
@@ -81,6 +83,23 @@ def load(path: Path) -> tuple[dict[str, Tensor], Card]:
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path}: no readable safetensors file ({error})") from error
     return {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, card
+
+
+@contextmanager
+def opened(name: str, kind: str, *, called: str | None = None) -> Iterator[tuple[dict[str, Tensor], Card]]:
+    """Tensors and card of a bundled name, a file or a run folder, for building the network within.
+
+    CheckpointError for weights of another kind than this, which messages call `called`, and where what is built of the
+    card does not take the tensors.
+    """
+    path = locate(name)
+    tensors, card = load(path)
+    if card.kind != kind:
+        raise CheckpointError(f"{path}: a {card.kind} is no {called or kind}")
+    try:
+        yield tensors, card
+    except (KeyError, TypeError, RuntimeError, RequestError) as error:
+        raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
 
 
 def read_card(path: Path) -> Card:

@@ -5,8 +5,7 @@ then makes exact. Dilated residual convolutions over time, on what was seen, a s
 seen, and the noise's sigmas. Where noise is nil what was seen is returned: the change fades with the sigma.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -15,9 +14,10 @@ from torch.nn.functional import gelu
 
 from mapctl import gaussian, rotations
 from mapctl.capture import Capture, Cleaned, filled
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
+from priors.settings import NetworkConfig
 
 _OTHERS = CANONICAL.num_joints - 1
 _ANGLES = 2 + 3 * _OTHERS  # tilt and rotation vectors
@@ -33,7 +33,7 @@ _PIECE, _MARGIN = 512, 64  # frames cleaned at once, and beside them
 
 
 @dataclass(frozen=True)
-class DenoiserConfig:
+class DenoiserConfig(NetworkConfig):
     """Shape of the network."""
 
     width: int = 192
@@ -46,15 +46,6 @@ class DenoiserConfig:
     def __post_init__(self):
         if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
             raise RequestError(f"a denoiser needs a positive width, an odd kernel and positive dilations, got {self}")
-
-    def as_card(self) -> dict[str, Any]:
-        """For a card's JSON, which knows no tuples."""
-        return {**asdict(self), "dilations": list(self.dilations)}
-
-    @staticmethod
-    def of_card(config: dict[str, Any]) -> "DenoiserConfig":
-        """Inverse of `as_card`; KeyError or TypeError for fields that are not these."""
-        return DenoiserConfig(**{**config, "dilations": tuple(config["dilations"])})
 
 
 class DenoiserNetwork(nn.Module):
@@ -193,13 +184,7 @@ class ConvDenoiser:
 
 def load(name: str) -> ConvDenoiser:
     """The bundled denoiser by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    path = checkpoints.locate(name)
-    tensors, card = checkpoints.load(path)
-    if card.kind != "denoiser":
-        raise CheckpointError(f"{path}: a {card.kind} is no denoiser")
-    try:
+    with checkpoints.opened(name, "denoiser") as (tensors, card):
         network = DenoiserNetwork(DenoiserConfig.of_card(card.config))
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError, RequestError) as error:
-        raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
     return ConvDenoiser(name, network.eval().requires_grad_(False), card)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.protocols import Abilities, Plan, Starts
 from priors import checkpoints, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig, LstmState
@@ -149,11 +149,7 @@ class LstmGmmDensity:
 
 def load(name: str) -> LstmGmmDensity:
     """A bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    path = checkpoints.locate(name)
-    tensors, card = checkpoints.load(path)
-    if card.kind != "lstm-gmm":
-        raise CheckpointError(f"{path}: a {card.kind} is no density")
-    try:
+    with checkpoints.opened(name, "lstm-gmm", called="density") as (tensors, card):
         starts = Starts(
             LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
             tensors.pop("starts.speed"), tuple(card.data["starts"]), tensors.pop("starts.weight"),
@@ -161,6 +157,4 @@ def load(name: str) -> LstmGmmDensity:
         Abilities(**card.abilities)
         model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError, RequestError) as error:
-        raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
     return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)

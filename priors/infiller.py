@@ -1,19 +1,19 @@
 """The infiller: a convolutional network that proposes the frames and joints that a motion lacks (infilling paper)."""
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mapctl import rotations
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.gaps import PositionImage, Proposed
 from mapctl.gaps.image import mirrored_places
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.infiller_networks import AUTOENCODERS, Architecture, Skips
+from priors.settings import NetworkConfig
 
 _JOINTS = CANONICAL.num_joints
 _PLACES, _COURSE, _FEET = 3 * _JOINTS, 3, 2
@@ -25,7 +25,7 @@ _FAR = 60  # frames beyond which it is all one how far a known frame is
 
 
 @dataclass(frozen=True)
-class InfillerConfig:
+class InfillerConfig(NetworkConfig):
     """Shape of the network."""
 
     architecture: Architecture = "skips"
@@ -41,15 +41,6 @@ class InfillerConfig:
             raise RequestError(f"no infiller architecture {self.architecture!r}; there are {known}")
         if min(self.widths, default=0) < 1 or self.kernel < 1 or self.kernel % 2 == 0:
             raise RequestError(f"an infiller needs positive widths and an odd kernel, got {self}")
-
-    def as_card(self) -> dict[str, Any]:
-        """For a card's JSON, which knows no tuples."""
-        return {**asdict(self), "widths": list(self.widths)}
-
-    @staticmethod
-    def of_card(config: dict[str, Any]) -> "InfillerConfig":
-        """Inverse of `as_card`; KeyError or TypeError for fields that are not these."""
-        return InfillerConfig(**{**config, "widths": tuple(config["widths"])})
 
 
 class InfillerNetwork(nn.Module):
@@ -130,13 +121,7 @@ class ConvInfiller:
 
 def load(name: str = "infiller") -> ConvInfiller:
     """The bundled infiller, or a trained one by its file or run folder; CheckpointError for anything else."""
-    path = checkpoints.locate(name)
-    tensors, card = checkpoints.load(path)
-    if card.kind != "infiller":
-        raise CheckpointError(f"{path} holds a {card.kind}, not an infiller")
-    try:
+    with checkpoints.opened(name, "infiller") as (tensors, card):
         network = InfillerNetwork(InfillerConfig.of_card(card.config))
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError, RequestError) as error:
-        raise CheckpointError(f"{path}: its card and its tensors do not fit ({error})") from error
     return ConvInfiller(name, network.eval().requires_grad_(False), card)

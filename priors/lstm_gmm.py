@@ -10,9 +10,8 @@ were not. It can also be told labels of the data (gait, style), or none.
 
 import copy
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,13 +20,14 @@ from torch import Tensor, nn
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, FeatureLayout
 from mapctl.protocols import Plan
+from priors.settings import NetworkConfig, check_least
 
 NOISE_UNIT = 0.1
 """Level of input noise (normalised units) that the network is told as 1."""
 
 
 @dataclass(frozen=True)
-class LstmGmmConfig:
+class LstmGmmConfig(NetworkConfig):
     """Shape of the network."""
 
     width: int = 500
@@ -50,18 +50,7 @@ class LstmGmmConfig:
     """What else it can be told of a motion, each yes or no: `gait=run`, `style=active`."""
 
     def __post_init__(self):
-        for name in ("width", "components"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
-
-    def as_card(self) -> dict[str, Any]:
-        """For a card's JSON, which knows no tuples."""
-        return {**asdict(self), "labels": list(self.labels)}
-
-    @staticmethod
-    def of_card(config: Mapping[str, Any]) -> "LstmGmmConfig":
-        """Inverse of `as_card`; KeyError or TypeError for fields that are not these."""
-        return LstmGmmConfig(**{**config, "labels": tuple(config["labels"])})
+        check_least(self, 1, "width", "components")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,18 +6,18 @@ bounded, so that no input can make it explode. Contact bits are in its input and
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.end_effectors import channels, end_effectors
+from priors.settings import NetworkConfig
 
 END_EFFECTORS = ("hips", "head", "leftLowerArm", "leftHand", "rightLowerArm", "rightHand", "leftLowerLeg", "leftFoot",
                  "leftToes", "rightLowerLeg", "rightFoot", "rightToes")  # fmt: skip
@@ -28,7 +28,7 @@ _PIECE = 600  # frames refined at once
 
 
 @dataclass(frozen=True)
-class RefinerConfig:
+class RefinerConfig(NetworkConfig):
     """Shape of the network."""
 
     width: int = 256
@@ -47,15 +47,6 @@ class RefinerConfig:
             raise RequestError(f"a refiner needs positive width, memory and limit, and lookahead >= 0, got {self}")
         if not self.joints or not set(self.joints) <= set(CANONICAL.names):
             raise RequestError(f"a refiner needs end effectors among {', '.join(CANONICAL.names)}, got {self.joints}")
-
-    def as_card(self) -> dict[str, Any]:
-        """For a card's JSON, which knows no tuples."""
-        return {**asdict(self), "joints": list(self.joints)}
-
-    @staticmethod
-    def of_card(config: dict[str, Any]) -> "RefinerConfig":
-        """Inverse of `as_card`; KeyError or TypeError for fields that are not these."""
-        return RefinerConfig(**{**config, "joints": tuple(config["joints"])})
 
 
 class RefinerNetwork(nn.Module):
@@ -147,14 +138,8 @@ def _with_margin(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterat
 
 def load(name: str) -> LstmRefiner:
     """A bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    path = checkpoints.locate(name)
-    tensors, card = checkpoints.load(path)
-    if card.kind != "refiner":
-        raise CheckpointError(f"{path}: a {card.kind} is no refiner")
-    try:
+    with checkpoints.opened(name, "refiner") as (tensors, card):
         statistics = {part: tensors[part] for part in ("mean", "std", "reach_mean", "reach_std")}
         network = RefinerNetwork(RefinerConfig.of_card(card.config), **statistics)
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError, RequestError) as error:
-        raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
     return LstmRefiner(name, network.eval().requires_grad_(False), card)

@@ -78,3 +78,26 @@ def data(tmp_path_factory) -> Path:
     from helpers import write_corpus
 
     return write_corpus(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture
+def fails(tmp_path, capsys, monkeypatch):
+    """Runs mapctl in an empty folder and holds it to the rule: exit status 2, one line on standard error, nothing
+    written. Returns the line.
+    """
+    from helpers import run
+
+    monkeypatch.chdir(tmp_path)
+
+    def check(*words: object) -> str:
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+        status = run(*words)
+        told = capsys.readouterr()
+        assert status == 2
+        assert told.out == ""
+        assert told.err.startswith("mapctl: ")
+        assert told.err.count("\n") == 1
+        assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+        return told.err
+
+    return check

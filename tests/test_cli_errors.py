@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from mapctl import cli
-
 TURNS = "Zrotation Xrotation Yrotation"
 HEAD = (
     f"HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition {TURNS}\n"
@@ -42,25 +40,6 @@ CURVES = {
     "point": b"x,z\n0,0\n",
     "header": b"x,z\n",
 }
-
-
-@pytest.fixture
-def fails(tmp_path, capsys, monkeypatch):
-    """Runs mapctl in an empty folder and holds it to the rule; returns the line."""
-    monkeypatch.chdir(tmp_path)
-
-    def check(*words: object) -> str:
-        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-        status = cli.main([str(word) for word in words])
-        told = capsys.readouterr()
-        assert status == 2
-        assert told.out == ""
-        assert told.err.startswith("mapctl: ")
-        assert told.err.count("\n") == 1
-        assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-        return told.err
-
-    return check
 
 
 @pytest.mark.parametrize("kind", MOTIONS)

@@ -158,11 +158,11 @@ def test_shapes_that_cannot_be_are_refused(wrong):
 
 def test_what_is_no_infiller_is_refused(tmp_path):
     denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
-    with pytest.raises(CheckpointError, match="a denoiser, not an infiller"):
+    with pytest.raises(CheckpointError, match="a denoiser is no infiller"):
         priors.load_infiller(str(denoiser))
     density, wrong = tiny_density(), tmp_path / "density.safetensors"
     checkpoints.save(density.reference.state_dict(), density.card, wrong)
-    with pytest.raises(CheckpointError, match="a lstm-gmm, not an infiller"):
+    with pytest.raises(CheckpointError, match="a lstm-gmm is no infiller"):
         priors.load_infiller(str(wrong))
     with pytest.raises(CheckpointError, match="no prior 'nobody'"):
         priors.load_infiller("nobody")
@@ -176,5 +176,5 @@ def test_what_is_no_infiller_is_refused(tmp_path):
 def test_tensors_that_do_not_fit_their_card_are_refused(tmp_path, config):
     path = tmp_path / "broken.safetensors"
     checkpoints.save(network().state_dict(), replace(card(), config={**CONFIG.as_card(), **config}), path)
-    with pytest.raises(CheckpointError, match="do not fit"):
+    with pytest.raises(CheckpointError, match="do not fit its card"):
         priors.load_infiller(str(path))

@@ -55,11 +55,7 @@ class Capture:
     @cached_property
     def heading(self) -> Float[Tensor, "batch frames"]:
         """Of the hips about +Y, radians, not wrapped; across frames that were not seen it is filled in."""
-        heading = rotations.split_heading(self.hips)[0]
-        # Unseen frames may show anything: whole turns are counted from one seen frame to the next.
-        nearest = last_seen(self.seen[..., 0])
-        wrapped = torch.take_along_dim(heading, nearest, dim=1)
-        return filled(rotations.unwrap_angle(wrapped)[..., None], self.seen[..., 0])[..., 0]
+        return filled_angle(rotations.split_heading(self.hips)[0], self.seen[..., 0])
 
     @cached_property
     def tilt(self) -> Float[Tensor, "batch frames 2"]:
@@ -82,6 +78,13 @@ def filled(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batc
     frame = torch.arange(values.shape[1], device=values.device)
     weight = ((frame - before).to(values) / (after - before).clamp_min(1)).clamp(0, 1)
     return torch.lerp(start, stop, weight[..., None])
+
+
+def filled_angle(angle: Float[Tensor, "batch frames"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
+    """Angles, radians, not wrapped; frames that were not seen are `filled` the short way round."""
+    # Unseen frames may show anything: whole turns are counted from one seen frame to the next.
+    held = torch.take_along_dim(angle, last_seen(seen), dim=1)
+    return filled(rotations.unwrap_angle(held)[..., None], seen)[..., 0]
 
 
 def last_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands import beside, options, outputs
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
 from mapctl.progress import bar
@@ -89,26 +89,14 @@ class Denoise:
 
     def as_report(self, done: "Denoised") -> dict[str, object]:
         """The request, versions, and what the result says of itself."""
-        from mapctl import __version__, metrics, report
-
-        request = {key: value for key, value in options.as_request("denoise", self).items() if value is not None}
-        return {"mapctl": __version__, "request": request, "versions": report.versions(), **done.summary(),
-                "measures": metrics.measure(done.motion)}  # fmt: skip
+        return beside.report("denoise", self, done.motion, done.summary())
 
     def _check(self) -> None:
-        from mapctl import formats
-
         for name in ("cluster", "again"):
             if getattr(self, name):
                 raise RequestError(f"--{name} is for folders; {self.source} is a file")
-        formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.report, self.plot, self.video))
-        if self.video is not None:
-            outputs.check_film(self.video, (1280, 720))
-        if self.plot is not None:
-            if self.plot.suffix.lower() != ".png":
-                raise RequestError(f"--plot writes .png, not {self.plot.suffix or 'a file without ending'}")
-            outputs.require_render("matplotlib")
+        beside.check(self.out, self.video, self.report, self.plot)
+        outputs.check_plot(self.plot)
 
     def _denoised(self) -> "Denoised":
         import priors
@@ -147,11 +135,7 @@ class Denoise:
             from scenes.denoise_plot import plot
 
             plot(done.capture, done.motion, self.plot, rig=done.rig)
-        if self.video is not None:
-            from scenes.denoise_plot import side_by_side
-
-            with bar("filming", quiet=self.quiet) as progress:
-                side_by_side(done.capture, done.motion, self.video, rig=done.rig, progress=progress)
+        beside.film(done.capture, done.motion, self.video, rig=done.rig, quiet=self.quiet)
 
     def _tell(self, done: "Denoised") -> None:
         summary = done.summary()

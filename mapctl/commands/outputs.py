@@ -31,6 +31,15 @@ def check_film(path: Path, size: tuple[int, int]) -> None:
     require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
 
 
+def check_plot(path: Path | None) -> None:
+    """RequestError where a --plot that is asked for cannot be made: another ending than .png, or no matplotlib."""
+    if path is None:
+        return
+    if path.suffix.lower() != ".png":
+        raise RequestError(f"--plot writes .png, not {path.suffix or 'a file without ending'}")
+    require_render("matplotlib")
+
+
 def require_render(package: str) -> None:
     """RequestError that names the extra if a package of it is not installed."""
     if find_spec(package) is None:

@@ -11,7 +11,6 @@ from tyro.conf import Positional, arg
 from mapctl.commands import options, outputs, rigged
 from mapctl.commands.threads import compute_on_one
 from mapctl.commands.walks import INTERRUPTED
-from mapctl.errors import RequestError
 from mapctl.progress import bar
 from mapctl.steering import Limits
 
@@ -95,10 +94,7 @@ class Steer:
         self._limits()
         formats.check_ending(self.out)
         outputs.check_files(options.given(self.out, self.report, self.plot))
-        if self.plot is not None:
-            if self.plot.suffix.lower() != ".png":
-                raise RequestError(f"--plot writes .png, not {self.plot.suffix or 'a file without ending'}")
-            outputs.require_render("matplotlib")
+        outputs.check_plot(self.plot)
 
     def _limits(self) -> Limits:
         return Limits(self.acceleration, self.braking, math.radians(self.turn_rate))

@@ -9,13 +9,12 @@ the edges go, what is within keeps its shape, and a seam without any is left alo
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from mapctl import rotations
 from mapctl.capture.faults import runs
+from mapctl.gaps import second_differences
 
-_SECOND = (1.0, -2.0, 1.0)
 _REACH = 0.1  # seconds over which an offset fades away from its edge
 _CALM_PLACE, _CALM_JOINT = 1.2, 9.0  # m/s^2 and rad/s^2 that are nothing unusual in any motion
 
@@ -27,7 +26,7 @@ def closed_places(
     values = values.clone()
     usual = _usual(torch.diff(values, n=2, dim=0)[:, None], put[:, None], _CALM_PLACE / fps**2)
     for _, start, stop in runs(put[:, None]):
-        rows = _rows(start, stop, len(values))
+        rows = second_differences.touching(start, stop, len(values))
         bends = torch.diff(values[rows.start : rows.stop + 2], n=2, dim=0)[:, None] if len(rows) else values[:0, None]
         beyond = _beyond(bends, usual, start, stop, len(values))
         values[start:stop] += _offset(beyond.flatten(1), start, stop, frames=len(values), fps=fps)
@@ -44,7 +43,7 @@ def closed_rotations(
     for joint, start, stop in runs(put):
         spans.setdefault((start, stop), []).append(joint)
     for (start, stop), joints in spans.items():
-        rows = _rows(start, stop, len(quats))
+        rows = second_differences.touching(start, stop, len(quats))
         if not len(rows):
             continue
         bends = _turning_bends(quats[rows.start : rows.stop + 2, joints])
@@ -73,16 +72,13 @@ def _usual(
     return torch.stack([part.quantile(0.8) if len(part) else sizes.new_tensor(calm) for part in whole])
 
 
-def _rows(start: int, stop: int, frames: int) -> range:
-    """First frames of the second differences that touch the gap."""
-    return range(max(0, start - 2), min(frames - 2, stop))
-
-
 def _beyond(
     bends: Float[Tensor, "rows joints width"], usual: Float[Tensor, " joints"], start: int, stop: int, frames: int
 ) -> Float[Tensor, "rows joints width"]:
     """What of the bends that reach across an edge is more than usual; 0 for those within."""
-    across = torch.tensor([not (start <= row and row + 2 < stop) for row in _rows(start, stop, frames)])
+    across = torch.tensor(
+        [not (start <= row and row + 2 < stop) for row in second_differences.touching(start, stop, frames)]
+    )
     size = bends.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     rest = bends * (1 - usual[:, None] / size).clamp_min(0)
     return torch.where(across[:, None, None], rest, 0.0) if len(bends) else bends
@@ -92,18 +88,14 @@ def _offset(
     bends: Float[Tensor, "rows width"], start: int, stop: int, *, frames: int, fps: float
 ) -> Float[Tensor, "gap width"]:
     """The offset of the gap's frames that takes these kinks away."""
-    rows, count = _rows(start, stop, frames), stop - start
+    rows, count = second_differences.touching(start, stop, frames), stop - start
     known_before, known_after = start > 0, stop < frames
     if not len(rows) or not (known_before or known_after):
         return bends.new_zeros(count, bends.shape[1])
-    bands, right = np.zeros((3, count)), np.zeros((count, bends.shape[1]))
-    errors = bends.double().numpy()
+    right, errors = np.zeros((count, bends.shape[1])), bends.double().numpy()
     for number, row in enumerate(rows):
-        inside = [tap for tap in range(3) if start <= row + tap < stop]
-        for tap in inside:
-            right[row + tap - start] -= _SECOND[tap] * errors[number]
-            for other in inside:
-                if other >= tap:
-                    bands[2 - (other - tap), row + other - start] += _SECOND[tap] * _SECOND[other]
-    bands[2] += 1.0 / max(1.0, _REACH * fps) ** 4
-    return torch.as_tensor(solveh_banded(bands, right)).to(bends)
+        for tap, weight in enumerate(second_differences.WEIGHTS):
+            if start <= row + tap < stop:
+                right[row + tap - start] -= weight * errors[number]
+    offset = second_differences.solved(right, second_differences.fading(_REACH, fps), start=start, frames=frames)
+    return torch.as_tensor(offset).to(bends)

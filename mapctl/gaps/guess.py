@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.capture.observed import filled, last_seen, next_seen
+from mapctl.capture.observed import filled, filled_angle, last_seen, next_seen
 from mapctl.skeleton import CANONICAL
 
 
@@ -40,7 +40,4 @@ def slerped(
 
 def led(heading: Float[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
     """Headings, radians, straight and the short way between frames whose root is known."""
-    rooted = known[..., 0]
-    # Whole turns are counted from one known frame to the next: what lies between tells nothing.
-    held = torch.take_along_dim(heading, last_seen(rooted), dim=1)
-    return filled(rotations.unwrap_angle(held)[..., None], rooted)[..., 0]
+    return filled_angle(heading, known[..., 0])

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from mapctl import inverse_kinematics, rotations
 from mapctl.errors import RequestError
+from mapctl.gaps import second_differences
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -111,10 +110,6 @@ def _smooth(
     count = len(values)
     if count < 3:
         return torch.where(firm[:, None], values, 0.0)
-    bands = np.zeros((3, count))
-    for tap, weight in enumerate((1.0, -2.0, 1.0)):
-        for other, beside in enumerate((1.0, -2.0, 1.0)[tap:]):
-            bands[2 - other, tap + other : count - 2 + tap + other] += weight * beside
-    bands[2] += 1.0 / max(1.0, _REACH * fps) ** 4 + _FIRM * firm.double().numpy()
+    weight = second_differences.fading(_REACH, fps) + _FIRM * firm.double().numpy()
     right = _FIRM * (values * firm[:, None]).double().numpy()
-    return torch.as_tensor(solveh_banded(bands, right)).to(values)
+    return torch.as_tensor(second_differences.solved(right, weight, start=0, frames=count)).to(values)

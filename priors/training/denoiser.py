@@ -15,6 +15,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
 from mapctl.skeleton import CANONICAL
 from priors.denoiser import DenoiserConfig, DenoiserNetwork
+from priors.settings import check_least
 from priors.training.corpus import Corpus, folder_of_clips, window_starts
 from priors.training.corruption import CorruptionSettings, clean_capture, corrupted
 from priors.training.trainer import Trainer
@@ -55,9 +56,7 @@ class DenoiserSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_least(self, 1, "steps", "batch")
         if self.window < 16:
             raise RequestError(f"window must be at least 16 frames, got {self.window}")
 

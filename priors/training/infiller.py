@@ -11,6 +11,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
 from priors.infiller import InfillerConfig, InfillerNetwork
+from priors.settings import check_least
 from priors.training.corpus import Corpus
 from priors.training.gap_masks import GapSettings, known_places
 from priors.training.position_windows import PositionWindows, Window
@@ -50,9 +51,7 @@ class InfillerSettings:
     """Of weights, windows and gaps."""
 
     def __post_init__(self):
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_least(self, 1, "steps", "batch")
         if self.window < 32:
             raise RequestError(f"window must be at least 32 frames, got {self.window}")
 

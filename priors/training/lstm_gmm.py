@@ -17,6 +17,7 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, mirror_features
 from priors.labels import Labels
 from priors.lstm_gmm import NOISE_UNIT, LstmGmm, LstmGmmConfig
+from priors.settings import check_least
 from priors.training.corpus import Corpus, window_starts
 from priors.training.matching import MatchingSettings, mismatch
 
@@ -60,9 +61,7 @@ class TrainingSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        for name in ("steps", "batch", "window"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_least(self, 1, "steps", "batch", "window")
         for name, known in (("optimiser", ("adam", "rmsprop")), ("schedule", ("cosine", "epochs"))):
             if getattr(self, name) not in known:
                 raise RequestError(f"{name} must be {' or '.join(known)}, got {getattr(self, name)!r}")

@@ -18,6 +18,7 @@ from mapctl.roles import find_feet
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.trial import Trial
 from priors.lstm_gmm import LstmGmm
+from priors.settings import check_least
 
 _PAST = 3  # frames of context that a third difference reaches back
 
@@ -52,11 +53,8 @@ class MatchingSettings:
     """Weight of the features' means over the second half of the runs: squared difference in standard deviations."""
 
     def __post_init__(self):
-        for name in ("batch", "context", "frames"):
-            if getattr(self, name) < _PAST:
-                raise RequestError(f"{name} must be at least {_PAST}, got {getattr(self, name)}")
-        if self.every < 1:
-            raise RequestError(f"every must be at least 1, got {self.every}")
+        check_least(self, _PAST, "batch", "context", "frames")
+        check_least(self, 1, "every")
 
 
 def mismatch(

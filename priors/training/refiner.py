@@ -13,6 +13,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place, mirror_features, root_places
 from priors.end_effectors import end_effectors
 from priors.refiner import RefinerConfig, RefinerNetwork
+from priors.settings import check_least
 from priors.training import run_files
 from priors.training.adversary import Critic, History
 from priors.training.corpus import Corpus, window_starts
@@ -75,9 +76,7 @@ class AdversarialSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        for name in ("rounds", "batch", "refiner_updates", "critic_updates", "most_updates"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_least(self, 1, "rounds", "batch", "refiner_updates", "critic_updates", "most_updates")
         if self.window < (least := 2 * self.critic_around + 2):
             raise RequestError(f"window must be at least {least}, got {self.window}: the critic needs them to see one")
         if self.history < self.batch or self.batch < 2:

@@ -16,6 +16,7 @@ from mapctl.metrics import reference
 from mapctl.metrics.states import state_summary
 from priors import checkpoints, density, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.settings import check_least
 from priors.training import corpus as corpora
 from priors.training import resume, run_files
 from priors.training.health import free_run
@@ -62,9 +63,7 @@ class TrainRequest:
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
     def __post_init__(self):
-        for name in ("starts", "report_steps", "validate_steps"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_least(self, 1, "starts", "report_steps", "validate_steps")
 
 
 def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path:

@@ -12,21 +12,13 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors import checkpoints
+from priors.settings import NetworkConfig
 from priors.training import corpus as corpora
 from priors.training import run_files
 from priors.training.trainer import Trainer
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
-
-
-@runtime_checkable
-class Config(Protocol):
-    """Shape of a network."""
-
-    def as_card(self) -> dict[str, Any]:
-        """For a card's JSON."""
-        ...
 
 
 @runtime_checkable
@@ -44,7 +36,7 @@ class Settings(Protocol):
         ...
 
 
-C = TypeVar("C", bound=Config)
+C = TypeVar("C", bound=NetworkConfig)
 S = TypeVar("S", bound=Settings)
 
 

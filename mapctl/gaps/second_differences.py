@@ -1,0 +1,36 @@
+"""The smoothest offsets of some frames: least second differences, and each frame held as firmly as it is told."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.linalg import solveh_banded
+
+WEIGHTS = (1.0, -2.0, 1.0)
+"""Of three frames in a second difference."""
+
+
+def touching(start: int, stop: int, frames: int) -> range:
+    """First frames of the second differences, of a motion of so many frames, that take in some of start to stop."""
+    return range(max(0, start - 2), min(frames - 2, stop))
+
+
+def fading(seconds: float, fps: float) -> float:
+    """How firmly frames are held at nothing where offsets are to fade away over this time."""
+    return 1.0 / max(1.0, seconds * fps) ** 4
+
+
+def solved(
+    right: Float[ndarray, "count width"], firm: float | Float[ndarray, " count"], *, start: int, frames: int
+) -> Float[ndarray, "count width"]:
+    """Offsets o of frames from `start` on, with  (D'D + diag(firm)) o = right,  D the second differences of a motion of
+    so many frames, of which all others have no offset.
+    """
+    count = len(right)
+    first = np.array(touching(start, start + count, frames), dtype=int) - start
+    bands = np.zeros((3, count))
+    for tap, weight in enumerate(WEIGHTS):
+        for beside in range(3 - tap):
+            held = first[(first + tap >= 0) & (first + tap + beside < count)] + tap + beside
+            bands[2 - beside, held] += weight * WEIGHTS[tap + beside]
+    bands[2] += firm
+    return solveh_banded(bands, right)

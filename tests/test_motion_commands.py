@@ -1,0 +1,95 @@
+"""What `mapctl denoise`, `infill` and `tween` share as a user types them: bytes, films, formats, refusals."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from captures import on_rig
+from helpers import run, walk
+from tiny_denoiser import save_tiny_denoiser
+from tiny_infiller import save_tiny_infiller
+from tiny_prior import save_tiny_prior
+
+import mapctl
+
+WORDS = {"denoise": [], "infill": ["--gap", "5:9"], "tween": ["--keyframes", "0,5,11"]}
+PLAIN = {"infill": [*WORDS["infill"], "--method", "linear"], "tween": [*WORDS["tween"], "--method", "slerp"]}
+"""Without a network."""
+NETWORK = {"denoise": "--denoiser", "infill": "--infiller", "tween": "--infiller"}
+COMMANDS = sorted(WORDS)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """The option and the network of each command."""
+    folder = tmp_path_factory.mktemp("tiny")
+    files = {"--denoiser": save_tiny_denoiser(folder / "denoiser.safetensors"),
+             "--infiller": save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02)}  # fmt: skip
+    return {command: (option, files[option]) for command, option in NETWORK.items()}
+
+
+@pytest.fixture
+def source(tmp_path):
+    """Twelve frames of a walk."""
+    path = tmp_path / "in.bvh"
+    on_rig("bandai", 12).save(path)
+    return path
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_same_bytes_come_twice_and_quiet_says_nothing(command, tiny, source, tmp_path, capsys):
+    found = set()
+    for _ in range(2):
+        assert run(command, source, "-o", tmp_path / "out.bvh", *WORDS[command], *tiny[command], "--quiet") == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.skipif(any(find_spec(name) is None for name in ("matplotlib", "PIL")), reason="needs mapctl[render]")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_film_is_made(command, tiny, source, tmp_path):
+    words = [*WORDS[command], *tiny[command], "--video", tmp_path / "v.png", "--quiet"]
+    assert run(command, source, "-o", tmp_path / "out.bvh", *words) == 0
+    assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_other_formats_come_and_go(command, tiny, tmp_path):
+    walk(12).save(tmp_path / "in.npz")
+    for out in ("out.glb", "out.bvh", "out.npz"):
+        words = [*PLAIN.get(command, []), *tiny[command], "--quiet"]
+        assert run(command, tmp_path / "in.npz", "-o", tmp_path / out, *words) == 0
+    assert mapctl.load(tmp_path / "out.npz").num_frames == 12
+    assert (tmp_path / "out.glb").stat().st_size > 0
+
+
+@pytest.mark.parametrize("command", sorted(PLAIN))
+def test_straight_lines_need_no_network(command, source, tmp_path):
+    assert run(command, source, "-o", tmp_path / "out.bvh", *PLAIN[command], "--infiller", "nobody", "--quiet") == 0
+    assert (tmp_path / "out.bvh").exists()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(("words", "said"), [
+    (["gone.bvh", "-o", "a.bvh"], "gone.bvh"),
+    (["broken.bvh", "-o", "a.bvh"], "broken.bvh"),
+    (["in.bvh"], "--out"),
+    (["in.bvh", "-o", "a.mp3"], ".mp3"),
+    (["in.bvh", "-o", "gone/a.bvh"], "gone"),
+    (["in.bvh", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
+    (["in.bvh", "-o", "a.bvh", "--video", "p.avi"], ".mp4"),
+    (["in.bvh", "-o", "a.bvh", "--rig", "nobody"], "nobody"),
+    (["in.bvh", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
+], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(command, tiny, source, fails, words, said):
+    Path("broken.bvh").write_text("HIERARCHY\nnonsense")
+    assert said in fails(command, *words, *WORDS[command], *tiny[command])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_network_of_another_kind_is_refused(command, source, fails):
+    kind = NETWORK[command].removeprefix("--")
+    save_tiny_prior(Path("prior.safetensors"))
+    for name, said in (("prior.safetensors", f"a lstm-gmm is no {kind}"), ("nobody", "no prior 'nobody'")):
+        assert said in fails(command, "in.bvh", "-o", "a.bvh", *WORDS[command], NETWORK[command], name)
