@@ -34,8 +34,8 @@ class Tween:
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. slerp: none of it."""
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
-    infiller: options.Name = "infiller"
-    """The bundled infiller, or the file or run folder of a trained one."""
+    infiller: options.MaybeName = None
+    """The file or run folder of a trained infiller; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
@@ -72,12 +72,16 @@ class Tween:
     def _check(self) -> None:
         if self.joints is not None and self.root_only:
             raise RequestError("--joints and --root-only are two kinds of keys; choose one")
-        beside.check(self.out, self.video, self.report)
+        beside.check_method(self.method, prior=self.prior, infiller=self.infiller)
+        beside.check(self.out, self.video, self.report, given=(self.source,))
 
     def _keys(self, motion: "Motion") -> "Keys":
         from controllers.tween import Keys
 
         frames = [parse_frame(word, fps=float(motion.fps)) for word in self.keyframes.split(",")]
+        if len(set(frames)) == 2 and (self.root_only or self.joints is not None):
+            name = "--root-only" if self.root_only else "--joints"
+            raise RequestError(f"{name} is about keys between the first and the last, and --keyframes has none there")
         limbs = () if self.joints is None else tuple(name.strip() for name in self.joints.split(","))
         return Keys(tuple(frames), limbs=limbs, root_only=self.root_only)
 
@@ -87,7 +91,7 @@ class Tween:
         from controllers.tween import tween
 
         method = "linear" if self.method == "slerp" else self.method
-        infiller = None if method == "linear" else priors.load_infiller(self.infiller)
+        infiller = None if method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
         settings, rig = InfillSettings(method=method), options.read_rig(self.rig)
         return tween(motion, keys, infiller, settings=settings, densities=densities, rig=rig)

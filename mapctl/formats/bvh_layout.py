@@ -36,6 +36,8 @@ class BvhLayout:
     """Frame time as printed, seconds."""
     encoding: str = "utf-8"
     """How names are encoded."""
+    values: np.ndarray | None = None
+    """(frames, channels) that were read, file unit and degrees: what is not changed is written as it was."""
 
     @property
     def decimals(self) -> int:
