@@ -33,6 +33,7 @@ MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
 MaybeCount = Annotated[int | None, arg(metavar="N")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
 MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
+MaybeSize = Annotated[str | None, arg(metavar="WxH")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
