@@ -75,7 +75,7 @@ def test_angles_in_changed_frames_go_on_from_those_before_or_lead_to_those_after
     edges = slice(max(0, start - 1), stop if start else stop + 1)
     for _, _, columns in read.hierarchy.rotation_groups():
         steps = np.abs(np.diff(read.values[edges][:, columns], axis=0))
-        assert steps.max() < 60  # a whole turn or the other solution would be 180 or more
+        assert steps.max() < 120  # by gimbal lock, some; a whole turn or the other solution is 180 or more
 
 
 def test_where_the_file_is_continuous_the_change_meets_it_on_both_sides(tmp_path):

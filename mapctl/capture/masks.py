@@ -59,6 +59,9 @@ def _mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Seq
 def of_missing(motion: Motion, missing: Missing) -> tuple[Mask, ...]:
     """What a file marks as lost. A joint that travels beside the body's own travel is lost with its place."""
     travels, joints = traveller(motion), missing.rotations.clone()
+    below = motion.skeleton.children(0)
+    if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
+        travels = below[0]  # hips under a root that stays on the ground: the body's way is not known anywhere
     for joint in motion.moving_offsets:
         if joint != travels:
             joints[:, joint] |= missing.places[:, joint]

@@ -42,17 +42,17 @@ def load(path: str | PathLike[str]) -> Motion:
 def load_lossy(path: str | PathLike[str]) -> tuple[Motion, Missing]:
     """Read a BVH file in which some values are NaN, and which they are; FileFormatError where all of them are.
 
-    The place of a joint that stays still is known in every frame if it is in one.
+    The place of a joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET.
     """
     return _read(bvh_text.read(path, lossy=True))
 
 
 def _read(text: bvh_text.BvhText) -> tuple[Motion, Missing]:
     tree, lost = text.hierarchy, np.isnan(text.values)
-    values = _completed(tree, text.values) if lost.any() else text.values
+    values = _completed(tree, text.values)
     _, rest, moving = _settle(tree, values)
     scale = metres_per_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
-    layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding, values)
+    layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding, text.values)
     return _motion(layout, values), _missing(tree, lost, moving)
 
 
@@ -72,6 +72,8 @@ def _motion(layout: BvhLayout, values: np.ndarray) -> Motion:
 
 def _completed(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
     """The channels with numbers in place of NaN."""
+    if not np.isnan(values).any():
+        return values
     done = missing.held(values)
     for joint, columns in enumerate(tree.position_columns()):
         own = list(columns.values())
@@ -80,16 +82,17 @@ def _completed(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
 
 
 def _missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> Missing:
-    """By joint. Where all channels are lost, joints are that have none."""
+    """By joint. Where all channels are lost, joints are that have none. One frame tells the place of a still joint."""
     whole = np.all(lost, axis=1)
     rotations = np.tile(whole[:, None], len(tree.names))
     places = np.zeros_like(rotations)
     places[:, 0] = whole
     for _, joints, columns in tree.rotation_groups():
         rotations[:, joints] |= lost[:, columns].any(axis=-1)
-    travels = tree.position_columns()
-    for joint in (0, *moving):
-        places[:, joint] |= lost[:, list(travels[joint].values())].any(axis=1)
+    for joint, columns in enumerate(tree.position_columns()):
+        own = lost[:, list(columns.values())]
+        if joint == 0 or joint in moving or own.all(axis=0).any():
+            places[:, joint] |= own.any(axis=1)
     return Missing(torch.from_numpy(rotations), torch.from_numpy(places))
 
 
@@ -195,15 +198,16 @@ def _with_kept(layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, qua
     values, own, old = channel_values(tree, translations, quat_xyzw), layout.values, layout.hierarchy
     if own is None or len(own) != len(values):
         return values
-    before = _motion(layout, own)
+    before = _motion(layout, _completed(old, own))
     turns, places = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
     turned = (turns == quat_xyzw).all(-1) | (turns == -quat_xyzw).all(-1)
     there = np.all(np.isclose(places, translations, rtol=1e-12, atol=1e-12), axis=-1)
     same = [now == then for now, then in zip(tree.channels, old.channels, strict=True)]
     for joint, (now, then) in enumerate(zip(tree.position_columns(), old.position_columns(), strict=True)):
         if same[joint]:
-            at = list(now.values())
-            values[:, at] = np.where(there[:, joint, None], own[:, list(then.values())], values[:, at])
+            at, numbers = list(now.values()), own[:, list(then.values())]
+            kept = there[:, joint] & np.isfinite(numbers).all(-1)
+            values[:, at] = np.where(kept[:, None], numbers, values[:, at])
     read = {
         joint: columns
         for _, joints, group in old.rotation_groups()
@@ -212,7 +216,9 @@ def _with_kept(layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, qua
     for axes, joints, group in tree.rotation_groups():
         for joint, at in zip(joints, group, strict=True):
             if same[joint] and turned[:, joint].any():
-                values[:, at] = bvh_euler.kept(values[:, at], own[:, read[joint]], turned[:, joint], axes)
+                numbers = own[:, read[joint]]
+                kept = turned[:, joint] & np.isfinite(numbers).all(-1)
+                values[:, at] = bvh_euler.kept(values[:, at], numbers, kept, axes)
     return values
 
 
