@@ -13,15 +13,16 @@ from mapctl.motion import Motion
 def without(source: Path, out: Path, lost: Sequence[tuple[str, int, int]], *, word: str = "nan") -> Path:
     """The BVH file with a word in place of the values of channels whose label begins so, from a frame up to another."""
     read = bvh_text.read(source)
-    head, _, body = source.read_text().partition(f"Frame Time: {read.frame_time}\n")
-    rows = [row.split() for row in body.splitlines()]
+    lines = source.read_text().splitlines()
+    first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+    rows = [row.split() for row in lines[first:]]
     for label, start, stop in lost:
         columns = [place for place, name in enumerate(read.hierarchy.labels()) if name.startswith(label)]
         assert columns
         for frame in range(start, stop):
             for column in columns:
                 rows[frame][column] = word
-    out.write_text(f"{head}Frame Time: {read.frame_time}\n" + "\n".join(map(" ".join, rows)) + "\n")
+    out.write_text("\n".join([*lines[:first], *map(" ".join, rows)]) + "\n")
     return out
 
 
