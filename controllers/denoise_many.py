@@ -11,6 +11,7 @@ from controllers.denoise import denoise
 from controllers.denoise_piece import DenoiseSettings
 from controllers.denoised import Denoised
 from mapctl import formats
+from mapctl.capture.masks import of_missing
 from mapctl.errors import MapctlError, RequestError
 from mapctl.protocols import Denoiser
 from mapctl.rigs import Rig
@@ -57,8 +58,10 @@ class Cleaner:
         """Denoise one file and write the result; what goes wrong with it is said in what is returned."""
         torch.set_num_threads(1)
         try:
-            motion = formats.load(job.source, metres_per_unit=None if self.rig is None else self.rig.metres_per_unit)
-            done = denoise(motion, _loaded(self.load), settings=self.settings, rig=self.rig)
+            unit = None if self.rig is None else self.rig.metres_per_unit
+            motion, missing = formats.load_lossy(job.source, metres_per_unit=unit)
+            masks = of_missing(motion, missing)
+            done = denoise(motion, _loaded(self.load), masks=masks, settings=self.settings, rig=self.rig)
             job.out.parent.mkdir(parents=True, exist_ok=True)
             if self.after is not None:
                 self.after(job, done)

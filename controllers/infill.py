@@ -5,9 +5,10 @@ from dataclasses import replace
 from typing import Any
 
 from controllers.filling import Infilled, InfillSettings, Method, fill
-from mapctl.capture.masks import Mask
+from mapctl.capture.masks import Mask, hidden
 from mapctl.curve import Curve
-from mapctl.gaps.lost import Lost
+from mapctl.errors import RequestError
+from mapctl.gaps.lost import Lost, straight
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
@@ -26,7 +27,11 @@ def infill(
     What stands in a gap does not matter. A gap at the motion's beginning or end is extended into. On a
     `course` the hips go along it while they are lost.
     """
-    lost = Lost.of_masks(motion, masks, to_canonical(motion, rig)[1])
+    # What rig it is must not be told from what stands in a gap.
+    shown = straight(motion, Lost(*hidden(motion, masks)))
+    lost = Lost.of_masks(motion, masks, to_canonical(shown, rig)[1])
+    if course is not None and not lost.root.any():
+        raise RequestError("a curve leads the hips where they are lost, and they never are; leave it out")
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course)
     return replace(done, notes=_notes(lost))
 

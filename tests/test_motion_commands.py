@@ -58,15 +58,15 @@ def test_a_film_is_made(command, tiny, source, tmp_path):
 def test_other_formats_come_and_go(command, tiny, tmp_path):
     walk(12).save(tmp_path / "in.npz")
     for out in ("out.glb", "out.bvh", "out.npz"):
-        words = [*PLAIN.get(command, []), *tiny[command], "--quiet"]
-        assert run(command, tmp_path / "in.npz", "-o", tmp_path / out, *words) == 0
+        words = PLAIN.get(command) or tiny[command]
+        assert run(command, tmp_path / "in.npz", "-o", tmp_path / out, *words, "--quiet") == 0
     assert mapctl.load(tmp_path / "out.npz").num_frames == 12
     assert (tmp_path / "out.glb").stat().st_size > 0
 
 
 @pytest.mark.parametrize("command", sorted(PLAIN))
 def test_straight_lines_need_no_network(command, source, tmp_path):
-    assert run(command, source, "-o", tmp_path / "out.bvh", *PLAIN[command], "--infiller", "nobody", "--quiet") == 0
+    assert run(command, source, "-o", tmp_path / "out.bvh", *PLAIN[command], "--quiet") == 0
     assert (tmp_path / "out.bvh").exists()
 
 
@@ -80,6 +80,7 @@ def test_straight_lines_need_no_network(command, source, tmp_path):
     (["in.bvh", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
     (["in.bvh", "-o", "a.bvh", "--video", "p.avi"], ".mp4"),
     (["in.bvh", "-o", "a.bvh", "--rig", "nobody"], "nobody"),
+    (["in.bvh", "-o", "./in.bvh"], "would be written over what it is made from"),
     (["in.bvh", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
 ], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(command, tiny, source, fails, words, said):

@@ -106,7 +106,7 @@ def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
     words = {
         "follow": ("line:2", "-o", out, "--seconds", 0.7, "--prior", prior),
         "steer": (tmp_path / "c.csv", "-o", out, "--prior", prior),
-        "generate": ("-o", tmp_path, "--seconds", 0.7, "--prior", prior, "--no-footing", "--no-refine"),
+        "generate": ("-o", tmp_path, "--seconds", 0.7, "--prior", prior, "--no-refine"),
         "run": (tmp_path / "s.toml", "-o", tmp_path),
     }[job]
     assert run(job, *words, "--rig", clip, "--quiet") == 0

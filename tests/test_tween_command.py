@@ -29,8 +29,8 @@ def source(tmp_path_factory):
 
 @pytest.fixture
 def tween(tiny):
-    """Runs the command; returns the exit status."""
-    return lambda *words: run("tween", *words, "--infiller", tiny)
+    """Runs the command, with the tiny network where the method asks one; returns the exit status."""
+    return lambda *words: run("tween", *words, *([] if "slerp" in words else ["--infiller", tiny]))
 
 
 def away_cm(source, out, frames):
@@ -104,10 +104,15 @@ def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_pat
     (["in.bvh", "-o", "a.bvh", "--keyframes", "0,1.5s"], "the key 45 is not one of the motion's frames 0:45"),
     (["in.bvh", "-o", "a.bvh", "--keyframes", "0,x"], "a frame is a whole number from 0, or seconds as in 1.5s"),
     (["in.bvh", "-o", "a.bvh", "--keyframes", "0,,9"], "a frame is a whole number from 0"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hnad_L"], "no hand or foot 'Hnad_L'; the nearest is"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", ""], "no hand or foot ''"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", "Hnad_L"], "no hand or foot 'Hnad_L'; the"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", ""], "no hand or foot ''"),
     (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L", "--root-only"], "choose one"),
     (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "best"], "--method"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L"], "--joints is about keys between"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "9,0,9", "--root-only"], "--root-only is about keys between"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--prior", "x"], "leave --prior out"),
+    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--prior", "general"], "leave --prior out"),
+    (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),
 ], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, source, words, said):
     Path("in.bvh").write_bytes(source.read_bytes())

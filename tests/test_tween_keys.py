@@ -75,12 +75,12 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
     assert "timing" not in told
 
 
-def test_timing_is_suggested_and_the_given_one_made(tween, folder, capsys):
+def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     keys = folder / "keys" / "keys.toml"
-    assert tween(keys, "-o", "plain.bvh", "--method", "slerp") == 0
+    assert run("tween", keys, "-o", "plain.bvh", "--method", "slerp") == 0
     capsys.readouterr()
     words = ["--method", "slerp", "--suggest-timing", "--report", "r.json"]
-    assert tween(keys, "-o", "out.bvh", *words) == 0
+    assert run("tween", keys, "-o", "out.bvh", *words) == 0
     assert Path("out.bvh").read_bytes() == Path("plain.bvh").read_bytes()
     (row,) = json.loads(Path("r.json").read_text())["timing"]
     assert (row["from"], row["to"], row["given"]) == (0, 40, 40)
@@ -90,9 +90,9 @@ def test_timing_is_suggested_and_the_given_one_made(tween, folder, capsys):
     assert "m/s" in told
 
 
-def test_timing_is_suggested_for_frames_of_a_clip_too(tween, folder, capsys):
+def test_timing_is_suggested_for_frames_of_a_clip_too(folder, capsys):
     words = ["-o", "out.bvh", "--keyframes", "0,3,44", "--method", "slerp", "--suggest-timing"]
-    assert tween(folder / "keys" / "walk.bvh", *words) == 0
+    assert run("tween", folder / "keys" / "walk.bvh", *words) == 0
     assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()[-3:] if line.strip()] == [
         ["0", "3", "3"], ["3", "44", "41"]]  # fmt: skip
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.capture.masks import Mask, masked
+from mapctl.capture.masks import Mask, masked, traveller
 from mapctl.capture.noise import angle_noise, place_noise
 from mapctl.capture.observed import filled, last_seen
 from mapctl.capture.spikes import angle_spikes, place_spikes
@@ -75,7 +75,7 @@ def examine(motion: Motion, masks: Sequence[Mask] = ()) -> Examined:
     """Look over a recording on any rig; RequestError for masks that name joints or frames it has not."""
     quats = rotations.sign_continuous(motion.local_quat_xyzw)
     hidden, hidden_root = masked(motion, masks)
-    travels = _traveller(motion)
+    travels = traveller(motion)
     place = motion.moving_offsets[travels] if travels else motion.root_position
     frozen = _frozen(quats, float(motion.fps))
     dropouts, dropouts_root = hidden | frozen, hidden_root
@@ -86,13 +86,6 @@ def examine(motion: Motion, masks: Sequence[Mask] = ()) -> Examined:
     noise = angle_noise(quats, ~(dropouts | spikes))
     noise_root = place_noise(place, ~(dropouts_root | spikes_root))
     return Examined(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
-
-
-def _traveller(motion: Motion) -> int:
-    """The root, or the first joint below a root that stays where it is."""
-    moving = [joint for joint, values in motion.moving_offsets.items() if bool((values != values[0]).any())]
-    stays = bool((motion.root_position == motion.root_position[0]).all())
-    return min(moving) if stays and moving else 0
 
 
 def _frozen(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor, "frames joints"]:

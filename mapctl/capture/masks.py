@@ -9,7 +9,9 @@ from os import PathLike
 import torch
 from torch import Tensor
 
+from mapctl.capture.faults import runs
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.missing import Missing
 from mapctl.formats.reading import read_table, shorten
 from mapctl.motion import Motion
 
@@ -52,6 +54,26 @@ def _mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Seq
     if not 0 <= start < stop:
         raise FileFormatError(path, f"needs 0 <= start < stop, got {start} and {stop}", line)
     return Mask(row["joint"], start, stop)
+
+
+def of_missing(motion: Motion, missing: Missing) -> tuple[Mask, ...]:
+    """What a file marks as lost. A joint that travels beside the body's own travel is lost with its place."""
+    travels, joints = traveller(motion), missing.rotations.clone()
+    below = motion.skeleton.children(0)
+    if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
+        travels = below[0]  # hips under a root that stays on the ground: the body's way is not known anywhere
+    for joint in motion.moving_offsets:
+        if joint != travels:
+            joints[:, joint] |= missing.places[:, joint]
+    lost = [Mask(motion.skeleton.names[joint], start, stop) for joint, start, stop in runs(joints)]
+    return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in runs(missing.places[:, travels, None])))
+
+
+def traveller(motion: Motion) -> int:
+    """The joint whose place is that of the body: the root, or the first below a root that stays where it is."""
+    moving = [joint for joint, values in motion.moving_offsets.items() if bool((values != values[0]).any())]
+    stays = bool((motion.root_position == motion.root_position[0]).all())
+    return min(moving) if stays and moving else 0
 
 
 def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:

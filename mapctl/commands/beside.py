@@ -1,9 +1,11 @@
 """What commands that give a motion back share: checks of where it goes, and a film of it beside the given one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapctl.commands import options, outputs
+from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from mapctl.motion import Motion
@@ -12,14 +14,24 @@ if TYPE_CHECKING:
 _SIZE = (1280, 720)
 
 
-def check(out: Path, video: Path | None, *others: Path | None) -> None:
-    """RequestError unless the motion, its film and the other files can be written; leaves no trace."""
+def check(out: Path, video: Path | None, *others: Path | None, given: Sequence[Path]) -> None:
+    """RequestError unless the motion, its film and the other files can be written, none over a given file; leaves no
+    trace.
+    """
     from mapctl import formats
 
     formats.check_ending(out)
-    outputs.check_files(options.given(out, video, *others))
+    outputs.check_files(options.given(out, video, *others), given=given)
     if video is not None:
         outputs.check_film(video, _SIZE)
+
+
+def check_method(method: str, *, prior: str | None = None, infiller: str | None) -> None:
+    """RequestError for a density or a network that is asked for by a method that has no use for it."""
+    if prior is not None and method != "map":
+        raise RequestError(f"--method {method} has no MAP stage for a density; leave --prior out")
+    if infiller is not None and method in ("linear", "slerp"):
+        raise RequestError(f"--method {method} knows no network; leave --infiller out")
 
 
 def film(before: "Motion", after: "Motion", video: Path | None, *, rig: "Rig | None", quiet: bool) -> None:

@@ -45,7 +45,7 @@ class Blend:
         compute_on_one()
         from mapctl import formats
 
-        beside.check(self.out, self.video)
+        beside.check(self.out, self.video, given=(self.source, self.other))
         rig = options.read_rig(self.rig)
         motion, other = options.read_motion(self.source, rig), options.read_motion(self.other, None)
         import priors

@@ -28,8 +28,8 @@ class Chain:
     """Of the gaps' lengths."""
     method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
-    infiller: options.Name = "infiller"
-    """The bundled infiller, or the file or run folder of a trained one."""
+    infiller: options.MaybeName = None
+    """The file or run folder of a trained infiller; the bundled one if not given."""
     video: options.MaybeFile = None
     """Film of the motion: .mp4, .gif or .png."""
     quiet: bool = False
@@ -41,7 +41,8 @@ class Chain:
         options.check_seed(self.seed)
         from mapctl import formats
 
-        beside.check(self.out, self.video)
+        beside.check_method(self.method, infiller=self.infiller)
+        beside.check(self.out, self.video, given=self.clips)
         import torch
 
         import priors
@@ -49,7 +50,7 @@ class Chain:
         from controllers.filling import InfillSettings
 
         settings = ChainSettings(piece=self.piece, gap=self._gap())
-        infiller = None if self.method == "linear" else priors.load_infiller(self.infiller)
+        infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         done = chain([options.read_motion(path, None) for path in self.clips], infiller, settings=settings,
                      filling=InfillSettings(method=self.method),
                      generator=torch.Generator().manual_seed(self.seed))  # fmt: skip

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _NOT_ALL_HOLDS = 3
 _MOST_NAMED = 6
 _DOUBTED = 0.5  # of a density's weight
+_DELAY = 0.2  # seconds
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Denoise:
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is not to be
-    believed. `*` stands for everything, `root position` for where it is."""
+    believed. `*` stands for everything, `root position` for where it is. What is nan in IN is not believed either."""
     sigma_deg: options.MaybeNumber = None
     """Noise of every joint's angles, degrees; told from the capture, joint by joint, if not given."""
     sigma_cm: options.MaybeNumber = None
@@ -41,8 +42,8 @@ class Denoise:
     ground changes."""
     causal: bool = False
     """As a live capture would be cleaned: a frame is decided `--delay` after it came."""
-    delay: options.Number = 0.2
-    """Seconds that --causal may look ahead."""
+    delay: options.MaybeNumber = None
+    """Seconds that --causal may look ahead; 0.2 if not given."""
     denoiser: options.Name = "denoiser"
     """The bundled denoiser, or the file or run folder of a trained one."""
     prior: options.MaybeName = None
@@ -92,10 +93,11 @@ class Denoise:
         return beside.report("denoise", self, done.motion, done.summary())
 
     def _check(self) -> None:
-        for name in ("cluster", "again"):
-            if getattr(self, name):
+
+        for name, idle in (("cluster", self.cluster is None), ("again", not self.again), ("jobs", self.jobs == 1)):
+            if not idle:
                 raise RequestError(f"--{name} is for folders; {self.source} is a file")
-        beside.check(self.out, self.video, self.report, self.plot)
+        beside.check(self.out, self.video, self.report, self.plot, given=(self.source,))
         outputs.check_plot(self.plot)
 
     def _denoised(self) -> "Denoised":
@@ -103,13 +105,15 @@ class Denoise:
 
         settings, masks, rig = self.settings(), self._masks(), options.read_rig(self.rig)
         densities = priors.load_choice(self.prior)
-        denoiser, motion = priors.load_denoiser(self.denoiser), options.read_motion(self.source, rig)
+        denoiser, (motion, lost) = priors.load_denoiser(self.denoiser), options.read_lossy(self.source, rig)
+        masks = (*masks, *lost)
         with bar("denoising", quiet=self.quiet) as progress:
             if self.causal:
                 from controllers.denoise_causal import denoise_causal
 
+                delay = _DELAY if self.delay is None else self.delay
                 return denoise_causal(
-                    motion, denoiser, masks=masks, settings=settings, delay=self.delay, rig=rig, progress=progress
+                    motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
                 )
             from controllers.denoise import denoise
 
@@ -123,6 +127,8 @@ class Denoise:
 
         if self.causal and self.prior is not None:
             raise RequestError("--causal has no time for a density; leave --prior out")
+        if self.delay is not None and not self.causal:
+            raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
         return DenoiseSettings(sigma_deg=self.sigma_deg, sigma_cm=self.sigma_cm, anchor=self.anchor)
 
     def _masks(self):

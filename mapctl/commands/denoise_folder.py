@@ -54,11 +54,13 @@ def jobs_of(given: "Denoise") -> tuple[list["Job"], int]:
     from controllers.denoise_many import Job
     from mapctl import formats
 
-    for name in ("mask", "plot", "video", "prior", "causal"):
+    for name in ("mask", "plot", "video", "prior", "causal", "strict"):
         if getattr(given, name):
             raise RequestError(f"--{name} is for single files; {given.source} is a folder")
     if given.jobs < 1:
         raise RequestError(f"--jobs must be at least 1, got {given.jobs}")
+    if given.cluster not in (None, "local") and given.jobs != 1:
+        raise RequestError(f"--jobs is for this machine; the cluster at {given.cluster} has workers of its own")
     outputs.check_folder(given.out)
     if given.report is not None:
         outputs.check_folder(given.report)

@@ -9,9 +9,11 @@ from tyro.conf import Positional, arg
 from mapctl.commands import options, outputs, rigged
 from mapctl.commands.threads import compute_on_one
 from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
+from mapctl.errors import RequestError
 from mapctl.progress import bar
 
 _NOT_ALL_HOLDS = 3
+_SIZE = "1280x720"
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,10 @@ class FollowCurve:
     """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
-    camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
-    """Of the film."""
-    size: options.Size = "1280x720"
-    """Of the film's pictures, pixels."""
+    camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None
+    """Of the film; follow if not given."""
+    size: options.MaybeSize = None
+    """Of the film's pictures, pixels; 1280x720 if not given."""
     report: options.MaybeFile = None
     """JSON with the request, status, ledger, measures and timing."""
     metres_per_unit: options.MaybeNumber = None
@@ -72,8 +74,11 @@ class FollowCurve:
         options.check_seed(self.seed)
         formats.check_ending(self.out)
         outputs.check_files(options.given(self.out, self.video, self.report))
+        for name in ("camera", "size"):
+            if self.video is None and getattr(self, name) is not None:
+                raise RequestError(f"--{name} is of the film, and --video asks for none")
         if self.video is not None:
-            outputs.check_film(self.video, options.parse_size(self.size))
+            outputs.check_film(self.video, options.parse_size(self.size or _SIZE))
 
     def _write(self, done: Walk, video: Path | None) -> None:
         from mapctl import report
@@ -85,7 +90,7 @@ class FollowCurve:
             from scenes.cameras import CameraSettings
             from scenes.film import film
 
-            actors, camera = [(done.solution.motion, done.request.curve)], CameraSettings(self.camera)
+            actors, camera = [(done.solution.motion, done.request.curve)], CameraSettings(self.camera or "follow")
             with bar("filming", quiet=self.quiet) as progress:
-                size = options.parse_size(self.size)
+                size = options.parse_size(self.size or _SIZE)
                 film(actors, video, camera=camera, size=size, progress=progress)

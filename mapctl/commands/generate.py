@@ -92,6 +92,8 @@ class Generate:
         numbered = self.start is not None and self.start.lstrip("-").isdecimal()
         if self.no_refine and self.refiner != "auto":
             raise RequestError("--refiner and --no-refine exclude each other")
+        if self.no_refine and self.no_footing:
+            raise RequestError("--no-refine leaves out the footing pass as well; leave --no-footing out")
         finishing = None if self.no_refine or self.no_footing else FinishSettings()
         start = int(self.start) if self.start and numbered else None
         settings = GenerateSettings(self.temperature, start, self.style is None, finishing)

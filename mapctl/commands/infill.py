@@ -27,7 +27,8 @@ class Infill:
     """Where the whole motion goes."""
     gap: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
     """Frames from A up to B (exclusive), or seconds as in 2s:4s; may be given several times. What stands in them does
-    not matter. Without gaps and joints, frozen and leaping frames are looked for."""
+    not matter. What is nan in IN is lost as well; where it is nothing, and there are no gaps and joints, frozen and
+    leaping frames are looked for."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints of the rig are lost: in the gaps, or throughout if there are none."""
     method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
@@ -37,8 +38,8 @@ class Infill:
     ends."""
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
-    infiller: options.Name = "infiller"
-    """The bundled infiller, or the file or run folder of a trained one."""
+    infiller: options.MaybeName = None
+    """The file or run folder of a trained infiller; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
@@ -54,8 +55,8 @@ class Infill:
         compute_on_one()
         self._check()
         rig = options.read_rig(self.rig)
-        motion = options.read_motion(self.source, rig)
-        masks = self._masks(motion)
+        motion, marked = options.read_lossy(self.source, rig)
+        masks = (*marked, *self._asked(motion)) or self._found(motion)
         done = self._infilled(motion, masks)
         from mapctl import formats
 
@@ -76,25 +77,30 @@ class Infill:
     def _check(self) -> None:
         if self.curve is not None and self.method == "linear":
             raise RequestError("--curve needs a network's steps; leave --method linear out")
-        beside.check(self.out, self.video, self.report)
+        beside.check_method(self.method, prior=self.prior, infiller=self.infiller)
+        beside.check(self.out, self.video, self.report, given=(self.source,))
 
-    def _masks(self, motion: "Motion") -> Sequence["Mask"]:
-        """What is lost; RequestError for what cannot be, or where nothing was asked for and nothing is wrong."""
+    def _asked(self, motion: "Motion") -> Sequence["Mask"]:
+        """What is lost by the options; RequestError for what cannot be."""
         from mapctl.capture.masks import ALL, Mask
 
         if not self.gap and self.joints is None:
-            from mapctl.gaps.finding import find
-
-            return find(motion)
+            return ()
         gaps = parse_ranges(self.gap, fps=float(motion.fps), frames=motion.num_frames) or [(0, motion.num_frames)]
         names = [ALL] if self.joints is None else [name.strip() for name in self.joints.split(",")]
         return [Mask(name, start, stop) for start, stop in gaps for name in names]
+
+    def _found(self, motion: "Motion") -> Sequence["Mask"]:
+        """What is wrong where nothing is marked; RequestError where nothing is."""
+        from mapctl.gaps.finding import find
+
+        return find(motion)
 
     def _infilled(self, motion: "Motion", masks: Sequence["Mask"]) -> "Infilled":
         import priors
         from controllers.infill import InfillSettings, infill
 
-        infiller = None if self.method == "linear" else priors.load_infiller(self.infiller)
+        infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
         settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
         course = None if self.curve is None else options.read_curve(self.curve, None)

@@ -13,6 +13,7 @@ from mapctl.errors import RequestError
 if TYPE_CHECKING:
     from fractions import Fraction
 
+    from mapctl.capture.masks import Mask
     from mapctl.motion import Motion
     from mapctl.rigs import Rig
 
@@ -32,6 +33,7 @@ MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
 MaybeCount = Annotated[int | None, arg(metavar="N")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
 MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
+MaybeSize = Annotated[str | None, arg(metavar="WxH")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
@@ -85,6 +87,15 @@ def read_motion(path: Path, rig: "Rig | None", *, fps: "Fraction | None" = None)
     from mapctl import formats
 
     return formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
+
+
+def read_lossy(path: Path, rig: "Rig | None") -> "tuple[Motion, tuple[Mask, ...]]":
+    """The same, of a file that may have NaN where something was lost, and masks of what was."""
+    from mapctl import formats
+    from mapctl.capture.masks import of_missing
+
+    motion, missing = formats.load_lossy(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    return motion, of_missing(motion, missing)
 
 
 def as_request(name: str, command: Any) -> dict[str, Any]:

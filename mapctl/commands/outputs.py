@@ -10,14 +10,17 @@ from pathlib import Path
 from mapctl.errors import RequestError
 
 
-def check_files(paths: Sequence[Path]) -> None:
-    """RequestError unless every file can be written and no two are the same; leaves no trace."""
+def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
+    """RequestError unless every file can be written, no two are the same and none is a given one; leaves no trace."""
     from mapctl.formats import atomic
 
     seen: set[str] = set()
+    sources = {os.path.realpath(path) for path in given}
     for path in paths:
         atomic.check_writable(path)
         real = os.path.realpath(path)
+        if real in sources:
+            raise RequestError(f"{path} would be written over what it is made from; choose another name")
         if real in seen:
             raise RequestError(f"{path} is asked for twice; every output needs a file of its own")
         seen.add(real)

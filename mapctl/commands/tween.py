@@ -43,8 +43,8 @@ class Tween:
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. slerp: none of it."""
     rig: options.MaybeRig = None
     """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
-    infiller: options.Name = "infiller"
-    """The bundled infiller, or the file or run folder of a trained one."""
+    infiller: options.MaybeName = None
+    """The file or run folder of a trained infiller; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
@@ -102,7 +102,8 @@ class Tween:
             raise RequestError(f"{given[0]} is for motion files; {self.source} says itself what its keys are")
         if not self._of_file and self.keyframes is None:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-        beside.check(self.out, self.video, self.report)
+        beside.check_method(self.method, prior=self.prior, infiller=self.infiller)
+        beside.check(self.out, self.video, self.report, given=(self.source,))
 
     def _asked(self) -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""
@@ -114,6 +115,9 @@ class Tween:
             return self._of_key_file(rig)
         motion = options.read_motion(self.source, rig)
         frames = [parse_frame(word, fps=float(motion.fps)) for word in (self.keyframes or "").split(",")]
+        if len(set(frames)) == 2 and (self.root_only or self.joints is not None):
+            name = "--root-only" if self.root_only else "--joints"
+            raise RequestError(f"{name} is about keys between the first and the last, and --keyframes has none there")
         limbs = () if self.joints is None else tuple(name.strip() for name in self.joints.split(","))
         if limbs:  # also where there is no key between the first and the last
             check_limbs(limbs, motion, rig)
@@ -135,7 +139,7 @@ class Tween:
         from controllers.tween import tween
 
         method = "linear" if self.method == "slerp" else self.method
-        infiller = None if method == "linear" else priors.load_infiller(self.infiller)
+        infiller = None if method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
         settings = InfillSettings(method=method)
         return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig)

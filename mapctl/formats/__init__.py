@@ -7,6 +7,7 @@ from pathlib import PurePath
 
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import asf_amc, bvh, npz
+from mapctl.formats.missing import Missing
 from mapctl.motion import Motion
 
 
@@ -24,6 +25,9 @@ def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
 
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {
     ".bvh": bvh.load, ".npz": npz.load, ".amc": asf_amc.load,
+}  # fmt: skip
+_LOSSY_READERS: dict[str, Callable[[str | PathLike[str]], tuple[Motion, Missing]]] = {
+    ".bvh": bvh.load_lossy, ".npz": npz.load_lossy, ".amc": asf_amc.load_lossy,
 }  # fmt: skip
 WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
     ".bvh": bvh.save, ".npz": npz.save, ".glb": _save_glb,
@@ -43,16 +47,32 @@ def load(
 
     `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit`
     wins over what is found by the size of the body, in formats whose unit is not fixed. FileFormatError says what is
-    wrong with the file, and where.
+    wrong with the file, and where: NaN in place of a number, too, which `load_lossy` takes.
     """
-    ending = PurePath(path).suffix.lower()
-    if ending not in READERS:
-        why = _WHY_NOT.get(ending, f"cannot read the ending {ending!r}")
-        raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
+    ending = _readable(path)
     if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
     motion = READERS[ending](path) if fps is None else asf_amc.load(path, fps=fps)
     return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit)
+
+
+def load_lossy(path: str | PathLike[str], *, metres_per_unit: float | None = None) -> tuple[Motion, Missing]:
+    """Read a motion as `load` does, from a file that may have NaN where something was lost, and what was.
+
+    The motion is finite: joints stay as they were last known, places go straight from one known place to the next.
+    FileFormatError where nothing is known.
+    """
+    motion, missing = _LOSSY_READERS[_readable(path)](path)
+    return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit), missing
+
+
+def _readable(path: str | PathLike[str]) -> str:
+    """The ending; FileFormatError unless it is one of `READERS`."""
+    ending = PurePath(path).suffix.lower()
+    if ending not in READERS:
+        why = _WHY_NOT.get(ending, f"cannot read the ending {ending!r}")
+        raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
+    return ending
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

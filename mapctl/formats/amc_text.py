@@ -9,12 +9,14 @@ from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from math import nan
 from os import PathLike
 from typing import NoReturn
 
 import numpy as np
 
 from mapctl.errors import FileFormatError
+from mapctl.formats import missing
 from mapctl.formats.asf_skeleton import AsfSkeleton, Row, rows
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
 from mapctl.formats.reading import MAX_POSES, NUMBER, decode, finite_number, read_bytes, shorten
@@ -37,9 +39,12 @@ class AmcText:
     """Frames per second; None where the file does not say, as most do not."""
 
 
-def read(path: str | PathLike[str], skeleton: AsfSkeleton) -> AmcText:
-    """Read a take of the skeleton. FileFormatError names the line and what was expected there."""
-    reader = _Reader(path, skeleton)
+def read(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = False) -> AmcText:
+    """Read a take of the skeleton. FileFormatError names the line and what was expected there.
+
+    A `lossy` one may hold NaN among its values, but not nothing else.
+    """
+    reader = _Reader(path, skeleton, lossy)
     reader.read(rows(decode(path, read_bytes(path), "AMC text")[0]))
     values = np.frombuffer(reader.values).reshape(reader.frames, reader.width)
     return AmcText(values, reader.degrees, reader.fps)
@@ -49,6 +54,7 @@ def read(path: str | PathLike[str], skeleton: AsfSkeleton) -> AmcText:
 class _Reader:
     path: str | PathLike[str]
     skeleton: AsfSkeleton
+    lossy: bool = False
     degrees: bool | None = None
     fps: Fraction | None = None
     full: bool = False
@@ -130,10 +136,11 @@ class _Reader:
         if len(words) - 1 != count:
             self.fail(f"{shorten(words[0])} has {len(words) - 1} values, expected {count}", line)
         for column, word in enumerate(words[1:], start):
-            value = finite_number(word)
+            value = nan if self.lossy and missing.is_nan(word) else finite_number(word)
             if value is None:
                 channel = self.skeleton.channels[bone][column - start]
-                self.fail(f"{shorten(words[0])} {channel}: expected {NUMBER}, got {shorten(word)}", line)
+                got = f"{shorten(word)}{missing.hint(word)}"
+                self.fail(f"{shorten(words[0])} {channel}: expected {NUMBER}, got {got}", line)
             self.row[column] = value
         self.seen.add(bone)
 

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import amc_text, asf_skeleton, bvh_euler
+from mapctl.formats import amc_text, asf_skeleton, bvh_euler, missing
 from mapctl.formats.asf_skeleton import AsfSkeleton
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
+from mapctl.formats.missing import Missing
 from mapctl.formats.reading import check_extent, read_bytes
 from mapctl.formats.units import metres_per_unit
 from mapctl.motion import Motion
@@ -38,6 +39,15 @@ def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> M
     second, over what the file says; else `USUAL_FPS`. Lengths are in metres by the ASF's `length`, or where that is 1
     by the size of the body. FileFormatError says what is wrong, in which line.
     """
+    return _read(path, fps=fps, lossy=False)[0]
+
+
+def load_lossy(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> tuple[Motion, Missing]:
+    """Read a take in which some values are NaN, and which they are; FileFormatError where all of them are."""
+    return _read(path, fps=fps, lossy=True)
+
+
+def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: bool) -> tuple[Motion, Missing]:
     if fps is not None and not SLOWEST <= fps <= FASTEST:
         raise RequestError(f"the frame rate must be {SLOWEST:g} to {FASTEST:g}, got {float(fps):g}")
     try:
@@ -45,16 +55,28 @@ def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> M
     except OSError as error:  # as a name that is too long, or a folder that may not be listed
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
     asf = asf_skeleton.read(subject)
-    text = amc_text.read(take, asf)
+    text = amc_text.read(take, asf, lossy=lossy)
     check_extent(take, len(text.values), len(asf.names))
+    missing.check_any(take, np.isnan(text.values))
     degrees = asf.degrees if text.degrees is None else text.degrees
     skeleton, scale = _skeleton(asf)
-    return Motion(
+    places = missing.bridged(_positions(asf, text.values), np.zeros(3))
+    motion = Motion(
         skeleton=skeleton,
         fps=Fraction(fps or text.fps or USUAL_FPS).limit_denominator(100_000),
-        root_position=torch.from_numpy((_positions(asf, text.values) + asf.root_position) * scale),
-        local_quat_xyzw=_quaternions(asf, text.values, degrees=degrees),
+        root_position=torch.from_numpy((places + asf.root_position) * scale),
+        local_quat_xyzw=_quaternions(asf, missing.held(text.values), degrees=degrees),
     )
+    return motion, _missing(asf, np.isnan(text.values))
+
+
+def _missing(asf: AsfSkeleton, lost: np.ndarray) -> Missing:
+    """By bone. Where all channels are lost, bones are that have none."""
+    whole = lost.all(axis=1)
+    turns = [lost[:, columns].any(axis=1) | whole for _, columns in _columns(asf, "r")]
+    places = np.zeros((len(lost), len(turns)), dtype=bool)
+    places[:, 0] = lost[:, _columns(asf, "t")[0][1]].any(axis=1)
+    return Missing(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(places))
 
 
 def paths(path: str | PathLike[str]) -> tuple[Path, Path]:

@@ -1,9 +1,10 @@
 """BVH files to Motion and back, on the file's own skeleton and in its own channel layout.
 
 A position channel replaces its joint's OFFSET when read. Lengths are scaled to metres by the size of the body
-(see `units`), and scaled back when written.
+(see `units`), and scaled back when written. Frames of a joint that are as they were read get the numbers they had.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 
@@ -14,11 +15,12 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.formats import bvh_euler, bvh_layout, bvh_text
+from mapctl.formats import bvh_euler, bvh_layout, bvh_text, missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.bvh_hierarchy import Hierarchy
 from mapctl.formats.bvh_layout import BvhLayout
 from mapctl.formats.frame_rate import frame_rate
+from mapctl.formats.missing import Missing
 from mapctl.formats.units import metres_per_unit, reach
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
@@ -34,20 +36,64 @@ def load(path: str | PathLike[str]) -> Motion:
     translation is its offset where it stays still, else `moving_offsets`. FileFormatError says what is
     wrong, in which line.
     """
-    text = bvh_text.read(path)
-    tree = text.hierarchy
-    travels = _translations(tree, text.values)
-    rest, moving = _settle(tree, travels)
+    return _read(bvh_text.read(path))[0]
+
+
+def load_lossy(path: str | PathLike[str]) -> tuple[Motion, Missing]:
+    """Read a BVH file in which some values are NaN, and which they are; FileFormatError where all of them are.
+
+    The place of a joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET.
+    """
+    return _read(bvh_text.read(path, lossy=True))
+
+
+def _read(text: bvh_text.BvhText) -> tuple[Motion, Missing]:
+    tree, lost = text.hierarchy, np.isnan(text.values)
+    values = _completed(tree, text.values)
+    _, rest, moving = _settle(tree, values)
     scale = metres_per_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
-    layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding)
+    layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding, text.values)
+    return _motion(layout, values), _missing(tree, lost, moving)
+
+
+def _motion(layout: BvhLayout, values: np.ndarray) -> Motion:
+    """Of channels (frames, channels) in the layout's order and unit."""
+    tree, scale = layout.hierarchy, layout.metres_per_unit
+    travels, rest, moving = _settle(tree, values)
     return Motion(
         skeleton=_skeleton(tree, rest * scale, scale),
         fps=layout.fps,
         root_position=torch.from_numpy(travels[0] * scale),
-        local_quat_xyzw=_quaternions(tree, text.values),
+        local_quat_xyzw=_quaternions(tree, values),
         moving_offsets={joint: torch.from_numpy(travels[joint] * scale) for joint in moving},
         source=layout,
     )
+
+
+def _completed(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
+    """The channels with numbers in place of NaN."""
+    if not np.isnan(values).any():
+        return values
+    done = missing.held(values)
+    for joint, columns in enumerate(tree.position_columns()):
+        own = list(columns.values())
+        done[:, own] = missing.bridged(values[:, own], np.array(tree.offsets[joint])[list(columns)])
+    return done
+
+
+def _missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> Missing:
+    """By joint. Where all channels are lost, joints are that have none. One frame tells the place of a still joint."""
+    whole = np.all(lost, axis=1)
+    rotations = np.tile(whole[:, None], len(tree.names))
+    places = np.zeros_like(rotations)
+    places[:, 0] = whole
+    for _, joints, columns in tree.rotation_groups():
+        rotations[:, joints] |= lost[:, columns].any(axis=-1)
+    for joint, columns in enumerate(tree.position_columns()):
+        own = lost[:, list(columns.values())]
+        if joint == 0 or joint in moving or own.all(axis=0).any():
+            places[:, joint] |= own.any(axis=1)
+    return Missing(torch.from_numpy(rotations), torch.from_numpy(places))
 
 
 def unit_of(motion: Motion) -> float | None:
@@ -82,7 +128,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     quat_xyzw = as_array(motion.local_quat_xyzw)[:, order]
     translations = all_translations(motion)[:, order] / layout.metres_per_unit
     tree = bvh_layout.fitted(layout, translations, quat_xyzw)
-    values = channel_values(tree, translations, quat_xyzw)
+    values = _with_kept(layout, tree, translations, quat_xyzw)
     text = bvh_text.compose(tree, layout.frame_time, values, decimals=layout.decimals)
     write_bytes(path, text.encode(layout.encoding))
 
@@ -97,12 +143,13 @@ def _translations(tree: Hierarchy, values: np.ndarray) -> dict[int, np.ndarray]:
     return travels
 
 
-def _settle(tree: Hierarchy, travels: dict[int, np.ndarray]) -> tuple[np.ndarray, list[int]]:
-    """Rest offsets (joints, 3) in the file's unit, and which joints travel within their parent.
+def _settle(tree: Hierarchy, values: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray, list[int]]:
+    """Translations as of `_translations`, rest offsets (joints, 3) in the file's unit, and which joints travel within
+    their parent.
 
     A channel that repeats OFFSET up to rounding is taken as OFFSET, so that clips of one rig agree.
     """
-    rest = np.array(tree.offsets)
+    travels, rest = _translations(tree, values), np.array(tree.offsets)
     for joint, track in travels.items():
         rest[joint] = track[0]
     still, moving = STILL * reach(tree.parents, np.linalg.norm(rest, axis=1), {}), []
@@ -117,7 +164,7 @@ def _settle(tree: Hierarchy, travels: dict[int, np.ndarray]) -> tuple[np.ndarray
         else:
             rest[joint] = offset
             moving.append(joint)
-    return rest, moving
+    return travels, rest, moving
 
 
 def _skeleton(tree: Hierarchy, offsets: np.ndarray, scale: float) -> Skeleton:
@@ -140,6 +187,38 @@ def channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndar
         values[:, list(columns.values())] = translations[:, joint, list(columns)]
     for axes, joints, columns in tree.rotation_groups():
         values[:, columns] = np.rad2deg(bvh_euler.from_quat_xyzw(quat_xyzw[:, joints], axes))
+    return values
+
+
+def _with_kept(layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+    """The motion block, with the numbers that were read where a joint still is as they say.
+
+    They are read again to compare: a motion's tensors may have been written into.
+    """
+    values, own, old = channel_values(tree, translations, quat_xyzw), layout.values, layout.hierarchy
+    if own is None or len(own) != len(values):
+        return values
+    before = _motion(layout, _completed(old, own))
+    turns, places = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
+    turned = (turns == quat_xyzw).all(-1) | (turns == -quat_xyzw).all(-1)
+    there = np.all(np.isclose(places, translations, rtol=1e-12, atol=1e-12), axis=-1)
+    same = [now == then for now, then in zip(tree.channels, old.channels, strict=True)]
+    for joint, (now, then) in enumerate(zip(tree.position_columns(), old.position_columns(), strict=True)):
+        if same[joint]:
+            at, numbers = list(now.values()), own[:, list(then.values())]
+            kept = there[:, joint] & np.isfinite(numbers).all(-1)
+            values[:, at] = np.where(kept[:, None], numbers, values[:, at])
+    read = {
+        joint: columns
+        for _, joints, group in old.rotation_groups()
+        for joint, columns in zip(joints, group, strict=True)
+    }
+    for axes, joints, group in tree.rotation_groups():
+        for joint, at in zip(joints, group, strict=True):
+            if same[joint] and turned[:, joint].any():
+                numbers = own[:, read[joint]]
+                kept = turned[:, joint] & np.isfinite(numbers).all(-1)
+                values[:, at] = bvh_euler.kept(values[:, at], numbers, kept, axes)
     return values
 
 

@@ -2,7 +2,7 @@
 
 A joint's matrix is the product of its channels' turns in file order, so the axes here are intrinsic. Going
 back, the angles are unwrapped over time and the closer of the two equivalent solutions is taken at every
-frame.
+frame; those of a source can be kept in the frames that are still its own.
 """
 
 from collections.abc import Sequence
@@ -53,6 +53,31 @@ def holds(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: float = 2e-6
     return bool((2 * nearest <= tolerance).all())
 
 
+def kept(path: np.ndarray, source: np.ndarray, same: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """Degrees (frames, channels): the source's own in the frames that are the `same`, the path's in others.
+
+    These go on from the source's angles before them, at the beginning to those after them, without a jump. Where they
+    do not lead to the source's angles after them but a whole turn away, or to the other of two equal solutions, the
+    step is there: no angles of these rotations lead from the one to the other.
+    """
+    done = np.where(same[:, None], source, path)
+    edges = np.flatnonzero(np.diff(~same, prepend=False, append=False))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if 0 <= (at := start - 1 if start else stop) < len(path):
+            done[start:stop] = nearest_form(path[[at, *range(start, stop)]], source[at], axes)[1:]
+    return done
+
+
+def nearest_form(path: np.ndarray, wanted: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """A path of angles (frames, channels), or its equal of the other solution, by whole turns from where its first
+    frame is nearest to the wanted angles (channels,); degrees.
+    """
+    forms = [path, _twin(path, axes, half=180.0)] if len(axes) == 3 else [path]
+    forms = [form + 360 * np.round((wanted - form[0]) / 360) for form in forms]
+    away = [abs(form[0] - wanted).sum() for form in forms]
+    return forms[-1] if away[-1] < away[0] - 1e-9 else forms[0]
+
+
 def _one_angle(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     parts = [2 * np.arctan2(quat[..., axis], quat[..., W]) for axis in axes]
     return np.stack(parts, axis=-1) if parts else np.zeros((*quat.shape[:-1], 0))
@@ -88,8 +113,13 @@ def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
         middle, turn = 2 * np.arctan2(sum_length - difference_length, sum_length + difference_length), sign
     outer = half_sum + half_difference, turn * (half_sum - half_difference)
     angles = np.stack([outer[0], middle, outer[1]], axis=-1)
-    twin = np.stack([outer[0] + np.pi, (0 if proper else np.pi) - middle, outer[1] + np.pi], axis=-1)
-    return _closest_path(angles, twin)
+    return _closest_path(angles, _twin(angles, axes, half=np.pi))
+
+
+def _twin(angles: np.ndarray, axes: Sequence[int], *, half: float) -> np.ndarray:
+    """The other three angles (..., 3) of the same rotations, in the unit in which a half turn is `half`."""
+    first, middle, last = np.moveaxis(angles, -1, 0)
+    return np.stack([first + half, (0 if axes[0] == axes[2] else half) - middle, last + half], axis=-1)
 
 
 def _held_angle(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

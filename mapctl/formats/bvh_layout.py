@@ -36,6 +36,8 @@ class BvhLayout:
     """Frame time as printed, seconds."""
     encoding: str = "utf-8"
     """How names are encoded."""
+    values: np.ndarray | None = None
+    """(frames, channels) that were read, file unit and degrees, NaN where lost; what is unchanged is written so."""
 
     @property
     def decimals(self) -> int:

@@ -9,13 +9,10 @@ from typing import TextIO
 import numpy as np
 
 from mapctl.errors import MapctlError
-from mapctl.formats import bvh, bvh_layout, bvh_text
+from mapctl.formats import bvh, bvh_euler, bvh_layout, bvh_text
 from mapctl.formats.atomic import atomic_path
 from mapctl.formats.bvh_hierarchy import Hierarchy
 from mapctl.motion import Motion
-
-_SAME_DEGREES = 30.0
-"""No joint turns this far within a frame, except by a change to the other of two equal Euler solutions."""
 
 
 @contextmanager
@@ -73,15 +70,5 @@ class BvhStream:
             return values
         for axes, _, columns in tree.rotation_groups():
             for joint in np.reshape(columns, (-1, len(axes))):
-                values[:, joint] = _nearest_form(values[:, joint], self._last[joint], axes)
+                values[:, joint] = bvh_euler.nearest_form(values[:, joint], self._last[joint], axes)
         return values
-
-
-def _nearest_form(degrees: np.ndarray, last: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
-    """The angles, or their equal (a + 180, 180 - b, c + 180), by whole turns nearest to `last`."""
-    moved = degrees + 360 * np.round((last - degrees[0]) / 360)
-    if len(set(axes)) < 3 or abs(moved[0] - last).max() < _SAME_DEGREES:
-        return moved
-    twin = np.stack([degrees[:, 0] + 180, 180 - degrees[:, 1], degrees[:, 2] + 180], axis=1)
-    twin += 360 * np.round((last - twin[0]) / 360)
-    return twin if abs(twin[0] - last).sum() < abs(moved[0] - last).sum() else moved

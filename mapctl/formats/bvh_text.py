@@ -1,7 +1,8 @@
 """The text of a BVH file to plain arrays and back, in the file's own unit and degrees.
 
 Tolerant on syntax: case of keywords, tabs, CRLF, byte-order marks, braces anywhere, names with spaces or
-colons, missing End Sites, `Frames :`. Strict on data: every value must be there and be a finite number.
+colons, missing End Sites, `Frames :`. Strict on data: every value must be there and be a finite number, or NaN where
+what is lost is asked for.
 """
 
 import re
@@ -12,6 +13,7 @@ from os import PathLike
 import numpy as np
 
 from mapctl.errors import FileFormatError
+from mapctl.formats import missing
 from mapctl.formats.bvh_hierarchy import Hierarchy, Scanner, read_hierarchy
 from mapctl.formats.frame_rate import LONGEST_FRAME, SHORTEST_FRAME
 from mapctl.formats.reading import LARGEST_VALUE, NUMBER, check_extent, decode, finite_number, read_bytes, shorten
@@ -35,15 +37,19 @@ class BvhText:
     """How names are encoded: utf-8 or latin-1."""
 
 
-def read(path: str | PathLike[str]) -> BvhText:
-    """Read a BVH file. FileFormatError names the line and what was expected there."""
+def read(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
+    """Read a BVH file. FileFormatError names the line and what was expected there.
+
+    A `lossy` one may hold NaN among its values, but not nothing else.
+    """
     text, encoding = decode(path, read_bytes(path), "BVH text")
     scanner = Scanner(path, text)
     hierarchy = read_hierarchy(scanner)
     frames, frames_line = _frame_count(scanner), scanner.line
     frame_time = _frame_time(scanner)
     labels = hierarchy.labels()
-    values = _values(scanner, labels, frames=frames, frames_line=frames_line)
+    values = _values(scanner, labels, frames=frames, frames_line=frames_line, lossy=lossy)
+    missing.check_any(path, np.isnan(values))
     check_extent(path, len(values), len(hierarchy.names))
     return BvhText(hierarchy, frame_time, values, encoding)
 
@@ -64,20 +70,21 @@ def _frame_time(scanner: Scanner) -> str:
     return word
 
 
-def _values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int) -> np.ndarray:
+def _values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
     """The motion block as (frames, channels). Parsed in one go; only a fault is looked for by row."""
     expected = frames * len(labels)
     if expected == 0:
         scanner.fail("no joint has any CHANNELS, expected at least one")
+    text = scanner.text[scanner.stop :]
     try:
-        values = np.fromstring(scanner.text[scanner.stop :], sep=" ")
+        values = np.fromstring(missing.plain(text) if lossy else text, sep=" ")
     except ValueError:
         values = np.empty(0)
     # NaN compares as not small. `1.5.2` was parsed as two values, so words are counted too.
-    sound = values.size == expected and bool((np.abs(values) < LARGEST_VALUE).all())
+    sound = values.size == expected and bool(((np.abs(values) < LARGEST_VALUE) | (lossy & np.isnan(values))).all())
     if sound and sum(len(row.split()) for _, row in _rows(scanner)) == expected:
         return values.reshape(frames, len(labels))
-    raise _fault(scanner, labels, may_wrap=values.size == expected) or FileFormatError(
+    raise _fault(scanner, labels, may_wrap=values.size == expected, lossy=lossy) or FileFormatError(
         scanner.path, f"'Frames: {frames}' but {sum(1 for _ in _rows(scanner))} rows follow", frames_line
     )
 
@@ -94,16 +101,17 @@ def _rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
         start, line = stop + 1, line + 1
 
 
-def _fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool) -> FileFormatError | None:
+def _fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, lossy: bool) -> FileFormatError | None:
     """The first value that is none, or the first row of a wrong length (where rows may not be wrapped)."""
     read = 0
     for line, row in _rows(scanner):
         words = _DATUM.findall(row)
         for place, word in enumerate(words, read):
-            if finite_number(word) is None:
+            if finite_number(word) is None and not (lossy and missing.is_nan(word)):
                 frame, column = divmod(place, len(labels))
                 where = f"frame {frame}, column {column + 1} ({labels[column]})"
-                return FileFormatError(scanner.path, f"{where}: expected {NUMBER}, got {shorten(word)}", line)
+                got = f"{shorten(word)}{missing.hint(word)}"
+                return FileFormatError(scanner.path, f"{where}: expected {NUMBER}, got {got}", line)
         if len(words) != len(labels) and not may_wrap:
             count = f"frame {read // len(labels)} has {len(words)} values, expected {len(labels)}"
             return FileFormatError(scanner.path, count, line)

@@ -25,8 +25,10 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
+from mapctl.formats.missing import Missing
 from mapctl.formats.reading import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, read_bytes, shorten
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
@@ -42,7 +44,8 @@ _KEYS = {
     "moving_joints": ("i", "M"), "moving_offsets": ("f", "MT3"),
 }  # fmt: skip
 
-
+_TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
+"""Keys that change from frame to frame, and may hold NaN where what is lost is asked for."""
 _UNSOUND = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, lzma.LZMAError, ValueError, EOFError, OSError,
     MemoryError, NotImplementedError, RuntimeError, SyntaxError, TypeError, OverflowError,
@@ -52,13 +55,25 @@ _UNSOUND = (
 
 def load(path: str | PathLike[str]) -> Motion:
     """Read what `save` wrote. FileFormatError names the key that is missing or wrong."""
+    return _read(path, lossy=False)[0]
+
+
+def load_lossy(path: str | PathLike[str]) -> tuple[Motion, Missing]:
+    """Read an archive in which rotations and places of some frames are NaN, and which they are; FileFormatError where
+    all of them are.
+    """
+    return _read(path, lossy=True)
+
+
+def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, Missing]:
     arrays = _read_arrays(path, read_bytes(path))
-    _check_shapes(path, arrays)
+    _check_shapes(path, arrays, lossy=lossy)
+    lost = _missing(path, arrays)
     if (found := str(arrays["format"])) != FORMAT:
         raise FileFormatError(path, f"format is {found[:40]!r}, expected {FORMAT!r}")
     _check_rotations(path, arrays["local_quat_xyzw"])
     try:
-        return _motion(arrays)
+        return _motion(arrays), lost
     except (MapctlError, ZeroDivisionError, ValueError, IndexError) as error:
         raise FileFormatError(path, f"does not hold a motion: {_reason(error)}") from error
 
@@ -144,7 +159,7 @@ def _check_members(path: str | PathLike[str], archive: zipfile.ZipFile) -> None:
         raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
 
 
-def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> None:
+def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray], *, lossy: bool) -> None:
     sizes = {"2": 2, "3": 3, "4": 4}
     sizes |= {"J": arrays["names"].size, "E": arrays["end_names"].size, "M": arrays["moving_joints"].size}
     sizes["T"] = len(np.atleast_1d(arrays["root_position_world"]))
@@ -154,9 +169,34 @@ def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> N
             found = f"{values.dtype} and shape {values.shape}"
             raise FileFormatError(path, f"{key} has {found}, expected kind {kind!r} and shape {wanted}")
         # NaN compares as not small.
-        if kind == "f" and not (small := np.abs(values.astype(np.float64)) < LARGEST_VALUE).all():
+        small = np.abs(values.astype(np.float64)) < LARGEST_VALUE if kind == "f" else np.True_
+        if key in _TRACKS and lossy:
+            small = small | np.isnan(values)
+        if not small.all():
             place = np.argwhere(~small)[0].tolist()
-            raise FileFormatError(path, f"{key} at {place}: expected {NUMBER}")
+            hint = missing.hint(str(values[tuple(place)])) if key in _TRACKS else ""
+            raise FileFormatError(path, f"{key} at {place}: expected {NUMBER}{hint}")
+
+
+def _missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> Missing:
+    """What is NaN, which is replaced in the arrays."""
+    lost: list[np.ndarray] = [np.isnan(arrays[key]) for key in _TRACKS]
+    missing.check_any(path, np.concatenate([part.ravel() for part in lost]))
+    root, turns, moving = lost
+    places = np.zeros_like(turns[:, :, 0])
+    places[:, 0] = root.any(axis=-1)
+    for track, joint in enumerate(arrays["moving_joints"].tolist()):
+        if 0 < joint < places.shape[1]:  # others are refused later
+            places[:, joint] = moving[track].any(axis=-1)
+    if any(part.any() for part in lost):
+        whole = np.where(turns.any(axis=-1, keepdims=True), np.nan, arrays["local_quat_xyzw"])
+        held = missing.held(whole.reshape(len(whole), -1)).reshape(whole.shape)
+        never = ~held.any(axis=-1)
+        held[never] = (0.0, 0.0, 0.0, 1.0)
+        tracks = [missing.bridged(track, np.zeros(3)) for track in arrays["moving_offsets"]]
+        arrays |= {"local_quat_xyzw": held, "moving_offsets": np.array(tracks).reshape(moving.shape),
+                   "root_position_world": missing.bridged(arrays["root_position_world"], np.zeros(3))}  # fmt: skip
+    return Missing(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(places))
 
 
 def _check_rotations(path: str | PathLike[str], quat_xyzw: np.ndarray) -> None:

@@ -1,0 +1,65 @@
+"""What a file marks as lost: NaN where a number belongs, as trackers and spreadsheets write it."""
+
+import re
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+from jaxtyping import Bool
+from torch import Tensor
+
+from mapctl.errors import FileFormatError
+
+_FORMS = re.compile(r"(?<!\S)[+-]?(?:nan(?:\([^\s)]*\))?|1\.#(?:ind|qnan|snan)\S*)(?!\S)", re.IGNORECASE | re.ASCII)
+
+
+@dataclass(frozen=True, eq=False)
+class Missing:
+    """Where the numbers of a motion stand for nothing: the file has NaN there."""
+
+    rotations: Bool[Tensor, "frames joints"]
+    """Local rotations; the motion repeats the last one that is known."""
+    places: Bool[Tensor, "frames joints"]
+    """Places within the parent, of the root in the world; the motion goes straight between those that are known."""
+
+
+def is_nan(word: str) -> bool:
+    """Whether a word of a text file stands for a number that was lost: `nan`, `-nan(ind)`, `1.#QNAN`."""
+    return _FORMS.fullmatch(word) is not None
+
+
+def plain(text: str) -> str:
+    """The text with such words in the one form that numpy reads."""
+    return _FORMS.sub("nan", text) if "#" in text else text
+
+
+def hint(word: str) -> str:
+    """What to add to the refusal of a word."""
+    return "; `mapctl infill` fills in what is lost" if is_nan(word) else ""
+
+
+def check_any(path: str | PathLike[str], lost: np.ndarray) -> None:
+    """FileFormatError where nothing is known."""
+    if lost.size and lost.all():
+        raise FileFormatError(path, "every value is nan: nothing is known of the motion")
+
+
+def held(values: np.ndarray) -> np.ndarray:
+    """Columns (frames, width) with the last known number in place of NaN, at first the first; 0 where none is known."""
+    known = ~np.isnan(values)
+    if known.all():
+        return values
+    frame = np.arange(len(values))[:, None]
+    nearest = np.maximum.accumulate(np.where(known, frame, known.argmax(axis=0)), axis=0)
+    return np.where(known.any(axis=0), np.take_along_axis(values, nearest, axis=0), 0.0)
+
+
+def bridged(values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Columns (frames, width) straight between the known numbers around NaN; `otherwise` (width,) where none is."""
+    done, frame = values.copy(), np.arange(len(values))
+    for column in np.flatnonzero(np.isnan(values).any(axis=0)):
+        known = ~np.isnan(values[:, column])
+        lone = np.full(len(values), otherwise[column])
+        done[:, column] = np.interp(frame, frame[known], values[known, column]) if known.any() else lone
+        done[known, column] = values[known, column]
+    return done

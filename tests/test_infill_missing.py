@@ -1,0 +1,162 @@
+"""`mapctl infill` of files with NaN, as a user types it: as if their gaps had been named."""
+
+import json
+
+import numpy as np
+import pytest
+from captures import on_rig
+from helpers import run
+from lossy_files import archive_without, with_all_channels, without
+from tiny_denoiser import save_tiny_denoiser
+from tiny_infiller import save_tiny_infiller
+
+import mapctl
+from mapctl.formats import bvh_text
+
+NAMES = {"canonical": ("leftHand", "rightLowerLeg"), "bandai": ("Hand_L", "LowerLeg_R"), "daz": ("lHand", "rShin")}
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.2)
+
+
+@pytest.fixture
+def infilled(tiny, tmp_path):
+    """Runs the command, which must do; returns the text of what it writes."""
+
+    def made(source, *words, method="infiller"):
+        asked = () if method == "linear" else ("--infiller", tiny)
+        assert run("infill", source, "-o", tmp_path / "out.bvh", *words, "--method", method, *asked, "--quiet") == 0
+        return (tmp_path / "out.bvh").read_text()
+
+    return made
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """A file by rig and rate, 1.5 seconds long, in drawn Euler orders or with the channels that a motion needs."""
+
+    def of(rig, fps=30, seed=None):
+        path, motion = tmp_path / f"{rig}-{fps}-{seed}.bvh", on_rig(rig, round(1.5 * fps), fps=fps)
+        if seed is None:
+            motion.save(path)
+            return path
+        return with_all_channels(motion, path, seed=seed)
+
+    return of
+
+
+@pytest.mark.parametrize(("rig", "fps", "seed", "method"), [
+    ("canonical", 30, None, "linear"), ("bandai", 30, 1, "map"), ("bandai", 120, None, "infiller"),
+    ("daz", 30, 2, "infiller"), ("daz", 60, 3, "linear"),
+])  # fmt: skip
+def test_frames_of_nan_are_gaps(infilled, clip, tmp_path, rig, fps, seed, method):
+    source, gaps = clip(rig, fps, seed), ((fps // 3, fps // 2), (fps, fps + 7))
+    lossy = without(source, tmp_path / "lossy.bvh", [("", *gap) for gap in gaps])
+    words = [word for gap in gaps for word in ("--gap", "{}:{}".format(*gap))]
+    assert infilled(lossy, method=method) == infilled(source, *words, method=method)
+
+
+@pytest.mark.parametrize("rig", sorted(NAMES))
+@pytest.mark.parametrize("gap", [None, (20, 33)])
+def test_joints_of_nan_are_lost_joints(infilled, clip, tmp_path, rig, gap):
+    source = clip(rig, seed=4)
+    start, stop = gap or (0, 45)
+    lossy = without(source, tmp_path / "lossy.bvh", [(f"{name} ", start, stop) for name in NAMES[rig]])
+    words = ["--joints", ",".join(NAMES[rig]), *(["--gap", f"{start}:{stop}"] if gap else [])]
+    assert infilled(lossy) == infilled(source, *words)
+
+
+@pytest.mark.parametrize(("rig", "root"), [("canonical", "hips"), ("bandai", "Hips"), ("daz", "hip")])
+def test_the_roots_place_alone_may_be_lost(infilled, clip, tmp_path, rig, root):
+    source = clip(rig)
+    lossy = without(source, tmp_path / "lossy.bvh", [(f"{root} Xposition", 20, 30)])
+    assert infilled(lossy) == infilled(source, "--joints", "root position", "--gap", "20:30")
+
+
+def test_what_is_asked_for_comes_to_what_is_nan(infilled, clip, tmp_path):
+    source = clip("bandai")
+    both = without(source, tmp_path / "both.bvh", [("", 8, 12), ("Hand_L", 20, 30)])
+    for lost, words in (([("", 8, 12)], ("--joints", "Hand_L", "--gap", "20:30")),
+                        ([("Hand_L", 20, 30)], ("--gap", "8:12"))):  # fmt: skip
+        lossy = without(source, tmp_path / "lossy.bvh", lost)
+        assert infilled(lossy, *words) == infilled(both)
+
+
+@pytest.mark.parametrize("rig", sorted(NAMES))
+@pytest.mark.parametrize("seed", [7, 8])
+def test_what_is_no_nan_has_the_numbers_of_the_file(infilled, clip, tmp_path, rig, seed):
+    source = clip(rig, seed=seed)
+    lossy = without(source, tmp_path / "lossy.bvh", [("", 15, 30)])
+    infilled(lossy)
+    before, after = bvh_text.read(source).values, bvh_text.read(tmp_path / "out.bvh").values
+    known = [frame for frame in range(45) if not 15 <= frame < 30]
+    assert np.array_equal(before[known], after[known])
+    assert np.isfinite(after).all()
+
+
+def test_where_something_is_nan_nothing_else_is_looked_for(tiny, clip, tmp_path):
+    lines = clip("bandai").read_text().splitlines()
+    lines[-25:-15] = [lines[-26]] * 10
+    (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
+    lossy = without(tmp_path / "frozen.bvh", tmp_path / "lossy.bvh", [("", 5, 9)])
+    words = ["--method", "infiller", "--infiller", tiny, "--report", tmp_path / "r.json", "--quiet"]
+    assert run("infill", lossy, "-o", tmp_path / "out.bvh", *words) == 0
+    (gap,) = json.loads((tmp_path / "r.json").read_text())["gaps"]
+    assert (gap["start"], gap["stop"]) == (5, 9)
+
+
+def test_an_archive_with_nan_is_filled(infilled, tmp_path):
+    on_rig("bandai", 45).save(tmp_path / "in.npz")
+    frames = (slice(20, 30),)
+    lossy = archive_without(tmp_path / "in.npz", tmp_path / "lossy.npz", local_quat_xyzw=frames,
+                            root_position_world=frames, moving_offsets=(slice(None), *frames))  # fmt: skip
+    assert infilled(lossy) == infilled(tmp_path / "in.npz", "--gap", "20:30")
+
+
+@pytest.mark.parametrize(("lost", "said"), [
+    ([("", 0, 45)], "every value is nan: nothing is known of the motion"),
+    ([("Hips ", 0, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
+    ([("", 0, 20), ("Hips Yposition", 20, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
+])  # fmt: skip
+def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, said):
+    lossy = without(clip("bandai"), tmp_path / "lossy.bvh", lost)
+    assert run("infill", lossy, "-o", tmp_path / "out.bvh", "--infiller", tiny) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith("mapctl: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert not (tmp_path / "out.bvh").exists()
+
+
+@pytest.mark.parametrize("words", [
+    ("convert", "lossy.bvh", "out.npz"), ("tween", "lossy.bvh", "-o", "out.bvh", "--keyframes", "0,44"),
+    ("info", "lossy.bvh"), ("measure", "lossy.bvh"), ("render", "lossy.bvh", "-o", "out.png"),
+], ids=" ".join)  # fmt: skip
+def test_other_commands_refuse_nan_and_say_who_fills_it(clip, tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    without(clip("bandai"), tmp_path / "lossy.bvh", [("Hand_L Zrotation", 3, 5)])
+    before = sorted(tmp_path.iterdir())
+    assert run(*words) == 2
+    told = capsys.readouterr()
+    assert told.err.count("\n") == 1
+    assert "frame 3, column" in told.err
+    assert "expected a finite number below 1e+08, got 'nan'; `mapctl infill` fills in what is lost" in told.err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_denoising_believes_no_nan(clip, tmp_path, many):
+    """As if a mask said so."""
+    denoiser = save_tiny_denoiser(tmp_path / "denoiser.safetensors")
+    source, folder = clip("bandai"), tmp_path / "folder"
+    folder.mkdir()
+    lossy = without(source, folder / "lossy.bvh", [("Hand_L", 20, 26)])
+    (tmp_path / "mask.csv").write_text("joint,start,stop\nHand_L,20,26\n")
+    words = ["--denoiser", denoiser, "--quiet"]
+    assert run("denoise", source, "-o", tmp_path / "asked.bvh", "--mask", tmp_path / "mask.csv", *words) == 0
+    given, out = (folder, tmp_path / "clean") if many else (lossy, tmp_path / "out.bvh")
+    assert run("denoise", given, "-o", out, *words) == 0
+    made = [mapctl.load(path) for path in (tmp_path / "asked.bvh", out / "lossy.bvh" if many else out)]
+    assert (made[0].joint_positions() - made[1].joint_positions()).abs().max() < 1e-6
