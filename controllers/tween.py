@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from controllers import feasibility
-from controllers.filling import Infilled, InfillSettings, fill
+from controllers.filling import Another, Infilled, InfillSettings, fill
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost, straight
@@ -51,6 +51,7 @@ class Keys:
 def tween(
     motion: Motion, keys: Keys, infiller: Inbetweener | None, *,
     settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
+    another: Another | None = None,
 ) -> Infilled:  # fmt: skip
     """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
 
@@ -76,7 +77,7 @@ def tween(
     rooted = wanted if keys.root_only else whole
     hasty = feasibility.between_keys(motion, canonical.root_position, told=~joints, keys=rooted)
     done = fill(motion, Lost(joints, root), infiller, settings=settings, densities=densities, rig=settled(rigmap),
-                targets=targets)  # fmt: skip
+                targets=targets, another=another)  # fmt: skip
     return replace(done, notes=(*hasty, *done.notes))
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands import beside, options
+from mapctl.commands import beside, options, tween_variations
 from mapctl.commands.frames import parse_frame
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
@@ -39,6 +39,11 @@ class Tween:
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
+    variations: options.Count = 1
+    """How many different motions to make, as OUT_000.bvh, OUT_001.bvh, ...: the first is what one would be, in the
+    others densities (--prior, or auto) are drawn from and steered from key to key."""
+    seed: options.Count = 0
+    """Of everything that is drawn; the first variations are the same however many are asked for."""
     report: options.MaybeFile = None
     """JSON with the keys, what is missed at them, contacts, ledger, measures and timing."""
     video: options.MaybeFile = None
@@ -53,6 +58,9 @@ class Tween:
         rig = options.read_rig(self.rig)
         motion = options.read_motion(self.source, rig)
         keys = self._keys(motion)
+        if self.variations > 1:
+            tween_variations.run(self, motion, keys)
+            return 0
         done = self._made(motion, keys)
         from mapctl import formats
 
@@ -72,7 +80,7 @@ class Tween:
     def _check(self) -> None:
         if self.joints is not None and self.root_only:
             raise RequestError("--joints and --root-only are two kinds of keys; choose one")
-        beside.check(self.out, self.video, self.report)
+        tween_variations.check(self)
 
     def _keys(self, motion: "Motion") -> "Keys":
         from controllers.tween import Keys
