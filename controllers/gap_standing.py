@@ -22,7 +22,7 @@ from mapctl.terms import Clearance, Footing, Seam
 
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 FINISHING = StandingSettings(
-    ease=5.0, footing=Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05), clearance=Clearance(),
+    ease=8.0, footing=Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05), clearance=Clearance(),
     seam=Seam(sigma=50.0, frames=96), budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
 )  # fmt: skip
 """Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the

@@ -72,7 +72,7 @@ def rolled(
     """
     settings, skeleton = settings or RolloutSettings(), proposal.skeleton
     body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
-    density = choosing.likeliest_of_motion(densities, body).density
+    density = likeliest(densities, body)
     lost, state, done, odds = gap.turns.all(dim=1) & gap.root, None, 0, odds.clone()
     for _, start, stop in runs(lost[:, None]):
         if start == 0 or stop == len(lost) or not settings.shortest <= stop - start <= settings.longest:
@@ -89,19 +89,25 @@ def rolled(
 
 
 def extended(
-    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None = None, *,
-    densities: Sequence[Any], settings: RolloutSettings | None = None,
-) -> tuple[Motion, Float[Tensor, "frames 2"]]:  # fmt: skip
-    """The proposal with the likeliest rollout from where it is last known to its end, if nothing is known there but
-    enough before; and the log odds of its contacts. No density runs backwards, so a beginning stays as it was proposed.
+    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], *, densities: Sequence[Any],
+    settings: RolloutSettings | None = None,
+) -> tuple[Motion, Float[Tensor, "frames 2"], str | None]:  # fmt: skip
+    """The proposal with the likeliest rollout from where it is last known to its end, if nothing is known there; the
+    log odds of its contacts; and the name of the density that was rolled, None if the proposal stays as it is.
+
+    It does where the first density (that of locomotion) does not find what comes before as likely as its own data:
+    densities then stop or turn away. None runs backwards, so a beginning stays as well.
     """
     settings, lost = settings or RolloutSettings(), gap.turns.all(dim=1) & gap.root
     start, stop = len(lost) - int(lost.flip(0).long().cumprod(0).sum()), len(lost)
-    if start < _BEFORE or start == stop:
-        return proposal, odds
+    if start == stop or start < _BEFORE or not densities:
+        return proposal, odds, None
     body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
     known = body.slice(0, start)
-    density = choosing.likeliest_of_motion(densities, known).density
+    judge = densities[0].blurred(choosing.spread())
+    if choosing.likeliest_of_motion([judge], known).weight < 1:
+        return proposal, odds, None
+    density = likeliest(densities, known)
     while start < stop:
         features, place = _until(body, odds, start)
         state = density.advance(density.likely_state(features), features[None])
@@ -111,7 +117,16 @@ def extended(
         window = replace(settings.method, proposal=zero_start)(context, terms, still, torch.Generator())
         body, odds = _put_in(body, odds, window, place, start, start + context.frames)
         start += context.frames
-    return replace(body, skeleton=proposal.skeleton, root_position=body.root_position * gap.scale), odds
+    body = replace(body, skeleton=proposal.skeleton, root_position=body.root_position * gap.scale)
+    return body, odds, density.name
+
+
+def likeliest(densities: Sequence[Any], motion: Motion) -> Any:
+    """The density under which a canonical motion, seen with a proposal's errors, is likeliest."""
+    if len(densities) == 1:
+        return densities[0]
+    blurred = [density.blurred(choosing.spread()) for density in densities]
+    return densities[blurred.index(choosing.likeliest_of_motion(blurred, motion).density)]
 
 
 def _until(body: Motion, odds: Tensor, start: int) -> tuple[Float[Tensor, "frames size"], Place]:
@@ -160,7 +175,7 @@ def _put_in(
     share = torch.sin(0.5 * torch.pi * torch.arange(1, count + 1) / (count + 1)).square()[:, None].double()
     root, quats, odds = body.root_position.clone(), body.local_quat_xyzw.clone(), odds.clone()
     root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
-    if stop < len(root):
+    if count < len(made.root_position):
         root[start:stop] += share * (root[stop] - made.root_position[count])
         turn = rotations.multiply(rotations.inverse(made.local_quat_xyzw[count]), quats[stop])
         turned = rotations.from_rotation_vector(share[..., None] * rotations.to_rotation_vector(turn))

@@ -9,9 +9,8 @@ import torch
 
 from controllers.energy import energy_of
 from controllers.filling import Infilled, InfillSettings
-from controllers.steered import RolloutSettings, rolled
+from controllers.steered import RolloutSettings, likeliest, rolled
 from controllers.tween import Keys, tween
-from mapctl import choosing
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics.realism import Diversity, sample_diversity
@@ -68,7 +67,7 @@ def variations(
         raise RequestError(f"a motion of {motion.num_frames} frames leaves nothing to vary")
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
     found = [make()]
-    density = choosing.likeliest_of_motion(rollable, to_canonical(found[0].motion, rig)[0]).density
+    density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
     for seed in _seeds(count - 1, generator):
         if progress is not None:
             progress(len(found), count)

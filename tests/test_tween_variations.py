@@ -1,6 +1,7 @@
 """`mapctl tween --variations K`: several motions through the same keys, all of which meet them."""
 
 import json
+from functools import partial
 
 import pytest
 import torch
@@ -11,10 +12,12 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 import priors
+from controllers import infill
 from controllers.canonical_gap import CanonicalGap
 from controllers.steered import RolloutSettings, rolled
 from controllers.tween import Keys, tween
 from controllers.variations import variations
+from mapctl.capture.masks import Mask
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost
 from mapctl.retarget import to_canonical
@@ -108,6 +111,44 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     torch.testing.assert_close(made.local_quat_xyzw[same], gap.motion.local_quat_xyzw[same])
     assert torch.equal(bits[same], odds[same])
     assert float((made.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
+
+
+@pytest.mark.parametrize("frames", [(30, 45), (5, 45)])
+def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
+    motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
+    fill = partial(infill, motion, tiny_infiller(drawn=0.02), masks)
+    plain, made = fill(), fill(extending=[prior])
+    known = ~made.lost.frames
+    for one in (plain, made):
+        assert torch.equal(one.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
+        assert bool(one.motion.joint_positions().isfinite().all())
+    apart = (made.motion.joint_positions() - plain.motion.joint_positions()).norm(dim=-1).amax(dim=-1)
+    assert float(apart[:2].max()) < 1e-3
+    assert float(apart[frames[0] + 3 :].min()) > 1e-4
+    assert [note.split(",")[0].rpartition("extended ")[2] for note in made.notes] == [
+        "backwards by the infiller", f"by the density {prior.name}",
+    ]  # fmt: skip
+    assert plain.notes[1].split(",")[0].endswith("extended by the infiller")
+    again = fill(extending=[prior])
+    assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
+
+
+def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(prior):
+    class Stern:
+        """Finds everything unlikely."""
+
+        name, usual_nats = "stern", 1e9
+
+        def __getattr__(self, name):
+            return getattr(prior, name)
+
+        def blurred(self, spread):
+            return self
+
+    done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], extending=[Stern()])
+    assert done.notes == (
+        "a gap at the end: the motion is extended by the infiller, with nothing after it to meet",
+    )  # fmt: skip
 
 
 def test_what_leaves_nothing_to_vary_is_refused(prior):
