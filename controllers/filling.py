@@ -3,7 +3,7 @@ kinematics makes them rotations of rigid bones, and the MAP stage puts the feet 
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -32,6 +32,11 @@ from mapctl.rigs import Rig
 from mapctl.solver.result import Ledger
 
 Method = Literal["infiller", "map", "linear"]
+Another = Callable[
+    [CanonicalGap, Motion, Float[Tensor, "frames 2"], Targets | None], tuple[Motion, Float[Tensor, "frames 2"]]
+]
+"""From what an infiller proposes for a gap and the log odds of its contacts to another proposal and its odds; see
+controllers.steered."""
 _MISSED = 0.001  # metres from a wanted place that are worth a word
 _HAIR = 1e-4  # metres from it that are nothing
 _AIMS = 6  # tries at most
@@ -80,12 +85,12 @@ class Infilled:
 def fill(
     motion: Motion, lost: Lost, infiller: Inbetweener | None, *, settings: InfillSettings | None = None,
     densities: Sequence[Any] = (), rig: Rig | None = None, targets: Targets | None = None,
-    course: Curve | None = None,
+    course: Curve | None = None, another: Another | None = None,
 ) -> Infilled:  # fmt: skip
     """What is lost of a motion, filled in; RequestError for a method without its network.
 
     `targets` are places that the rig's hands and feet are wanted at in frames in which they are lost; along `course`
-    the hips go while they are.
+    the hips go while they are; `another` proposal may take the place of the infiller's.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
     if infiller is None and settings.method != "linear":
@@ -101,6 +106,8 @@ def fill(
     gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
     shown = None if targets is None else targets.shown(gap.seconds, fps=float(motion.fps))
     proposal, bits = proposed(gap, infiller, shown, held=course is not None)
+    if another is not None:
+        proposal, bits = another(gap, proposal, bits, shown)
     stands, ledger = contacts.steadied(bits > 0), Ledger()
     if settings.method == "map":
         proposal, ledger = stood(proposal, bits, gap, settings.standing, densities, shown)

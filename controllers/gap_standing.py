@@ -18,16 +18,17 @@ from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.result import Ledger
-from mapctl.terms import Footing, Seam
+from mapctl.terms import Clearance, Footing, Seam
 
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 FINISHING = StandingSettings(
-    ease=5.0, unseen_deg=2.0, unseen_cm=2.0, seam=Seam(sigma=150.0, frames=96),
-    footing=Footing(sigma_speed=0.1, sigma_height=0.1, sigma_below=0.1),
+    ease=8.0, unseen_deg=2.0, unseen_cm=2.0, seam=Seam(sigma=150.0, frames=96), clearance=Clearance(),
+    footing=Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05),
     budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
 )  # fmt: skip
 """Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
-network's, since styles differ in them; jerk costs something; and it may take twice the evaluations."""
+network's, since styles differ in them, but for those of toes that skate; jerk costs something; and it may take twice
+the evaluations."""
 
 
 def stood(

@@ -21,12 +21,13 @@ from mapctl.contacts import steadied
 from mapctl.features import Place, decode, root_places
 from mapctl.gaps.targets import Targets
 from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, minimise
 from mapctl.solver.objective import Objective
 from mapctl.solver.poses import Guide, Poses
 from mapctl.solver.result import Ledger
-from mapctl.terms import Footing, Keyframe, Likelihood, Noise, Seam, Term
+from mapctl.terms import Clearance, Footing, Keyframe, Likelihood, Noise, Seam, Term
 from mapctl.terms.footing import TOES
 
 _DRIFT = 3.0  # frames, sigma, over which the travel of planted toes is averaged
@@ -41,6 +42,10 @@ class StandingSettings:
     not every floor is level."""
     seam: Seam | None = None
     """Jerk, if it is to cost something: of as many frames of each window as the term says."""
+    clearance: Clearance | None = None
+    """Toes that swing, if they are to clear the ground where nothing shows whether they do."""
+    clearing: float = 8.0
+    """Frames next to ones in which a toe's place was seen over which that is asked for more and more."""
     share: float = 0.35
     """Doubt about a proposal that was seen, as a share of the capture's noise."""
     unseen_deg: float = 5.0
@@ -93,6 +98,7 @@ def stand(
     guide = guide_of(proposal, steadied(contacts > 0))
     sigma = _doubt(capture, settings)
     footing = replace(settings.footing, rest_height=rest_height(proposal, guide.contacts))
+    clearing = _eased(_toes_seen(capture), settings.clearing)
     judges = [density.blurred(choosing.spread()) for density in densities]
     place = _before(guide)
     done = _Done(place, torch.zeros(0, proposal.num_joints, 3), torch.zeros(2, dtype=torch.bool), ())
@@ -108,6 +114,8 @@ def stand(
             poses, done, choice = _judged(poses, done, judges)
             terms.append(Likelihood(settings.temperature / choice.weight))
             stretches.append(Stretch(first, first + count, choice.density.name, choice.nats, choice.weight))
+        if settings.clearance is not None:
+            terms.append(replace(settings.clearance, rest_height=footing.rest_height, share=clearing[first:stop]))
         if settings.seam is not None:
             terms.append(settings.seam)
         if targets is not None:
@@ -211,6 +219,17 @@ def _doubt(capture: Capture, settings: StandingSettings) -> Float[Tensor, "frame
     # Feet are put down even in a capture without noise, if only by half a millimetre.
     root = root.clamp_min(5e-4)[:, None]
     return torch.cat([root.expand(-1, 3), hips.expand(-1, 3), angle[:, 1:].repeat_interleave(3, dim=-1)], dim=-1)
+
+
+def _toes_seen(capture: Capture) -> Bool[Tensor, "frames 2"]:
+    """Whether the places of the toes were: the hips', and the rotations of all joints that carry them."""
+    seen = capture.seen_root[0][:, None].repeat(1, len(TOES))
+    for foot, name in enumerate(TOES):
+        joint = CANONICAL.parents[CANONICAL.index(name)]
+        while joint >= 0:
+            seen[:, foot] &= capture.seen[0, :, joint]
+            joint = CANONICAL.parents[joint]
+    return seen
 
 
 def _eased(seen: Bool[Tensor, "frames columns"], ease: float) -> Float[Tensor, "frames columns"]:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from controllers import feasibility
-from controllers.filling import Infilled, InfillSettings, fill
+from controllers.filling import Another, Infilled, InfillSettings, fill
 from controllers.keys import Key, Keys, lost_between, targets_of
 from controllers.keys import key_errors as errors_at
 from mapctl.gaps.lost import Lost, straight
@@ -22,6 +22,7 @@ from mapctl.rigs import Rig
 def tween(
     motion: Motion, keys: Keys, infiller: Inbetweener | None, *,
     settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
+    another: Another | None = None,
 ) -> Infilled:  # fmt: skip
     """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
 
@@ -31,7 +32,8 @@ def tween(
     canonical, rigmap, shown = shown_by(wanted, motion, rig)
     lost, targets = lost_between(wanted, motion, rigmap), targets_of(wanted, shown, rigmap)
     hasty = feasibility.between_keys(shown, canonical, rigmap, lost, targets)
-    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=settled(rigmap), targets=targets)
+    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=settled(rigmap), targets=targets,
+                another=another)  # fmt: skip
     return replace(done, notes=(*hasty, *done.notes))
 
 

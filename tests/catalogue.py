@@ -6,7 +6,20 @@ from helpers import generator, tiny_model, walk
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import encode
-from mapctl.terms import Closeness, Footing, Keyframe, Likelihood, Noise, Observation, Path, Seam, Steps, Term, Travel
+from mapctl.terms import (
+    Clearance,
+    Closeness,
+    Footing,
+    Keyframe,
+    Likelihood,
+    Noise,
+    Observation,
+    Path,
+    Seam,
+    Steps,
+    Term,
+    Travel,
+)
 from priors.lstm_gmm import LstmGmm
 
 FRAMES = 12
@@ -35,6 +48,7 @@ TERMS: dict[str, Term] = {
     "footing": Footing(),
     "steps": Steps(0.6),
     "observation": _OBSERVED,
+    "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
     "seam": Seam(sigma=300.0),
     "closeness": Closeness(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_turn=0.3),
     "keyframe": Keyframe(0.3 + 0.1 * torch.rand(FRAMES, 21, 3, generator=generator(9)).double(), _MASK, 0.1),

@@ -21,7 +21,7 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.objective import Objective
 from mapctl.solver.poses import Guide, Poses
-from mapctl.terms import Footing, Noise
+from mapctl.terms import Clearance, Footing, Noise
 from mapctl.terms.footing import TOES
 
 TOE = [CANONICAL.index(name) for name in TOES]
@@ -237,3 +237,18 @@ def test_the_rest_height_is_that_of_planted_toes():
     planted = motion.joint_positions()[:, TOE, 1] < TOE_REST_HEIGHT + 0.01
     assert rest_height(motion, planted) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
     assert rest_height(motion, torch.zeros_like(planted)) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
+
+
+def test_toes_that_slide_unseen_are_lifted_and_those_that_were_seen_are_not():
+    motion = standing_still(drift=1.5)
+    capture = told(motion, degrees=0.0, centimetres=0.0)
+    seen = torch.ones(60, dtype=torch.bool)
+    seen[15:45] = False
+    capture = replace(capture, seen=seen[None, :, None].expand_as(capture.seen), seen_root=seen[None])
+    heights = [
+        stand(motion, odds(motion, -5.0, -5.0), capture, replace(QUICK, clearance=clearance, ease=5.0)).motion
+        .joint_positions()[:, TOE, 1] for clearance in (None, Clearance())
+    ]  # fmt: skip
+    lifts = heights[1] - heights[0]
+    assert float(lifts[25:35].min()) > 0.01
+    assert float(lifts[seen].abs().max()) < 2e-3

@@ -24,25 +24,28 @@ class Bench:
 
     what: Positional[
         Annotated[
-            Literal["speed", "ablation", "free-run", "generation", "steer", "live", "denoise", "infill", "timing"],
-            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill|timing"),
+            Literal[
+                "speed", "ablation", "free-run", "generation", "steer", "live", "denoise", "infill", "tween", "timing"
+            ],
+            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill|tween|timing"),
         ]
     ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
     `free-run`: 8 random motions of 10,000 frames beside the training data; `generation`: raw, refined and finished
     motion beside mocap that training did not see; `steer`: random commands, which are reached and how soon; `live`: the
     same against the wall clock, for one, two and four characters at once; `denoise`: clips that training did not see,
-    spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out; `timing`:
-    pairs of their poses, and the time between them that `mapctl tween --suggest-timing` would suggest."""
+    spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out; `tween`: such
+    clips of which keys are left, and such clips without their ends; `timing`: pairs of their poses, and the time
+    between them that `mapctl tween --suggest-timing` would suggest."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
     `live`, if not given; for `denoise` as that command takes it."""
     data: options.MaybeFile = None
-    """For `generation`, `denoise`, `infill` and `timing`: the folder that was trained on, for the clips that were held
-    out."""
+    """For `generation`, `denoise`, `infill`, `tween` and `timing`: the folder that was trained on, for the clips
+    that were held out."""
     count: options.Count = 48
     """For `generation`: clips of 10 s to draw; for `steer`: commands to give; for `denoise`,
-    `infill` and `timing`: clips, spread over the kinds."""
+    `infill`, `tween` and `timing`: clips, spread over the kinds."""
     denoiser: options.Name = "denoiser"
     """For `denoise`: the bundled denoiser, or the file or run folder of a trained one."""
     infiller: options.Name = "infiller"
@@ -64,7 +67,7 @@ class Bench:
         compute_on_one()
         from mapctl import report
 
-        others = {"denoise": self._denoise, "infill": self._infill, "timing": self._timing}
+        others = {"denoise": self._denoise, "infill": self._infill, "tween": self._tween, "timing": self._timing}
         rows = others.get(self.what, self._of_a_prior)()
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
@@ -119,6 +122,18 @@ class Bench:
         with bar("filling") as progress:
             rows = table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
         return [*rows, *by_kind(kinds, infiller), *lost_joints(kinds, infiller)]
+
+    def _tween(self) -> list[dict[str, Any]]:
+        import priors
+        from controllers.bench_tween import table
+        from mapctl import retarget
+        from mapctl.features import PRIOR_FPS
+
+        infiller, kinds = priors.load_infiller(self.infiller), {}
+        for clip in self._clips_by_kind(infiller.card):
+            kinds.setdefault(clip.kind, []).append(retarget.to_canonical(clip.motion)[0].resample(PRIOR_FPS))
+        with bar("tweening") as progress:
+            return table(kinds, infiller, priors.load_choice(self.prior or "auto"), progress=progress)
 
     def _timing(self) -> list[dict[str, Any]]:
         import priors

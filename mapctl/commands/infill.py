@@ -42,7 +42,8 @@ class Infill:
     """The file or run folder of a trained infiller; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
-    window, the bundled one under which the motion is likelier."""
+    window, the bundled one under which the motion is likelier. A gap at the end is extended into by it, by `auto` if
+    none is named."""
     report: options.MaybeFile = None
     """JSON with the gaps, contacts, ledger, measures and timing."""
     video: options.MaybeFile = None
@@ -102,9 +103,11 @@ class Infill:
 
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
+        extending = () if self.method == "linear" else priors.load_choice(self.prior or "auto")
         settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
         course = None if self.curve is None else options.read_curve(self.curve, None)
-        return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course)
+        return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course,
+                      extending=extending)  # fmt: skip
 
     def _tell(self, done: "Infilled") -> None:
         summary = done.summary()

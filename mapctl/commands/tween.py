@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands import beside, options
+from mapctl.commands import beside, options, tween_variations
 from mapctl.commands.frames import parse_frame
 from mapctl.commands.tables import print_table
 from mapctl.commands.threads import compute_on_one
@@ -48,6 +48,11 @@ class Tween:
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
+    variations: options.Count = 1
+    """How many different motions to make, as OUT_000.bvh, OUT_001.bvh, ...: the first is what one would be, in the
+    others densities (--prior, or auto) are drawn from and steered from key to key."""
+    seed: options.Count = 0
+    """Of everything that is drawn; the first variations are the same however many are asked for."""
     report: options.MaybeFile = None
     """JSON with the keys, what is missed at them, contacts, ledger, measures and timing."""
     video: options.MaybeFile = None
@@ -60,6 +65,9 @@ class Tween:
         compute_on_one()
         self._check()
         asked = self._asked()
+        if self.variations > 1:
+            tween_variations.run(self, asked)
+            return 0
         intervals = self._timing(asked)
         done = self._made(asked)
         from mapctl import formats
@@ -102,8 +110,10 @@ class Tween:
             raise RequestError(f"{given[0]} is for motion files; {self.source} says itself what its keys are")
         if not self._of_file and self.keyframes is None:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-        beside.check_method(self.method, prior=self.prior, infiller=self.infiller)
-        beside.check(self.out, self.video, self.report, given=(self.source,))
+        tween_variations.check(self)
+        # Variations are rolled by a density whatever the method.
+        prior = self.prior if self.variations == 1 else None
+        beside.check_method(self.method, prior=prior, infiller=self.infiller)
 
     def _asked(self) -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""

@@ -1,6 +1,7 @@
 """The terms of the MAP problem. A new one is a file here, a name below and an instance in tests/catalogue.py."""
 
 from mapctl.terms.base import Term
+from mapctl.terms.clearance import Clearance
 from mapctl.terms.closeness import Closeness
 from mapctl.terms.footing import Footing
 from mapctl.terms.keyframe import Keyframe
@@ -12,10 +13,11 @@ from mapctl.terms.seam import Seam
 from mapctl.terms.steps import Steps
 from mapctl.terms.travel import Travel
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe, Clearance)
 
 __all__ = [
     "ALL",
+    "Clearance",
     "Closeness",
     "Footing",
     "Keyframe",

@@ -1,0 +1,89 @@
+"""Several answers to one question: the same keys met by different motions, each with its energy."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+
+from controllers.energy import energy_of
+from controllers.filling import Infilled, InfillSettings
+from controllers.keys import Keys
+from controllers.steered import RolloutSettings, likeliest, rolled
+from controllers.tween import tween
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.metrics.realism import Diversity, sample_diversity
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.retarget import to_canonical
+from mapctl.rigs import Rig
+from mapctl.solver.result import Ledger
+
+MOST = 1000
+"""Variations at a time."""
+_SHORTEST = 8  # frames at the prior's rate: shorter motions have no energy to speak of
+
+
+@dataclass(frozen=True, eq=False)
+class Variation:
+    """One answer."""
+
+    infilled: Infilled
+    """The motion, and how it became so."""
+    ledger: Ledger
+    """Of the finished motion, by term: likelihood, footing, clearance and jerk."""
+
+    @property
+    def energy(self) -> float:
+        """Nats a frame: less is likelier."""
+        return sum(float(entry.energy.mean()) for entry in self.ledger.entries)
+
+
+@dataclass(frozen=True, eq=False)
+class Variations:
+    """Several answers."""
+
+    each: tuple[Variation, ...]
+    """The first is what is made of the keys if one answer is asked for; the others are drawn."""
+    diversity: Diversity
+    """How different they are on average."""
+
+
+def variations(
+    motion: Motion, keys: Keys, infiller: Inbetweener, count: int, *, rollable: Sequence[Any],
+    generator: torch.Generator, settings: InfillSettings | None = None, rolling: RolloutSettings | None = None,
+    densities: Sequence[Any] = (), rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Variations:  # fmt: skip
+    """So many motions through the same keys. The first answers are the same however many are asked for.
+
+    The first is that of `tween`; in the others densities that are `rollable` are drawn from and steered from key to
+    key. RequestError for fewer than two, for keys that are too near to each other to leave a choice, and as `tween`.
+    """
+    if not 2 <= count <= MOST:
+        raise RequestError(f"variations are 2 to {MOST}, got {count}")
+    settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
+    if motion.num_frames < _SHORTEST * motion.fps / PRIOR_FPS:
+        raise RequestError(f"a motion of {motion.num_frames} frames leaves nothing to vary")
+    make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
+    found = [make()]
+    density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
+    for seed in _seeds(count - 1, generator):
+        if progress is not None:
+            progress(len(found), count)
+        draws = torch.Generator().manual_seed(seed)
+        found.append(make(another=partial(rolled, densities=[density], generator=draws, settings=rolling)))
+    if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
+        raise RequestError(f"no two keys are {_span(rolling)} apart, so that there is nothing to vary between them")
+    each = tuple(Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)) for one in found)
+    return Variations(each, sample_diversity([one.motion for one in found]))
+
+
+def _seeds(count: int, generator: torch.Generator) -> Iterator[int]:
+    """One for each, the first ones the same however many there are."""
+    return (int(torch.randint(2**62, (1,), generator=generator)) for _ in range(count))
+
+
+def _span(rolling: RolloutSettings) -> str:
+    return f"{rolling.shortest / PRIOR_FPS:.2g} to {rolling.longest / PRIOR_FPS:.2g} s"

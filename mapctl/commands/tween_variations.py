@@ -1,0 +1,97 @@
+"""`mapctl tween --variations K`: several motions through the same keys, as OUT_000.bvh, OUT_001.bvh, ..."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapctl.commands import beside, options
+from mapctl.errors import RequestError
+from mapctl.progress import bar
+
+if TYPE_CHECKING:
+    from controllers.keyed import Keyed
+    from controllers.variations import Variations
+    from mapctl.commands.tween import Tween
+
+_MOST = 1000
+
+
+def numbered(path: Path, count: int) -> list[Path]:
+    """walk_000.bvh, walk_001.bvh, ... of walk.bvh."""
+    return [path.with_name(f"{path.stem}_{number:03d}{path.suffix}") for number in range(count)]
+
+
+def check(command: "Tween") -> None:
+    """RequestError for what variations cannot be made of, and files that cannot be written."""
+    options.check_seed(command.seed)
+    if not 1 <= command.variations <= _MOST:
+        raise RequestError(f"--variations must be 1 to {_MOST}, got {command.variations}")
+    if command.variations == 1:
+        if command.seed:
+            raise RequestError(
+                "--seed is of what is drawn, and one answer is not; ask for --variations, or leave it out"
+            )
+        beside.check(command.out, command.video, command.report, given=(command.source,))
+        return
+    if command.method == "slerp":
+        raise RequestError("--method slerp knows one answer only; leave --variations out")
+    if command.suggest_timing:
+        raise RequestError("--suggest-timing tells of one answer; leave --variations out")
+    if command.video is not None:
+        raise RequestError("--video shows one answer; leave it out, and film OUT_000 by `mapctl render`")
+    first, *others = numbered(command.out, command.variations)
+    beside.check(first, None, *others, command.report, given=(command.source,))
+
+
+def run(command: "Tween", asked: "Keyed") -> None:
+    """Make, write, tell; the report names every file with its energy."""
+    from mapctl import formats
+
+    found = _made(command, asked)
+    files = numbered(command.out, command.variations)
+    for one, file in zip(found.each, files, strict=True):
+        formats.save(one.infilled.motion, file)
+    if command.report is not None:
+        from mapctl import report
+
+        report.write(_as_report(command, asked, found, files), command.report)
+    if not command.quiet:
+        for one, file in zip(found.each, files, strict=True):
+            frames = one.infilled.motion.num_frames
+            ms = 1000 * one.infilled.seconds / frames
+            print(f"{file}: {frames} frames through {len(asked.keys.frames)} keys; energy {one.energy:.1f} nats a"
+                  f" frame; {ms:.1f} ms a frame")  # fmt: skip
+        print(f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
+              f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips")  # fmt: skip
+        for note in found.each[0].infilled.notes:
+            print(note)
+
+
+def _made(command: "Tween", asked: "Keyed") -> "Variations":
+    import torch
+
+    import priors
+    from controllers.filling import InfillSettings
+    from controllers.variations import variations
+
+    settings = InfillSettings(method="infiller" if command.method == "infiller" else "map")
+    with bar("variations", quiet=command.quiet) as progress:
+        return variations(
+            asked.motion, asked.keys, priors.load_infiller(command.infiller or "infiller"), command.variations,
+            rollable=priors.load_choice(command.prior or "auto"), densities=priors.load_choice(command.prior),
+            generator=torch.Generator().manual_seed(command.seed), settings=settings,
+            rig=asked.rig, progress=progress,
+        )  # fmt: skip
+
+
+def _as_report(command: "Tween", asked: "Keyed", found: "Variations", files: list[Path]) -> dict[str, Any]:
+    from controllers.tween import key_errors
+
+    rows = []
+    for one, file in zip(found.each, files, strict=True):
+        made = one.infilled
+        told = {"keys": key_errors(made.motion, asked.motion, asked.keys, asked.rig), **made.summary()}
+        rows.append({"file": str(file), "energy_nats": one.energy, "energy": one.ledger.summary(),
+                     **beside.report("tween", command, made.motion, told)})  # fmt: skip
+    shared = ("mapctl", "request", "versions")
+    own = [{key: value for key, value in row.items() if key not in shared} for row in rows]
+    return {**{key: rows[0][key] for key in shared}, "diversity": found.diversity._asdict(), "variations": own}

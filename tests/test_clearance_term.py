@@ -1,0 +1,76 @@
+"""The clearance term: toes that travel are off the ground, those that stand are let alone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import walk
+
+from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.skeleton import CANONICAL
+from mapctl.terms import Clearance
+from mapctl.terms.footing import TOES
+from mapctl.trial import Trial
+
+FRAMES = 20
+INDICES = [CANONICAL.index(name) for name in TOES]
+
+
+@pytest.fixture
+def trial():
+    """A walk, with no toe planted."""
+    motion = walk(FRAMES + 2)
+    vectors, start = encode(motion)
+    ground, heading = root_places(vectors[:2], start)
+    nothing = torch.zeros(1, FRAMES, 1).double()
+    bits = torch.zeros(1, FRAMES, 2, dtype=torch.bool)
+    return Trial(vectors[None, 2:], Place(ground[-1], heading[-1]), nothing, nothing[..., 0], bits,
+                 motion.joint_positions()[:2], contacts_before=bits[0, 0])  # fmt: skip
+
+
+def speeds(trial):
+    return torch.stack([trial.step(toe)[..., ::2].norm(dim=-1) for toe in INDICES], dim=-1)[0] * trial.fps
+
+
+def lifted(trial, metres):
+    """The whole body."""
+    features = trial.features.clone()
+    features[..., LAYOUT.slices["root_height"]] += metres
+    return replace(trial, features=features)
+
+
+def test_what_lacks_is_the_height_asked_of_that_speed_less_the_own(trial):
+    term = Clearance(height=0.3, speed=0.8, sigma=0.05, rest_height=0.02)
+    own = trial.joints_world[0, :, INDICES, 1] - 0.02
+    lacking = (0.3 * (speeds(trial) / 0.8).clamp(max=1) - own).clamp_min(0)
+    assert float((lacking > 0).double().mean()) > 0
+    torch.testing.assert_close(term(trial)[0], 0.5 * (lacking / 0.05).square().sum(-1), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(term.residual(trial)[0], lacking.amax(-1), atol=1e-5, rtol=1e-5)
+
+
+def test_toes_that_are_high_or_stand_cost_nothing(trial):
+    term = Clearance(rest_height=float(trial.joints_world[0, :, INDICES, 1].min()) + 0.05)
+    assert float(term(trial).sum()) > 0
+    assert float(term(lifted(trial, 0.2)).sum()) == 0
+    planted = torch.zeros_like(trial.contacts)
+    planted[:, :, 0] = True
+    left = term(replace(trial, contacts=planted))
+    assert float(left.sum()) < float(term(trial).sum())
+    assert float(term(replace(trial, contacts=torch.ones_like(planted))).sum()) == 0
+
+
+def test_lower_toes_cost_more(trial):
+    term = Clearance(height=0.3)
+    costs = [float(term(lifted(trial, metres)).sum()) for metres in (0.0, -0.02, -0.04)]
+    assert costs == sorted(costs)
+    assert costs[0] < costs[-1]
+
+
+def test_a_share_asks_for_less_and_for_nothing_where_it_is_nothing(trial):
+    term, high = Clearance(height=0.3), lifted(trial, 0.01)
+    share = torch.zeros(FRAMES, 2)
+    share[10:] = 0.5
+    some = replace(term, share=share)
+    assert float(term(high)[0, :10].sum()) > 0
+    assert float(some(high)[0, :10].sum()) == 0
+    torch.testing.assert_close(some(high)[0, 10:], replace(term, height=0.15)(high)[0, 10:])

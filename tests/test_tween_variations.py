@@ -1,0 +1,208 @@
+"""`mapctl tween --variations K`: several motions through the same keys, all of which meet them."""
+
+import json
+from functools import partial
+
+import pytest
+import torch
+from captures import on_rig
+from helpers import generator, run, tiny_density
+from tiny_infiller import save_tiny_infiller, tiny_infiller
+from tiny_prior import save_tiny_prior
+
+import mapctl
+import priors
+from controllers import infill
+from controllers.canonical_gap import CanonicalGap
+from controllers.keys import Keys
+from controllers.steered import RolloutSettings, rolled
+from controllers.tween import tween
+from controllers.variations import variations
+from mapctl.capture.masks import Mask
+from mapctl.errors import RequestError
+from mapctl.gaps.lost import Lost
+from mapctl.retarget import to_canonical
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.solver.methods import LatentMethod
+from mapctl.solver.proposals import Swarm
+from mapctl.solver.swarm import SwarmSettings
+
+FRAMES, KEYS = 45, (0, 20, 23, 44)
+QUICK = RolloutSettings(ahead=4, method=LatentMethod(
+    rounds=1, lbfgs=LbfgsSettings(max_iterations=6), budget=Budget(evaluations=20),
+    proposal=Swarm(SwarmSettings(particles=4, iterations=2))))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def prior_file(tmp_path_factory):
+    return save_tiny_prior(tmp_path_factory.mktemp("prior") / "tiny.safetensors")
+
+
+@pytest.fixture(scope="module")
+def prior(prior_file):
+    return priors.load(str(prior_file))
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    path = tmp_path_factory.mktemp("source") / "in.bvh"
+    on_rig("bandai", FRAMES).save(path)
+    return path
+
+
+@pytest.fixture
+def command(tmp_path_factory, prior_file):
+    infiller = save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.02)
+    return lambda *words: run("tween", *words, "--infiller", infiller, "--prior", prior_file)
+
+
+def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
+    return variations(motion, Keys.of(keys, **told), tiny_infiller(drawn=0.02), count, rollable=[prior],
+                      generator=generator(seed), rolling=QUICK)  # fmt: skip
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("daz", 60)])
+def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior, rig, fps):
+    motion = on_rig(rig, FRAMES * fps // 30, fps=fps)
+    keys = [key * fps // 30 for key in KEYS]
+    found = asked(motion, prior, keys=tuple(keys))
+    places = [one.infilled.motion.joint_positions() for one in found.each]
+    for one in found.each:
+        made = one.infilled.motion
+        assert torch.equal(made.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
+        assert torch.equal(made.root_position[keys], motion.root_position[keys])
+    apart = [float((places[i] - places[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
+    assert min(apart) > 0.005
+    assert found.diversity.world_cm > 0.1
+    assert all(torch.isfinite(torch.tensor(one.energy)) for one in found.each)
+
+
+def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prior):
+    motion = on_rig("canonical", FRAMES)
+    alone = tween(motion, Keys(KEYS), tiny_infiller(drawn=0.02)).motion
+    two, three = (asked(motion, prior, count=count).each for count in (2, 3))
+    assert torch.equal(two[0].infilled.motion.local_quat_xyzw, alone.local_quat_xyzw)
+    for one, other in zip(two, three[:2], strict=True):
+        assert torch.equal(one.infilled.motion.local_quat_xyzw, other.infilled.motion.local_quat_xyzw)
+        assert one.energy == other.energy
+    reseeded = asked(motion, prior, count=2, seed=1).each
+    assert not torch.equal(two[1].infilled.motion.local_quat_xyzw, reseeded[1].infilled.motion.local_quat_xyzw)
+
+
+def test_limbs_are_still_where_they_are_wanted(prior):
+    motion = on_rig("bandai", FRAMES)
+    hand = motion.skeleton.index("Hand_L")
+    for one in asked(motion, prior, limbs=("Hand_L",)).each:
+        away = (one.infilled.motion.joint_positions() - motion.joint_positions())[list(KEYS), hand].norm(dim=-1)
+        assert float(away.max()) < 1e-3
+
+
+def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
+    motion = on_rig("canonical", FRAMES)
+    free = torch.zeros(FRAMES, dtype=torch.bool)
+    free[:5] = free[20:30] = free[40:] = True
+    canonical, rigmap = to_canonical(motion)
+    gap = CanonicalGap.of(canonical, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free), rigmap.joint_of)
+    odds = torch.full((FRAMES, 2), -1.0)
+    made, bits = rolled(gap, gap.motion, odds, densities=[tiny_density()], generator=generator(0), settings=QUICK)
+    same = torch.ones(FRAMES, dtype=torch.bool)
+    same[20:30] = False
+    torch.testing.assert_close(made.root_position[same], gap.motion.root_position[same])
+    torch.testing.assert_close(made.local_quat_xyzw[same], gap.motion.local_quat_xyzw[same])
+    assert torch.equal(bits[same], odds[same])
+    assert float((made.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
+
+
+@pytest.mark.parametrize("frames", [(30, 45), (5, 45)])
+def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
+    motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
+    fill = partial(infill, motion, tiny_infiller(drawn=0.02), masks)
+    plain, made = fill(), fill(extending=[prior])
+    known = ~made.lost.frames
+    for one in (plain, made):
+        assert torch.equal(one.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
+        assert bool(one.motion.joint_positions().isfinite().all())
+    apart = (made.motion.joint_positions() - plain.motion.joint_positions()).norm(dim=-1).amax(dim=-1)
+    assert float(apart[:2].max()) < 1e-3
+    assert float(apart[frames[0] + 3 :].min()) > 1e-4
+    assert [note.split(",")[0].rpartition("extended ")[2] for note in made.notes] == [
+        "backwards by the infiller", f"by the density {prior.name}",
+    ]  # fmt: skip
+    assert plain.notes[1].split(",")[0].endswith("extended by the infiller")
+    again = fill(extending=[prior])
+    assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
+
+
+def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(prior):
+    class Stern:
+        """Finds everything unlikely."""
+
+        name, usual_nats = "stern", 1e9
+
+        def __getattr__(self, name):
+            return getattr(prior, name)
+
+        def blurred(self, spread):
+            return self
+
+    done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], extending=[Stern()])
+    assert done.notes == (
+        "a gap at the end: the motion is extended by the infiller, with nothing after it to meet",
+    )  # fmt: skip
+
+
+def test_what_leaves_nothing_to_vary_is_refused(prior):
+    motion = on_rig("canonical", FRAMES)
+    with pytest.raises(RequestError, match="nothing to vary"):
+        asked(motion, prior, keys=tuple(range(FRAMES)))
+    with pytest.raises(RequestError, match="leaves nothing to vary"):
+        asked(motion.slice(0, 6), prior, keys=(0, 5))
+    for count in (1, 1001):
+        with pytest.raises(RequestError, match=f"variations are 2 to 1000, got {count}"):
+            asked(motion, prior, count=count)
+
+
+def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, source, tmp_path, capsys):
+    found = set()
+    words = ["--keyframes", "0,20,44", "--method", "infiller", "--variations", 2, "--seed", 4]
+    for _ in range(2):
+        assert command(source, "-o", tmp_path / "out.bvh", *words, "--report", tmp_path / "r.json") == 0
+        found.add(tuple((tmp_path / f"out_00{number}.bvh").read_bytes() for number in range(2)))
+    assert len(found) == 1
+    (files,) = found
+    assert files[0] != files[1]
+    assert not (tmp_path / "out.bvh").exists()
+    lines = capsys.readouterr().out.splitlines()[:3]
+    assert lines[0].startswith(f"{tmp_path / 'out_000.bvh'}: 45 frames through 3 keys; energy ")
+    assert lines[1].startswith(f"{tmp_path / 'out_001.bvh'}: ")
+    assert lines[2].startswith("2 variations, on average ")
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert told["request"]["seed"] == 4
+    assert set(told["diversity"]) == {"world_cm", "root_aligned_cm"}
+    assert [row["file"] for row in told["variations"]] == [str(tmp_path / f"out_00{number}.bvh") for number in range(2)]
+    for row in told["variations"]:
+        assert f"{row['energy_nats']:.1f} nats" in " ".join(lines)
+        assert {"likelihood", "footing", "clearance", "seam"} <= set(row["energy"])
+        assert max(key["missed_cm"] for key in row["keys"]) < 1e-3
+        assert "skate_cm_s" in row["measures"]
+        assert mapctl.load(row["file"]).num_frames == FRAMES
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["--variations", 0], "--variations must be 1 to 1000, got 0"),
+    (["--variations", 1001], "--variations must be 1 to 1000, got 1001"),
+    (["--variations", 2, "--seed", -1], "seed"),
+    (["--seed", 1], "--seed is of what is drawn"),
+    (["--variations", 2, "--suggest-timing"], "--suggest-timing tells of one answer"),
+    (["--variations", 2, "--method", "slerp"], "one answer only"),
+    (["--variations", 2, "--video", "v.png"], "one answer"),
+    (["--variations", 2, "--report", "out_001.bvh"], "asked for twice"),
+], ids=str)  # fmt: skip
+def test_what_cannot_be_is_said_and_nothing_is_written(command, source, tmp_path, monkeypatch, capsys, words, said):
+    monkeypatch.chdir(tmp_path)
+    assert command(source, "-o", "out.bvh", "--keyframes", "0,20,44", *words) == 2
+    told = capsys.readouterr()
+    assert (told.out, told.err.count("\n")) == ("", 1)
+    assert said in told.err
+    assert list(tmp_path.iterdir()) == []
