@@ -16,6 +16,7 @@ from mapctl.capture.faults import runs
 from mapctl.gaps import second_differences
 
 _REACH = 0.1  # seconds over which an offset fades away from its edge
+_ONE_IN_FIVE = 0.8
 _CALM_PLACE, _CALM_JOINT = 1.2, 9.0  # m/s^2 and rad/s^2 that are nothing unusual in any motion
 
 
@@ -63,13 +64,19 @@ def _turning_bends(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "be
 def _usual(
     bends: Float[Tensor, "bends joints width"], put: Bool[Tensor, "frames joints"], calm: float
 ) -> Float[Tensor, " joints"]:
-    """By joint, the bend that one in five exceeds where nothing was put in; a calm one where nothing shows how motion
-    bends there, as at single keys.
+    """By joint, the bend that one in five exceeds where nothing was put in. Where nothing shows how motion bends there,
+    as at single keys, the one within what was put in, and a calm one at most.
     """
     sizes = bends.norm(dim=-1)
-    own = ~(put[:-2] | put[1:-1] | put[2:])
-    whole = [sizes[own[:, joint], joint] for joint in range(sizes.shape[1])]
-    return torch.stack([part.quantile(0.8) if len(part) else sizes.new_tensor(calm) for part in whole])
+    own, inside = ~(put[:-2] | put[1:-1] | put[2:]), put[:-2] & put[1:-1] & put[2:]
+    usual = []
+    for joint in range(sizes.shape[1]):
+        known, within = sizes[own[:, joint], joint], sizes[inside[:, joint], joint]
+        if len(known):
+            usual.append(known.quantile(_ONE_IN_FIVE))
+        else:
+            usual.append(within.quantile(_ONE_IN_FIVE).clamp(max=calm) if len(within) else sizes.new_tensor(calm))
+    return torch.stack(usual)
 
 
 def _beyond(
