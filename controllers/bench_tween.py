@@ -11,6 +11,7 @@ from controllers.infill import infill
 from controllers.keys import Keys
 from controllers.steered import likeliest, rolled
 from controllers.tween import tween
+from controllers.variations import best_of
 from mapctl import metrics
 from mapctl.capture.masks import ALL, Mask
 from mapctl.features import PRIOR_FPS
@@ -22,6 +23,7 @@ FRAMES = 6 * PRIOR_FPS
 """Of a clip that are looked at."""
 _BETWEEN = 5  # keys, beside the first and the last
 _ENDS = (30, 60)  # frames
+_BEST_OF = 4  # answers
 Row = dict[str, Any]
 
 
@@ -29,21 +31,23 @@ def table(
     kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener, densities: Sequence[Any], *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:  # fmt: skip
-    """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens by the infiller and of a
-    rolled variation, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
+    """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens by the infiller, of a
+    rolled variation and of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
     """
     rows, draws = [], torch.Generator().manual_seed(0)
     for number, (kind, clips) in enumerate(kinds.items()):
         shown = [clip.slice(0, FRAMES) for clip in clips if clip.num_frames >= FRAMES]
-        told: dict[str, list[Row]] = {"infiller": [], "rolled": []}
+        told: dict[str, list[Row]] = {"infiller": [], "rolled": [], f"best of {_BEST_OF}": []}
         for clip in shown:
             inner = (1 + torch.randperm(FRAMES - 2, generator=draws)[:_BETWEEN]).tolist()
             keys = Keys((0, *inner, FRAMES - 1))
             density = likeliest(densities, to_canonical(clip)[0])
             roll = partial(rolled, densities=[density], generator=draws)
-            for method, another in (("infiller", None), ("rolled", roll)):
+            best = partial(best_of, count=_BEST_OF, rollable=densities, generator=draws)
+            ways = (tween, partial(tween, another=roll), best)
+            for method, way in zip(told, ways, strict=True):
                 began = time.perf_counter()
-                made = tween(clip, keys, infiller, another=another).motion
+                made = way(clip, keys, infiller).motion
                 told[method].append(_of_keys(made, clip, keys.frames, time.perf_counter() - began))
         rows += [{"kind": kind, "what": "keys", "by": method, "clips": len(each), **_mean(each)}
                  for method, each in told.items() if each]  # fmt: skip

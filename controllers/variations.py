@@ -1,12 +1,15 @@
 """Several answers to one question: the same keys met by different motions, each with its energy."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from controllers.canonical_gap import CanonicalGap
 from controllers.energy import energy_of
 from controllers.filling import Infilled, InfillSettings
 from controllers.keys import Keys
@@ -14,6 +17,7 @@ from controllers.steered import RolloutSettings, likeliest, rolled
 from controllers.tween import tween
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.gaps.targets import Targets
 from mapctl.metrics.realism import Diversity, sample_diversity
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -64,20 +68,67 @@ def variations(
     if not 2 <= count <= MOST:
         raise RequestError(f"variations are 2 to {MOST}, got {count}")
     settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
-    if motion.num_frames < _SHORTEST * motion.fps / PRIOR_FPS:
-        raise RequestError(f"a motion of {motion.num_frames} frames leaves nothing to vary")
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [make()]
+    found = [_first(motion, make)]
     density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
-    for seed in _seeds(count - 1, generator):
-        if progress is not None:
-            progress(len(found), count)
-        draws = torch.Generator().manual_seed(seed)
-        found.append(make(another=partial(rolled, densities=[density], generator=draws, settings=rolling)))
+    found += _rollouts(make, count - 1, density, generator, rolling, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
         raise RequestError(f"no two keys are {_span(rolling)} apart, so that there is nothing to vary between them")
     each = tuple(Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)) for one in found)
     return Variations(each, sample_diversity([one.motion for one in found]))
+
+
+def best_of(
+    motion: Motion, keys: Keys, infiller: Inbetweener, count: int, *, rollable: Sequence[Any],
+    generator: torch.Generator, settings: InfillSettings | None = None, rolling: RolloutSettings | None = None,
+    densities: Sequence[Any] = (), rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Infilled:  # fmt: skip
+    """The one with the least energy of so many finished answers: from the infiller's proposal, from slerp's, and from
+    rollouts; its notes tell all energies. RequestError for fewer than two, and as `tween`.
+    """
+    if not 2 <= count <= MOST:
+        raise RequestError(f"the best is of 2 to {MOST}, got {count}")
+    settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
+    make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
+    found = [_first(motion, make), make(another=_straight)]
+    density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
+    found += _rollouts(make, count - 2, density, generator, rolling, progress)
+    nats = [Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)).energy
+            for one in found]  # fmt: skip
+    names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
+    best, told = min(range(count), key=nats.__getitem__), ", ".join(f"{name} {one:.1f}" for name, one in
+                                                                    zip(names, nats, strict=True))  # fmt: skip
+    note = f"the best of {count} is from the {names[best]}; nats a frame: {told}"
+    seconds = sum(one.seconds for one in found)
+    return replace(found[best], seconds=seconds, notes=(*found[best].notes, note))
+
+
+def _first(motion: Motion, make: Callable[..., Infilled]) -> Infilled:
+    """The infiller's answer; RequestError for motions too short for an energy."""
+    if motion.num_frames < _SHORTEST * motion.fps / PRIOR_FPS:
+        raise RequestError(f"a motion of {motion.num_frames} frames leaves nothing to vary")
+    return make()
+
+
+def _rollouts(
+    make: Callable[..., Infilled], count: int, density: Any, generator: torch.Generator, rolling: RolloutSettings,
+    progress: Callable[[int, int], None] | None,
+) -> list[Infilled]:  # fmt: skip
+    """Answers of a density, each of a seed of its own."""
+    found = []
+    for number, seed in enumerate(_seeds(count, generator)):
+        if progress is not None:
+            progress(number, count)
+        draws = torch.Generator().manual_seed(seed)
+        found.append(make(another=partial(rolled, densities=[density], generator=draws, settings=rolling)))
+    return found
+
+
+def _straight(
+    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None
+) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+    """Slerp's proposal, with the infiller's contacts."""
+    return gap.motion, odds
 
 
 def _seeds(count: int, generator: torch.Generator) -> Iterator[int]:

@@ -1,6 +1,7 @@
-"""`mapctl tween --variations K`: several motions through the same keys, all of which meet them."""
+"""`mapctl tween --variations K` and `--best-of K`: several motions through the same keys, all of which meet them."""
 
 import json
+import re
 from functools import partial
 
 import pytest
@@ -17,7 +18,7 @@ from controllers.canonical_gap import CanonicalGap
 from controllers.keys import Keys
 from controllers.steered import RolloutSettings, rolled
 from controllers.tween import tween
-from controllers.variations import variations
+from controllers.variations import best_of, variations
 from mapctl.capture.masks import Mask
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost
@@ -163,6 +164,43 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
             asked(motion, prior, count=count)
 
 
+@pytest.mark.parametrize("keys", [KEYS, (0, 44)])
+def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
+    motion = on_rig("canonical", FRAMES)
+    made = best_of(motion, Keys(keys), tiny_infiller(drawn=0.02), 4, rollable=[prior], generator=generator(0),
+                   rolling=QUICK)  # fmt: skip
+    assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
+    told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
+    assert list(told) == ["infiller", "slerp", "rollout 1", "rollout 2"]
+    winner = min(told, key=lambda name: float(told[name]))
+    assert made.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
+    # Its own energy, found anew, is that told; the answers that variations have as well have the same.
+    others = asked(motion, prior, keys=keys).each
+    for name, one in zip(("infiller", "rollout 1", "rollout 2"), others, strict=True):
+        assert float(told[name]) == pytest.approx(one.energy, abs=0.06)
+        if name == winner:
+            assert torch.equal(made.motion.local_quat_xyzw, one.infilled.motion.local_quat_xyzw)
+
+
+def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
+    motion, take = on_rig("canonical", FRAMES), partial(best_of, rollable=[prior], generator=generator(0))
+    with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):
+        take(motion, Keys(KEYS), tiny_infiller(), 1)
+    with pytest.raises(RequestError, match="leaves nothing to vary"):
+        take(motion.slice(0, 6), Keys((0, 5)), tiny_infiller(), 2)
+
+
+def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys):
+    found = set()
+    for _ in range(2):
+        words = ["-o", tmp_path / "out.bvh", "--keyframes", "0,20,44", "--best-of", 2, "--report", tmp_path / "r.json"]
+        assert command(source, *words) == 0
+        found.add((tmp_path / "out.bvh").read_bytes())
+    assert len(found) == 1
+    assert "the best of 2 is from the " in capsys.readouterr().out
+    assert "the best of 2 is from the " in " ".join(json.loads((tmp_path / "r.json").read_text())["notes"])
+
+
 def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, source, tmp_path, capsys):
     found = set()
     words = ["--keyframes", "0,20,44", "--method", "infiller", "--variations", 2, "--seed", 4]
@@ -194,6 +232,10 @@ def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, 
     (["--variations", 1001], "--variations must be 1 to 1000, got 1001"),
     (["--variations", 2, "--seed", -1], "seed"),
     (["--seed", 1], "--seed is of what is drawn"),
+    (["--seed", 1, "--best-of", 2], "--seed is of what is drawn"),
+    (["--best-of", 0], "--best-of must be 1 to 1000, got 0"),
+    (["--best-of", 3, "--variations", 2], "choose one"),
+    (["--best-of", 3, "--method", "slerp"], "one answer only"),
     (["--variations", 2, "--suggest-timing"], "--suggest-timing tells of one answer"),
     (["--variations", 2, "--method", "slerp"], "one answer only"),
     (["--variations", 2, "--video", "v.png"], "one answer"),

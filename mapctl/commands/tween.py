@@ -51,6 +51,9 @@ class Tween:
     variations: options.Count = 1
     """How many different motions to make, as OUT_000.bvh, OUT_001.bvh, ...: the first is what one would be, in the
     others densities (--prior, or auto) are drawn from and steered from key to key."""
+    best_of: options.Count = 1
+    """Of so many answers the one with the least energy is kept: from the infiller's proposal, slerp's, and rollouts of
+    densities (--prior, or auto) that are steered from key to key."""
     seed: options.Count = 0
     """Of everything that is drawn; the first variations are the same however many are asked for."""
     report: options.MaybeFile = None
@@ -112,7 +115,7 @@ class Tween:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
         tween_variations.check(self)
         # Variations are rolled by a density whatever the method.
-        prior = self.prior if self.variations == 1 else None
+        prior = self.prior if self.variations == self.best_of == 1 else None
         beside.check_method(self.method, prior=prior, infiller=self.infiller)
 
     def _asked(self) -> "Keyed":
@@ -152,6 +155,8 @@ class Tween:
         infiller = None if method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
         settings = InfillSettings(method=method)
+        if self.best_of > 1 and infiller is not None:
+            return tween_variations.best(self, asked, infiller, settings)
         return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig)
 
     def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:

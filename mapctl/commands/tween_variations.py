@@ -1,4 +1,6 @@
-"""`mapctl tween --variations K`: several motions through the same keys, as OUT_000.bvh, OUT_001.bvh, ..."""
+"""`mapctl tween --variations K`: several motions through the same keys, as OUT_000.bvh, OUT_001.bvh, ...; and
+`--best-of K`: one of several.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,11 +10,13 @@ from mapctl.errors import RequestError
 from mapctl.progress import bar
 
 if TYPE_CHECKING:
+    from controllers.filling import Infilled, InfillSettings
     from controllers.keyed import Keyed
     from controllers.variations import Variations
     from mapctl.commands.tween import Tween
 
 _MOST = 1000
+_FIRST_DRAWN = 3  # answers before it are the infiller's and slerp's
 
 
 def numbered(path: Path, count: int) -> list[Path]:
@@ -21,25 +25,35 @@ def numbered(path: Path, count: int) -> list[Path]:
 
 
 def check(command: "Tween") -> None:
-    """RequestError for what variations cannot be made of, and files that cannot be written."""
+    """RequestError for what several answers cannot be made of, and files that cannot be written."""
     options.check_seed(command.seed)
-    if not 1 <= command.variations <= _MOST:
-        raise RequestError(f"--variations must be 1 to {_MOST}, got {command.variations}")
+    for name, count in (("--variations", command.variations), ("--best-of", command.best_of)):
+        if not 1 <= count <= _MOST:
+            raise RequestError(f"{name} must be 1 to {_MOST}, got {count}")
+        if count > 1 and command.method == "slerp":
+            raise RequestError(f"--method slerp knows one answer only; leave {name} out")
+    if command.variations > 1 and command.best_of > 1:
+        raise RequestError("--variations keeps all answers and --best-of one; choose one")
     if command.variations == 1:
-        if command.seed:
-            raise RequestError(
-                "--seed is of what is drawn, and one answer is not; ask for --variations, or leave it out"
-            )
+        if command.seed and command.best_of < _FIRST_DRAWN:
+            raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --best-of 3")
         beside.check(command.out, command.video, command.report, given=(command.source,))
         return
-    if command.method == "slerp":
-        raise RequestError("--method slerp knows one answer only; leave --variations out")
     if command.suggest_timing:
         raise RequestError("--suggest-timing tells of one answer; leave --variations out")
     if command.video is not None:
         raise RequestError("--video shows one answer; leave it out, and film OUT_000 by `mapctl render`")
     first, *others = numbered(command.out, command.variations)
     beside.check(first, None, *others, command.report, given=(command.source,))
+
+
+def best(command: "Tween", asked: "Keyed", infiller: Any, settings: "InfillSettings") -> "Infilled":
+    """The likeliest of several answers."""
+    from controllers.variations import best_of
+
+    with bar("answers", quiet=command.quiet) as progress:
+        return best_of(asked.motion, asked.keys, infiller, command.best_of, settings=settings,
+                       **_drawn(command, asked), progress=progress)  # fmt: skip
 
 
 def run(command: "Tween", asked: "Keyed") -> None:
@@ -67,20 +81,25 @@ def run(command: "Tween", asked: "Keyed") -> None:
 
 
 def _made(command: "Tween", asked: "Keyed") -> "Variations":
-    import torch
-
     import priors
     from controllers.filling import InfillSettings
     from controllers.variations import variations
 
     settings = InfillSettings(method="infiller" if command.method == "infiller" else "map")
+    infiller = priors.load_infiller(command.infiller or "infiller")
     with bar("variations", quiet=command.quiet) as progress:
-        return variations(
-            asked.motion, asked.keys, priors.load_infiller(command.infiller or "infiller"), command.variations,
-            rollable=priors.load_choice(command.prior or "auto"), densities=priors.load_choice(command.prior),
-            generator=torch.Generator().manual_seed(command.seed), settings=settings,
-            rig=asked.rig, progress=progress,
-        )  # fmt: skip
+        return variations(asked.motion, asked.keys, infiller, command.variations, settings=settings,
+                          **_drawn(command, asked), progress=progress)  # fmt: skip
+
+
+def _drawn(command: "Tween", asked: "Keyed") -> dict[str, Any]:
+    """What rollouts are made by, and the rig."""
+    import torch
+
+    import priors
+
+    return {"rollable": priors.load_choice(command.prior or "auto"), "densities": priors.load_choice(command.prior),
+            "generator": torch.Generator().manual_seed(command.seed), "rig": asked.rig}  # fmt: skip
 
 
 def _as_report(command: "Tween", asked: "Keyed", found: "Variations", files: list[Path]) -> dict[str, Any]:
