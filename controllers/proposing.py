@@ -13,7 +13,7 @@ from mapctl import contacts, gaussian, inverse_kinematics
 from mapctl.features import PRIOR_FPS
 from mapctl.gaps import PositionImage
 from mapctl.gaps.closing import closed_places, closed_rotations
-from mapctl.gaps.targets import Targets
+from mapctl.gaps.targets import LIMBS, Targets
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -21,6 +21,12 @@ from mapctl.skeleton import CANONICAL
 from mapctl.terms.footing import TOES
 
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
+_LIMBS = tuple(
+    inverse_kinematics.Limb(CANONICAL.index(upper), CANONICAL.index(lower), CANONICAL.index(end),
+                            (0.0, 0.0, 1.0 if "Leg" in upper else -1.0))
+    for end, (upper, lower) in LIMBS.items()
+)  # fmt: skip
+"""Knees go forward and elbows back."""
 _TREMBLE, _MOMENT = 0.8, 10  # frames at the prior's rate
 _FIDGET = 0.005  # metres
 _SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
@@ -50,13 +56,19 @@ def proposed(
     if held:
         wanted = wanted - _slow_way_off(wanted[:, 0] - body.root_position, gap.root)[:, None]
     root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
-    quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root)
+    quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root,
+                                     limbs=_shown_limbs(gap.turns))  # fmt: skip
     quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
     quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
     root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
     made = replace(shown, root_position=root, local_quat_xyzw=quats)
     bits = torch.where(_toe_speeds(made) < _SWINGS * gap.scale, answer.contacts[0], -_SURE)
     return made, torch.where(image.known[0][:, list(_TOES)], _SURE * (2 * stands - 1), bits)
+
+
+def _shown_limbs(lost: Bool[Tensor, "frames joints"]) -> tuple[inverse_kinematics.Limb, ...]:
+    """Those that are known in some frame: how others bend nothing tells but the proposal."""
+    return tuple(limb for limb in _LIMBS if not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all()))
 
 
 def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:

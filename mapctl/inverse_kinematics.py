@@ -6,6 +6,7 @@ the motion that one starts from, but for the plane in which an elbow or a knee b
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +18,23 @@ from mapctl.skeleton import Skeleton
 
 _BENT = 0.15  # sine of a limb's bend from which its plane is believed rather than not
 _TINY = 1e-9
+_STRAIGHT = 1e-4  # metres that a limb is kept from being straight
+_SIDE = 0.003  # metres that an elbow or a knee is off the line before it shows where the limb bends to
+_TRUST = 8  # power of a bone's share of its length: nine tenths of it are half a reason to believe it
+
+
+@dataclass(frozen=True)
+class Limb:
+    """Two bones and what is at their end: an arm or a leg."""
+
+    upper: int
+    """Joint at which it begins."""
+    lower: int
+    """Elbow or knee, the only child of `upper`."""
+    end: int
+    """Hand or foot, the only child of `lower`."""
+    bends: tuple[float, float, float]
+    """Which way the elbow or the knee of a straight limb would go, seen from `upper`."""
 
 
 def solve(
@@ -26,18 +44,20 @@ def solve(
     *,
     free: Bool[Tensor, "frames joints"] | None = None,
     root_position: Float[Tensor, "frames 3"] | None = None,
+    limbs: Sequence[Limb] = (),
 ) -> Float[Tensor, "frames joints 4"]:
     """Local rotations (xyzw) with which the joints come nearest to the given places, metres.
 
     `start_quat_xyzw` are local rotations; those that are not `free` stay as they are. `root_position` is the first
-    joint's, if it is not its place. A limb that cannot reach points at its place. RequestError for other shapes.
+    joint's, if it is not its place. A limb that cannot reach points at its place. Of `limbs` the ends count, and
+    elbows and knees as far as their bones have their lengths (see `_between`). RequestError for other shapes.
     """
     frames, joints = places_world.shape[:2]
     if start_quat_xyzw.shape[:2] != (frames, joints) or joints != skeleton.num_joints:
         raise RequestError(f"places {tuple(places_world.shape)} and rotations {tuple(start_quat_xyzw.shape)} must be "
                            f"of the same frames and of {skeleton.num_joints} joints")  # fmt: skip
     offsets = skeleton.offsets.to(places_world)
-    start = start_quat_xyzw.to(places_world)
+    start, bending = start_quat_xyzw.to(places_world), {limb.upper: limb for limb in limbs}
     at, world, local = [places_world[:, 0] if root_position is None else root_position], [], []
     for joint, parent in enumerate(skeleton.parents):
         above = None if parent < 0 else world[parent]
@@ -45,6 +65,10 @@ def solve(
             at.append(at[parent] + rotations.rotate(above, offsets[joint].expand(frames, 3)))
         turn = start[:, joint] if above is None else rotations.multiply(above, start[:, joint])
         children = skeleton.children(joint)
+        if joint in bending:
+            lower = bending[joint].lower
+            between = _between(bending[joint], turn, start[:, lower], at[joint], places_world, offsets)
+            places_world = places_world.index_copy(1, torch.tensor([lower]), between[:, None])
         if children:
             aims = [places_world[:, child] - at[joint] for child in children]
             found = _turned(turn, [offsets[child] for child in children], aims)
@@ -54,6 +78,37 @@ def solve(
         world.append(turn)
         local.append(turn if above is None else rotations.multiply(rotations.inverse(above), turn))
     return rotations.sign_continuous(torch.stack(local, dim=1))
+
+
+def _between(
+    limb: Limb, turn: Float[Tensor, "frames 4"], bent: Float[Tensor, "frames 4"], at: Float[Tensor, "frames 3"],
+    places: Float[Tensor, "frames joints 3"], offsets: Float[Tensor, "joints 3"],
+) -> Float[Tensor, "frames 3"]:  # fmt: skip
+    """Where the elbow or the knee is if the end is at its place, as far as the bones reach.
+
+    A proposal that is the mean of several poses has short bones, and a forearm that is short points anywhere, also
+    where no arm bends to. So its place counts only as far as its bones have their lengths; what lacks is the way the
+    limb bends as it is (`turn` of its first joint in the world, `bent` of the second in the first), turned towards the
+    end.
+    """
+    upper, lower = offsets[limb.lower], offsets[limb.end]
+    long, short = upper.norm(), lower.norm()
+    way = places[:, limb.end] - at
+    far = way.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+    axis = way / far
+    reach = far.clamp((long - short).abs() + _STRAIGHT, long + short - _STRAIGHT)
+    knee = rotations.rotate(turn, upper.expand(len(turn), 3))
+    foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(len(turn), 3))
+    towards = _shortest(foot, way)
+    usual = rotations.rotate(rotations.multiply(towards, turn), offsets.new_tensor(limb.bends).expand(len(turn), 3))
+    proposed = torch.stack([places[:, limb.lower] - places[:, limb.upper],
+                            places[:, limb.end] - places[:, limb.lower]], dim=1)  # fmt: skip
+    whole = (proposed.norm(dim=-1) / torch.stack([long, short])).amin(dim=1, keepdim=True).clamp(max=1)
+    trust = whole**_TRUST
+    side = trust * (places[:, limb.lower] - at) + (1 - trust) * rotations.rotate(towards, knee) + _SIDE * usual
+    side = torch.nn.functional.normalize(side - (side * axis).sum(-1, keepdim=True) * axis, dim=-1)
+    along = (long.square() - short.square() + reach.square()) / (2 * reach)
+    return at + along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side
 
 
 def _turned(
