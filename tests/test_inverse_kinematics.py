@@ -49,6 +49,62 @@ def test_twist_and_swing_of_a_walk_come_back_as_places(rig):
     assert torch.allclose(lengths(made), lengths(still), atol=1e-12)
 
 
+ARM = inverse_kinematics.Limb(
+    *(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1)
+)
+LEG = inverse_kinematics.Limb(
+    *(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1)
+)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000))
+def test_limbs_whose_bones_have_their_lengths_come_back_as_all_do(seed):
+    wanted = random_motion(CANONICAL, 4, seed=seed)
+    start = random_motion(CANONICAL, 4, seed=seed + 1)
+    made = solved(wanted.joint_positions(), start.local_quat_xyzw, limbs=(ARM, LEG))
+    away = (made.joint_positions() - wanted.joint_positions()).norm(dim=-1)
+    ends = [ARM.end, LEG.end]
+    # An elbow close to the line has no side to speak of: a hair of anatomy then tells, and moves it by as much.
+    assert away[:, ends].max() < 1e-3
+    assert away.max() < 0.02
+
+
+@pytest.mark.parametrize("limb", [ARM, LEG], ids=["arm", "leg"])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.7])
+def test_a_limb_of_short_bones_that_point_the_wrong_way_bends_as_it_did(limb, share):
+    """As the mean of several swings: the end's place is met all the same."""
+    motion = walk(40)
+    if limb is ARM:  # which hangs straight down there
+        quats = motion.local_quat_xyzw.clone()
+        quats[:, limb.lower] = quat_xyzw(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)).expand(40, 4)
+        motion = replace(motion, local_quat_xyzw=quats)
+    places = motion.joint_positions()
+    shoulder, elbow, hand = places[:, limb.upper], places[:, limb.lower], places[:, limb.end]
+    bend = elbow - shoulder - _along(elbow - shoulder, hand - shoulder)
+    wrong = places.clone()
+    # The elbow on the other side of the line from the shoulder to the hand, and nearer to it.
+    wrong[:, limb.lower] = elbow - (1 + share) * bend
+    close = shoulder + 0.8 * (hand - shoulder)
+    wrong[:, limb.end] = close
+    wrong[:, limb.lower] = close + share * (wrong[:, limb.lower] - close)
+    made = solved(wrong, motion.local_quat_xyzw, limbs=(limb,)).joint_positions()
+    assert (made[:, limb.end] - close).norm(dim=-1).max() < 1e-9
+    now = made[:, limb.lower] - shoulder
+    now = now - _along(now, close - shoulder)
+    bent = bend.norm(dim=-1) > 0.02
+    assert bent.any()
+    assert torch.cosine_similarity(now, bend, dim=-1)[bent].min() > 0.5
+    without = solved(wrong, motion.local_quat_xyzw).joint_positions()
+    assert (without[:, limb.end] - close).norm(dim=-1).max() > 0.01
+
+
+def _along(vector, axis):
+    """The part of a vector along an axis."""
+    axis = torch.nn.functional.normalize(axis, dim=-1)
+    return (vector * axis).sum(-1, keepdim=True) * axis
+
+
 def test_from_the_answer_nothing_changes():
     motion = walk(20)
     made = solved(motion.joint_positions(), motion.local_quat_xyzw)
