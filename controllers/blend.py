@@ -57,12 +57,12 @@ def blend(
     places = torch.zeros_like(own.joint_positions())
     wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
     for end in ends:
-        chain = [CANONICAL.index(name) for name in LIMBS[CANONICAL.names[end]]]
-        for joint in (*chain, end):
+        limb = LIMBS[CANONICAL.names[end]]
+        for joint in (limb.upper, limb.lower, limb.end):
             rigged = rigmap.joint_of[joint]
             if rigged is not None:
                 joints[free, rigged] = True
-        places[there, end] = _carried_over(own, other, chain[0], end, borrowed)
+        places[there, end] = _carried_over(own, other, limb.upper, end, borrowed)
         wanted[there, end] = True
     lost = Lost(joints, torch.zeros(motion.num_frames, dtype=torch.bool))
     done = fill(

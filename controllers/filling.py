@@ -78,7 +78,8 @@ class Infilled:
         return {
             "frames": self.motion.num_frames, "fps": float(self.motion.fps), "gaps": gaps,
             "ledger": self.ledger.summary(), "seconds": self.seconds,
-            "frame_ms": 1000 * self.seconds / max(1, filled), "notes": list(self.notes),
+            "frame_ms": 1000 * self.seconds / max(1, filled),
+            "contacts": [[bool(bit) for bit in row] for row in self.contacts.tolist()], "notes": list(self.notes),
         }  # fmt: skip
 
 
@@ -116,6 +117,18 @@ def fill(
     done = _closed(put_back(filled, base, lost), lost, motion)
     done, notes = _on_target(done, targets, lost, motion, rig)
     return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes)
+
+
+def end_notes(lost: Lost, first: str, by: str) -> tuple[str, ...]:
+    """On gaps that have one edge only: who extends the motion into the first, and into the last."""
+    notes = []
+    if bool(lost.root[0]):
+        notes.append(
+            f"a gap at the beginning: the motion is extended backwards by the {first}, with nothing before it to meet"
+        )
+    if bool(lost.root[-1]):
+        notes.append(f"a gap at the end: the motion is extended by the {by}, with nothing after it to meet")
+    return tuple(notes)
 
 
 def _at_rate_of(canonical: Motion, proposal: Motion, seconds: Float[Tensor, " shown"]) -> Motion:

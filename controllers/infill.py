@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.canonical_gap import CanonicalGap
-from controllers.filling import Infilled, InfillSettings, Method, fill
+from controllers.filling import Infilled, InfillSettings, Method, end_notes, fill
 from controllers.steered import extended
 from mapctl.capture.masks import Mask, hidden
 from mapctl.curve import Curve
@@ -51,16 +51,4 @@ def infill(
 
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course,
                 another=another)  # fmt: skip
-    return replace(done, notes=_notes(lost, first, by[0]))
-
-
-def _notes(lost: Lost, first: str, by: str) -> tuple[str, ...]:
-    """Gaps that have one edge only."""
-    notes = []
-    if bool(lost.root[0]):
-        notes.append(
-            f"a gap at the beginning: the motion is extended backwards by the {first}, with nothing before it to meet"
-        )
-    if bool(lost.root[-1]):
-        notes.append(f"a gap at the end: the motion is extended by the {by}, with nothing after it to meet")
-    return tuple(notes)
+    return replace(done, notes=end_notes(lost, first, by[0]))

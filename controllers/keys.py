@@ -127,7 +127,7 @@ def targets_of(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> Targets |
     return Targets(places, wanted)
 
 
-def key_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
+def missed_by(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
     """By key, how far what it tells is missed by the joint that misses it by most: places in cm, and rotations in
     degrees where it tells any.
     """

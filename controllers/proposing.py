@@ -21,12 +21,6 @@ from mapctl.skeleton import CANONICAL
 from mapctl.terms.footing import TOES
 
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
-_LIMBS = tuple(
-    inverse_kinematics.Limb(CANONICAL.index(upper), CANONICAL.index(lower), CANONICAL.index(end),
-                            (0.0, 0.0, 1.0 if "Leg" in upper else -1.0))
-    for end, (upper, lower) in LIMBS.items()
-)  # fmt: skip
-"""Knees go forward and elbows back."""
 _TREMBLE, _MOMENT = 0.8, 10  # frames at the prior's rate
 _FIDGET = 0.005  # metres
 _SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
@@ -57,7 +51,7 @@ def proposed(
         wanted = wanted - _slow_way_off(wanted[:, 0] - body.root_position, gap.root)[:, None]
     root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
     quats = inverse_kinematics.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root,
-                                     limbs=_shown_limbs(gap.turns))  # fmt: skip
+                                     limbs=_limbs(gap.turns))  # fmt: skip
     quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
     quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
     root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
@@ -66,9 +60,10 @@ def proposed(
     return made, torch.where(image.known[0][:, list(_TOES)], _SURE * (2 * stands - 1), bits)
 
 
-def _shown_limbs(lost: Bool[Tensor, "frames joints"]) -> tuple[inverse_kinematics.Limb, ...]:
-    """Those that are known in some frame: how others bend nothing tells but the proposal."""
-    return tuple(limb for limb in _LIMBS if not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all()))
+def _limbs(lost: Bool[Tensor, "frames joints"]) -> list[inverse_kinematics.Limb]:
+    """Arms and legs; how those bend that are known in no frame nothing tells but the proposal."""
+    return [replace(limb, shown=not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all()))
+            for limb in LIMBS.values()]  # fmt: skip
 
 
 def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:

@@ -100,10 +100,12 @@ def extended(
     """
     settings, lost = settings or RolloutSettings(), gap.turns.all(dim=1) & gap.root
     start, stop = len(lost) - int(lost.flip(0).long().cumprod(0).sum()), len(lost)
-    if start == stop or start < _BEFORE or not densities:
+    # What stood before other gaps tells, and not what fills them.
+    since = int(lost[:start].nonzero()[-1]) + 1 if bool(lost[:start].any()) else 0
+    if start == stop or start - since < _BEFORE or not densities:
         return proposal, odds, None
     body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
-    known = body.slice(0, start)
+    known = body.slice(since, start)
     judge = densities[0].blurred(choosing.spread())
     if choosing.likeliest_of_motion([judge], known).weight < 1:
         return proposal, odds, None

@@ -9,9 +9,8 @@ from typing import Any
 import torch
 
 from controllers import feasibility
-from controllers.filling import Another, Infilled, InfillSettings, fill
-from controllers.keys import Key, Keys, lost_between, targets_of
-from controllers.keys import key_errors as errors_at
+from controllers.filling import Another, Infilled, InfillSettings, end_notes, fill
+from controllers.keys import Key, Keys, lost_between, missed_by, targets_of
 from mapctl.gaps.lost import Lost, straight
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -34,7 +33,8 @@ def tween(
     hasty = feasibility.between_keys(shown, canonical, rigmap, lost, targets)
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=settled(rigmap), targets=targets,
                 another=another)  # fmt: skip
-    return replace(done, notes=(*hasty, *done.notes))
+    by = "nearest key" if infiller is None else "infiller"
+    return replace(done, notes=(*hasty, *end_notes(lost, by, by), *done.notes))
 
 
 def shown_by(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
@@ -48,5 +48,5 @@ def shown_by(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Mo
 
 
 def key_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:
-    """By key, how far what it tells is missed (see `controllers.keys.key_errors`)."""
-    return errors_at(made, source, keys, shown_by(keys.checked(source), source, rig)[1])
+    """By key, how far what it tells is missed (see `controllers.keys.missed_by`)."""
+    return missed_by(made, source, keys, shown_by(keys.checked(source), source, rig)[1])

@@ -73,7 +73,7 @@ def variations(
     density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
     found += _rollouts(make, count - 1, density, generator, rolling, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
-        raise RequestError(f"no two keys are {_span(rolling)} apart, so that there is nothing to vary between them")
+        raise RequestError(f"no two keys have {_span(rolling)} between them, which leaves nothing to vary")
     each = tuple(Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)) for one in found)
     return Variations(each, sample_diversity([one.motion for one in found]))
 
@@ -137,4 +137,4 @@ def _seeds(count: int, generator: torch.Generator) -> Iterator[int]:
 
 
 def _span(rolling: RolloutSettings) -> str:
-    return f"{rolling.shortest / PRIOR_FPS:.2g} to {rolling.longest / PRIOR_FPS:.2g} s"
+    return f"{(rolling.shortest + 1) / PRIOR_FPS:.2g} to {(rolling.longest + 1) / PRIOR_FPS:.2g} s"

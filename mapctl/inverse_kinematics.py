@@ -35,6 +35,8 @@ class Limb:
     """Hand or foot, the only child of `lower`."""
     bends: tuple[float, float, float]
     """Which way the elbow or the knee of a straight limb would go, seen from `upper`."""
+    shown: bool = True
+    """Whether the motion that one starts from shows how it bends; if not, only the proposed elbow or knee tells."""
 
 
 def solve(
@@ -50,7 +52,8 @@ def solve(
 
     `start_quat_xyzw` are local rotations; those that are not `free` stay as they are. `root_position` is the first
     joint's, if it is not its place. A limb that cannot reach points at its place. Of `limbs` the ends count, and
-    elbows and knees as far as their bones have their lengths (see `_between`). RequestError for other shapes.
+    elbows and knees as far as their bones have their lengths (see `_reached`), and the first bone turns about itself
+    with the plane in which the limb bends. RequestError for other shapes.
     """
     frames, joints = places_world.shape[:2]
     if start_quat_xyzw.shape[:2] != (frames, joints) or joints != skeleton.num_joints:
@@ -65,14 +68,15 @@ def solve(
             at.append(at[parent] + rotations.rotate(above, offsets[joint].expand(frames, 3)))
         turn = start[:, joint] if above is None else rotations.multiply(above, start[:, joint])
         children = skeleton.children(joint)
-        if joint in bending:
+        if joint in bending and bending[joint].shown:
             lower = bending[joint].lower
-            between = _between(bending[joint], turn, start[:, lower], at[joint], places_world, offsets)
-            places_world = places_world.index_copy(1, torch.tensor([lower]), between[:, None])
+            ends = torch.tensor([lower, bending[joint].end])
+            reached = _reached(bending[joint], turn, start[:, lower], at[joint], places_world, offsets)
+            places_world = places_world.index_copy(1, ends, reached)
         if children:
             aims = [places_world[:, child] - at[joint] for child in children]
             found = _turned(turn, [offsets[child] for child in children], aims)
-            if len(children) == 1:
+            if joint in bending:
                 found = _in_plane(found, start, skeleton, children[0], places_world, at[joint])
             turn = found if free is None else torch.where(free[:, joint, None], found, turn)
         world.append(turn)
@@ -80,11 +84,11 @@ def solve(
     return rotations.sign_continuous(torch.stack(local, dim=1))
 
 
-def _between(
+def _reached(
     limb: Limb, turn: Float[Tensor, "frames 4"], bent: Float[Tensor, "frames 4"], at: Float[Tensor, "frames 3"],
     places: Float[Tensor, "frames joints 3"], offsets: Float[Tensor, "joints 3"],
-) -> Float[Tensor, "frames 3"]:  # fmt: skip
-    """Where the elbow or the knee is if the end is at its place, as far as the bones reach.
+) -> Float[Tensor, "frames 2 3"]:  # fmt: skip
+    """Where the elbow or the knee is if the end is at its place, as far as the bones reach; and where the end then is.
 
     A proposal that is the mean of several poses has short bones, and a forearm that is short points anywhere, also
     where no arm bends to. So its place counts only as far as its bones have their lengths; what lacks is the way the
@@ -108,7 +112,8 @@ def _between(
     side = trust * (places[:, limb.lower] - at) + (1 - trust) * rotations.rotate(towards, knee) + _SIDE * usual
     side = torch.nn.functional.normalize(side - (side * axis).sum(-1, keepdim=True) * axis, dim=-1)
     along = (long.square() - short.square() + reach.square()) / (2 * reach)
-    return at + along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side
+    between = at + along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side
+    return torch.stack([between, at + reach * axis], dim=1)
 
 
 def _turned(

@@ -15,7 +15,9 @@ from mapctl.errors import FileFormatError, RequestError
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 _MOST_SECONDS = 3600.0
-_MOST_FRAMES = 1_000_000
+_MOST_FRAMES = 100_000
+
+_OF_A_POSE = ("pose", "pose_frame", "pose_seconds", "place", "height", "facing_deg")
 
 Metres = Annotated[float, Field(ge=-1000, le=1000)]
 Frame = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
@@ -93,6 +95,12 @@ class KeyRequest:
             raise RequestError(f"key[{first}]: the motion begins with its first key, so that is at frame 0; got "
                                f"{frames[first]}")  # fmt: skip
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """All motion files that are read."""
+        named = (self.body, *(key.pose for key in self.key))
+        return tuple(dict.fromkeys(name for name in named if name is not None))
+
     def frame_of(self, key: PlacedKey) -> int:
         """When a key is, in frames."""
         return key.frame if key.frame is not None else round((key.seconds or 0.0) * self.fps)
@@ -131,6 +139,9 @@ def _fault(key: PlacedKey, body: str | None) -> str | None:
         return "pose_frame: a pose is told by pose_frame or by pose_seconds, not by both"
     if key.root_only and (key.joints or key.reach):
         return "root_only: a key tells the root or some joints; choose one"
+    idle = [name for name in _OF_A_POSE if getattr(key, name) is not None]
+    if idle and not key.needs_pose:
+        return f"{idle[0]}: of a key that only reaches, no pose counts; leave it out"
     if key.needs_pose and key.pose is None and body is None:
         return "pose: this key is needed where no body is given"
     return None

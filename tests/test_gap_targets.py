@@ -32,10 +32,10 @@ def place_of(motion, frame, joint):
 
 def nearer(motion, frame, limb, share=0.15, aside=0.05):
     """A place in reach: toward where the limb begins, and somewhat aside."""
-    begins, ends = place_of(motion, frame, LIMBS[limb][0]), place_of(motion, frame, limb)
+    begins, ends = place_of(motion, frame, CANONICAL.names[LIMBS[limb].upper]), place_of(motion, frame, limb)
     aside = aside * torch.randn(3, generator=generator(frame)).double()
     place = ends + share * (begins - ends) + aside
-    length = CANONICAL.offsets[[CANONICAL.index(LIMBS[limb][1]), CANONICAL.index(limb)]].norm(dim=-1).sum()
+    length = CANONICAL.offsets[[LIMBS[limb].lower, LIMBS[limb].end]].norm(dim=-1).sum()
     return begins + (place - begins) * min(1.0, 0.98 * float(length) / float((place - begins).norm()))
 
 
@@ -83,7 +83,7 @@ def test_only_the_limb_turns_and_only_where_it_is_free(limb):
     free[20:40] = True
     made = reached(motion, at(motion, {(30, limb): nearer(motion, 30, limb)}), free)
     turned = (made.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1)
-    assert set(turned.any(dim=0).nonzero()[:, 0].tolist()) == {CANONICAL.index(joint) for joint in LIMBS[limb]}
+    assert set(turned.any(dim=0).nonzero()[:, 0].tolist()) == {LIMBS[limb].upper, LIMBS[limb].lower}
     assert torch.equal(made.local_quat_xyzw[~free], motion.local_quat_xyzw[~free])
     assert torch.equal(made.root_position, motion.root_position)
 
@@ -122,8 +122,8 @@ def test_runs_of_places_are_met_in_every_frame(count):
 @pytest.mark.parametrize("limb", LIMBS)
 def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(limb):
     motion = walk(31)
-    begins, ends = (place_of(motion, 15, joint) for joint in (LIMBS[limb][0], limb))
-    length = float(lengths(motion)[15, [CANONICAL.index(joint) - 1 for joint in (LIMBS[limb][1], limb)]].sum())
+    begins, ends = (place_of(motion, 15, joint) for joint in (CANONICAL.names[LIMBS[limb].upper], limb))
+    length = float(lengths(motion)[15, [LIMBS[limb].lower - 1, LIMBS[limb].end - 1]].sum())
     way = torch.nn.functional.normalize(ends - begins + torch.tensor([0.1, 0.05, 0.1]).double(), dim=-1)
     targets = at(motion, {(15, limb): begins + (length + 0.3) * way})
     made = reached(motion, targets, all_free(motion)).joint_positions()
@@ -136,14 +136,16 @@ def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(
 @pytest.mark.parametrize("limb", LIMBS)
 def test_a_place_where_the_limb_begins_breaks_nothing(limb):
     motion = walk(31)
-    made = reached(motion, at(motion, {(15, limb): place_of(motion, 15, LIMBS[limb][0])}), all_free(motion))
+    made = reached(
+        motion, at(motion, {(15, limb): place_of(motion, 15, CANONICAL.names[LIMBS[limb].upper])}), all_free(motion)
+    )
     assert made.joint_positions().isfinite().all()
 
 
 @pytest.mark.parametrize(("limb", "forward"), [("leftFoot", 1), ("rightFoot", 1), ("leftHand", -1), ("rightHand", -1)])
 def test_straight_limbs_bend_knees_forward_and_elbows_back(limb, forward):
     motion = standing()
-    upper, lower = LIMBS[limb]
+    upper, lower = (CANONICAL.names[joint] for joint in (LIMBS[limb].upper, LIMBS[limb].lower))
     begins, ends = place_of(motion, 15, upper), place_of(motion, 15, limb)
     made = reached(motion, at(motion, {(15, limb): ends + 0.2 * (begins - ends)}), all_free(motion))
     bent = place_of(made, 15, lower) - begins

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from mapctl import inverse_kinematics, rotations
 from mapctl.errors import RequestError
+from mapctl.gaps.targets import LIMBS
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -122,15 +123,27 @@ def test_joints_without_children_keep_their_rotation():
 def test_a_bent_knee_tells_the_plane_in_which_it_bends():
     """The knee itself turns about one axis only, as in the motion that the places are of."""
     motion = walk(60)
-    thigh, knee = CANONICAL.index("leftUpperLeg"), CANONICAL.index("leftLowerLeg")
+    thigh, knee, foot = (CANONICAL.index(f"left{part}") for part in ("UpperLeg", "LowerLeg", "Foot"))
     twist = quat_xyzw(torch.tensor([0.0, 0.6, 0.0], dtype=torch.float64)).expand(60, 4)
     start = motion.local_quat_xyzw.clone()
     start[:, thigh] = rotations.multiply(start[:, thigh], twist)
-    made = solved(motion.joint_positions(), start)
+    made = solved(motion.joint_positions(), start, limbs=(replace(LEG, upper=thigh, lower=knee, end=foot),))
     bent = rotations.to_rotation_vector(motion.local_quat_xyzw[:, knee])[:, 0] > 0.45
     assert bent.sum() > 5
     off = apart_deg(made.local_quat_xyzw[:, thigh], motion.local_quat_xyzw[:, thigh])
     assert off[bent].max() < 0.5 * torch.rad2deg(torch.tensor(0.6))
+
+
+def test_only_arms_and_legs_turn_about_their_own_bones():
+    """Collarbones and shins, which have one child too, only go where their bones point."""
+    motion = random_motion(CANONICAL, 6, seed=3)
+    start = walk(6)
+    made = solved(motion.joint_positions(), start.local_quat_xyzw, limbs=tuple(LIMBS.values()))
+    for name, child in (("leftShoulder", "leftUpperArm"), ("rightLowerLeg", "rightFoot")):
+        joint, bone = CANONICAL.index(name), CANONICAL.offsets[CANONICAL.index(child)].double()
+        turn = rotations.multiply(rotations.inverse(start.local_quat_xyzw[:, joint]), made.local_quat_xyzw[:, joint])
+        twist = (turn[:, :3] * torch.nn.functional.normalize(bone, dim=0)).sum(-1).abs()
+        assert twist.max() < 1e-6
 
 
 def test_joints_that_are_not_free_stay_as_they_are():

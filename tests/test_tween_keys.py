@@ -107,6 +107,15 @@ def test_the_same_bytes_come_twice_and_quiet_says_nothing(tween, folder, capsys)
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize("more", [[], ["--report", "keys/walk.bvh", "-o", "out.bvh"]])
+def test_a_file_that_keys_name_is_not_written_over(tween, folder, capsys, monkeypatch, more):
+    monkeypatch.chdir(folder)
+    before = (folder / "keys" / "walk.bvh").read_bytes()
+    assert tween("keys/keys.toml", *(more or ["-o", "keys/walk.bvh"])) == 2
+    assert "would be written over what it is made from" in capsys.readouterr().err
+    assert (folder / "keys" / "walk.bvh").read_bytes() == before
+
+
 def test_the_example_runs_on_a_clip_of_its_name(tween, folder):
     """The clip that it names is made by the command that it tells."""
     text = (DOCS / "keys.toml").read_text()

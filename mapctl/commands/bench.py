@@ -39,7 +39,7 @@ class Bench:
     between them that `mapctl tween --suggest-timing` would suggest."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
-    `live`, if not given; for `denoise` as that command takes it."""
+    `live`, if not given; for `denoise` as that command takes it; for `tween` auto."""
     data: options.MaybeFile = None
     """For `generation`, `denoise`, `infill`, `tween` and `timing`: the folder that was trained on, for the clips
     that were held out."""
@@ -49,8 +49,8 @@ class Bench:
     denoiser: options.Name = "denoiser"
     """For `denoise`: the bundled denoiser, or the file or run folder of a trained one."""
     infiller: options.Name = "infiller"
-    """For `infill` and `timing`, and in `denoise` for joints that are lost: the bundled infiller, or the file or run
-    folder of a trained one."""
+    """For `infill`, `tween` and `timing`, and in `denoise` for joints that are lost: the bundled infiller, or the file
+    or run folder of a trained one."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """For `infill`: other trained infillers, to compare as they are."""
     refiner: options.Name = "auto"

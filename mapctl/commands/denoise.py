@@ -93,7 +93,6 @@ class Denoise:
         return beside.report("denoise", self, done.motion, done.summary())
 
     def _check(self) -> None:
-
         for name, idle in (("cluster", self.cluster is None), ("again", not self.again), ("jobs", self.jobs == 1)):
             if not idle:
                 raise RequestError(f"--{name} is for folders; {self.source} is a file")
@@ -105,7 +104,7 @@ class Denoise:
 
         settings, masks, rig = self.settings(), self._masks(), options.read_rig(self.rig)
         densities = priors.load_choice(self.prior)
-        denoiser, (motion, lost) = priors.load_denoiser(self.denoiser), options.read_lossy(self.source, rig)
+        denoiser, (motion, lost, _) = priors.load_denoiser(self.denoiser), options.read_lossy(self.source, rig)
         masks = (*masks, *lost)
         with bar("denoising", quiet=self.quiet) as progress:
             if self.causal:

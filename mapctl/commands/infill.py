@@ -43,9 +43,9 @@ class Infill:
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier. A gap at the end is extended into by it, by `auto` if
-    none is named."""
+    none is named, where it knows what comes before."""
     report: options.MaybeFile = None
-    """JSON with the gaps, contacts, ledger, measures and timing."""
+    """JSON with the gaps, contacts, ledger, measures and compute."""
     video: options.MaybeFile = None
     """Film of the given motion and the whole one side by side: .mp4, .gif or .png."""
     quiet: bool = False
@@ -56,8 +56,8 @@ class Infill:
         compute_on_one()
         self._check()
         rig = options.read_rig(self.rig)
-        motion, marked = options.read_lossy(self.source, rig)
-        masks = (*marked, *self._asked(motion)) or self._found(motion)
+        motion, marked, holed = options.read_lossy(self.source, rig)
+        masks = (*marked, *self._asked(motion)) or (() if holed else self._found(motion))
         done = self._infilled(motion, masks)
         from mapctl import formats
 
@@ -103,7 +103,7 @@ class Infill:
 
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
-        extending = () if self.method == "linear" else priors.load_choice(self.prior or "auto")
+        extending = () if self.method != "map" else priors.load_choice(self.prior or "auto")
         settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
         course = None if self.curve is None else options.read_curve(self.curve, None)
         return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course,

@@ -89,13 +89,13 @@ def read_motion(path: Path, rig: "Rig | None", *, fps: "Fraction | None" = None)
     return formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
 
 
-def read_lossy(path: Path, rig: "Rig | None") -> "tuple[Motion, tuple[Mask, ...]]":
-    """The same, of a file that may have NaN where something was lost, and masks of what was."""
+def read_lossy(path: Path, rig: "Rig | None") -> "tuple[Motion, tuple[Mask, ...], bool]":
+    """The same, of a file that may have NaN where something was lost; masks of what was, and whether it has any."""
     from mapctl import formats
     from mapctl.capture.masks import of_missing
 
     motion, missing = formats.load_lossy(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
-    return motion, of_missing(motion, missing)
+    return motion, of_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())
 
 
 def as_request(name: str, command: Any) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
@@ -57,7 +58,7 @@ class Tween:
     seed: options.Count = 0
     """Of everything that is drawn; the first variations are the same however many are asked for."""
     report: options.MaybeFile = None
-    """JSON with the keys, what is missed at them, contacts, ledger, measures and timing."""
+    """JSON with the keys, what is missed at them, contacts, ledger, measures, compute and suggested timing."""
     video: options.MaybeFile = None
     """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
     quiet: bool = False
@@ -113,10 +114,18 @@ class Tween:
             raise RequestError(f"{given[0]} is for motion files; {self.source} says itself what its keys are")
         if not self._of_file and self.keyframes is None:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-        tween_variations.check(self)
+        tween_variations.check(self, self._given())
         # Variations are rolled by a density whatever the method.
         prior = self.prior if self.variations == self.best_of == 1 else None
         beside.check_method(self.method, prior=prior, infiller=self.infiller)
+
+    def _given(self) -> Sequence[Path]:
+        """Files that are read, and so not written."""
+        if not self._of_file:
+            return [self.source]
+        from mapctl.key_files import read_keys
+
+        return [self.source, *map(Path, read_keys(self.source).files)]
 
     def _asked(self) -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""

@@ -2,6 +2,7 @@
 `--best-of K`: one of several.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ def numbered(path: Path, count: int) -> list[Path]:
     return [path.with_name(f"{path.stem}_{number:03d}{path.suffix}") for number in range(count)]
 
 
-def check(command: "Tween") -> None:
+def check(command: "Tween", given: Sequence[Path]) -> None:
     """RequestError for what several answers cannot be made of, and files that cannot be written."""
     options.check_seed(command.seed)
     for name, count in (("--variations", command.variations), ("--best-of", command.best_of)):
@@ -37,14 +38,14 @@ def check(command: "Tween") -> None:
     if command.variations == 1:
         if command.seed and command.best_of < _FIRST_DRAWN:
             raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --best-of 3")
-        beside.check(command.out, command.video, command.report, given=(command.source,))
+        beside.check(command.out, command.video, command.report, given=given)
         return
     if command.suggest_timing:
         raise RequestError("--suggest-timing tells of one answer; leave --variations out")
     if command.video is not None:
         raise RequestError("--video shows one answer; leave it out, and film OUT_000 by `mapctl render`")
     first, *others = numbered(command.out, command.variations)
-    beside.check(first, None, *others, command.report, given=(command.source,))
+    beside.check(first, None, *others, command.report, given=given)
 
 
 def best(command: "Tween", asked: "Keyed", infiller: Any, settings: "InfillSettings") -> "Infilled":

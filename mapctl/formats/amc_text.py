@@ -42,7 +42,7 @@ class AmcText:
 def read(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = False) -> AmcText:
     """Read a take of the skeleton. FileFormatError names the line and what was expected there.
 
-    A `lossy` one may hold NaN among its values, but not nothing else.
+    A `lossy` one may hold NaN among its values, but not only NaN.
     """
     reader = _Reader(path, skeleton, lossy)
     reader.read(rows(decode(path, read_bytes(path), "AMC text")[0]))

@@ -40,7 +40,7 @@ class BvhText:
 def read(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
     """Read a BVH file. FileFormatError names the line and what was expected there.
 
-    A `lossy` one may hold NaN among its values, but not nothing else.
+    A `lossy` one may hold NaN among its values, but not only NaN.
     """
     text, encoding = decode(path, read_bytes(path), "BVH text")
     scanner = Scanner(path, text)

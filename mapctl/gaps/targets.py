@@ -6,21 +6,25 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import inverse_kinematics, rotations
+from mapctl import inverse_kinematics
 from mapctl.errors import RequestError
 from mapctl.gaps import second_differences
+from mapctl.inverse_kinematics import Limb
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
+_KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 LIMBS = {
-    "leftHand": ("leftUpperArm", "leftLowerArm"), "rightHand": ("rightUpperArm", "rightLowerArm"),
-    "leftFoot": ("leftUpperLeg", "leftLowerLeg"), "rightFoot": ("rightUpperLeg", "rightLowerLeg"),
+    side + end: Limb(CANONICAL.index(side + upper), CANONICAL.index(side + lower), CANONICAL.index(side + end), bends)
+    for upper, lower, end, bends in (
+        ("UpperArm", "LowerArm", "Hand", _ELBOW), ("UpperLeg", "LowerLeg", "Foot", _KNEE),
+    )
+    for side in ("left", "right")
 }  # fmt: skip
-"""Ends of limbs, and the two joints that bring them to a place."""
+"""Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
 _REACH = 0.15  # seconds over which a limb goes to its place and back
 _FIRM = 1e9  # how much more a place counts than smoothness
-_SIDE = 0.003  # metres
-_STRAIGHT = 1e-4  # metres that a limb is kept from being straight
+_NOTHING = 1e-12  # metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,45 +66,19 @@ def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> 
     """A canonical motion with limbs bent so that they are at their places, if these are in reach; they go there and
     back smoothly within frames that are `free`.
     """
-    for name, (upper, lower) in LIMBS.items():
-        end = CANONICAL.index(name)
-        wanted = targets.wanted[:, end] & free
+    for limb in LIMBS.values():
+        wanted = targets.wanted[:, limb.end] & free
         if not bool(wanted.any()):
             continue
-        places = motion.joint_positions()
-        away = torch.where(wanted[:, None], targets.places[:, end] - places[:, end], 0.0)
+        places = motion.joint_positions().clone()
+        away = torch.where(wanted[:, None], targets.places[:, limb.end] - places[:, limb.end], 0.0)
         offset = torch.where(free[:, None], _smooth(away, wanted | ~free, fps=float(motion.fps)), 0.0)
-        chain = [CANONICAL.index(joint) for joint in (upper, lower)]
-        motion = _bent(motion, places, chain[0], chain[1], end, offset)
+        places[:, limb.end] += offset
+        turning = torch.zeros(places.shape[:2], dtype=torch.bool)
+        turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NOTHING)[:, None]
+        quats = inverse_kinematics.solve(places, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,))
+        motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
     return motion
-
-
-def _bent(
-    motion: Motion, places: Float[Tensor, "frames joints 3"], upper: int, lower: int, end: int,
-    offset: Float[Tensor, "frames 3"],
-) -> Motion:  # fmt: skip
-    """Two bones turned so that the end is where it was, plus the offset, as far as they reach; in their own plane."""
-    root, knee, foot = places[:, upper], places[:, lower], places[:, end]
-    first, second = (knee - root).norm(dim=-1), (foot - knee).norm(dim=-1)
-    way = foot + offset - root
-    low = (first - second).abs() + _STRAIGHT
-    far = way.norm(dim=-1).clamp_min(1e-9)
-    reach = torch.minimum(torch.maximum(far, low), first + second - _STRAIGHT)
-    axis = way / far[:, None]
-    # A straight limb does not show its plane: knees then go forward and elbows back.
-    usual = torch.tensor([0.0, 0.0, 1.0 if "Leg" in motion.skeleton.names[upper] else -1.0], dtype=places.dtype)
-    side = knee - root + _SIDE * rotations.rotate(motion.joint_rotations()[:, upper], usual.expand(len(places), 3))
-    across = side - (side * axis).sum(-1, keepdim=True) * axis
-    along = (first.square() - second.square() + reach.square()) / (2 * reach)
-    height = (first.square() - along.square()).clamp_min(0).sqrt()
-    bent = root + along[:, None] * axis + height[:, None] * torch.nn.functional.normalize(across, dim=-1)
-    wanted = places.clone()
-    wanted[:, lower], wanted[:, end] = bent, root + reach[:, None] * axis
-    moved = offset.norm(dim=-1) > 1e-12
-    turning = torch.zeros(wanted.shape[:2], dtype=torch.bool)
-    turning[:, [upper, lower]] = moved[:, None]
-    quats = inverse_kinematics.solve(wanted, motion.local_quat_xyzw, motion.skeleton, free=turning)
-    return replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
 
 
 def _smooth(
