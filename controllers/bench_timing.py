@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.bench_infill import on_canonical_bones
-from controllers.timing import GOING, pair_features, seconds_of
+from controllers.timing import GOING, pair_features, seconds_of, travelled
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 
@@ -48,7 +48,7 @@ def pairs_of(
         frames = torch.randint(low, high + 1, (_PAIRS,), generator=generator)
         first = (torch.rand(_PAIRS, generator=generator) * (body.num_frames - frames)).long()
         features.append(pair_features(body, first, first + frames))
-        metres.append((body.root_position[first + frames] - body.root_position[first])[:, ::2].norm(dim=-1))
+        metres.append(travelled(body, first, first + frames))
         seconds.append(frames.double() / PRIOR_FPS)
     return Pairs(torch.cat(features), torch.cat(metres), torch.cat(seconds))
 

@@ -97,10 +97,10 @@ def suggest(motion: Motion, keys: Keys, rig: Rig | None = None) -> list[Interval
     scale, fps = leg_length(canonical.skeleton) / leg_length(CANONICAL), float(motion.fps)
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
     first = torch.arange(len(wanted) - 1)
-    features = pair_features(body, first, first + 1)
+    features, ways = pair_features(body, first, first + 1), travelled(body, first, first + 1)
     intervals = []
     for number, (start, stop) in enumerate(pairwise(wanted)):
-        metres = _way(body, first, first + 1)[number]
+        metres = ways[number]
         seconds = float(seconds_of(features[number : number + 1], metres[None]))
         usual = _USUAL["going" if float(metres) >= GOING else "staying"]
         suggested = max(1, round(seconds * fps))
@@ -127,7 +127,7 @@ def pair_features(
     places, facing = body.joint_positions(), heading(body.local_quat_xyzw[:, 0])
     turn = rotations.about_y(-facing)[:, None].expand(-1, CANONICAL.num_joints, 4)
     own = rotations.rotate(turn, places - places[:, :1])
-    metres = _way(body, first, second)
+    metres = travelled(body, first, second)
     way = torch.log(metres.clamp(max=FARTHEST) + 0.1)
     off = (own[second] - own[first]).norm(dim=-1)
     apart, worst = torch.log(off.mean(dim=-1) + _SOFT), torch.log(off.amax(dim=-1) + 0.05)
@@ -156,7 +156,7 @@ def _cues(
                         legs, arms, own[:, _JOINT["head"], 2]], dim=-1)  # fmt: skip
 
 
-def _way(body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]) -> Float[Tensor, " pairs"]:
+def travelled(body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]) -> Float[Tensor, " pairs"]:
     """Of the hips over the ground, metres."""
     return (body.root_position[second] - body.root_position[first])[:, ::2].norm(dim=-1)
 

@@ -1,19 +1,18 @@
 """Key files: poses, when they are taken and where, for in-betweening. TOML, checked before any work."""
 
-import json
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
+from mapctl import toml_files
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.toml_files import STRICT
 
-_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 _MOST_SECONDS = 3600.0
 _MOST_FRAMES = 100_000
 
@@ -29,7 +28,7 @@ Name = Annotated[str, Field(min_length=1)]
 class PlacedKey:
     """One key: when, which pose, where, and what of it counts."""
 
-    __pydantic_config__ = _STRICT
+    __pydantic_config__ = STRICT
 
     frame: Frame | None = None
     """When; or `seconds`."""
@@ -64,7 +63,7 @@ class PlacedKey:
 class KeyRequest:
     """A whole key file."""
 
-    __pydantic_config__ = _STRICT
+    __pydantic_config__ = STRICT
 
     key: Annotated[tuple[PlacedKey, ...], Field(max_length=10_000)]
     """One [[key]] table each, in any order."""
@@ -109,17 +108,7 @@ class KeyRequest:
 def read_keys(path: str | PathLike[str]) -> KeyRequest:
     """The request of a file, the files that it names relative to its folder. FileFormatError names file and key."""
     try:
-        table = tomllib.loads(Path(path).read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise FileFormatError(path, error.strerror or str(error)) from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(path, "a key file is UTF-8 text, and this is not") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileFormatError(path, f"not TOML: {error}") from error
-    try:
-        request = TypeAdapter(KeyRequest).validate_json(json.dumps(table, default=str), strict=True)
-    except ValidationError as error:
-        raise FileFormatError(path, _first_fault(error)) from error
+        request = toml_files.read(path, KeyRequest, what="key file", unknown=_nearest)
     except RequestError as error:
         raise FileFormatError(path, str(error)) from error
     folder = Path(path).parent
@@ -147,19 +136,7 @@ def _fault(key: PlacedKey, body: str | None) -> str | None:
     return None
 
 
-def _first_fault(error: ValidationError) -> str:
-    """`key[1].facing_deg: ...` in one line."""
-    fault = error.errors(include_url=False)[0]
-    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in fault["loc"]).lstrip(".")
-    return f"{where}: {_words(fault)}"
-
-
-def _words(fault: Mapping[str, Any]) -> str:
-    if fault["type"] == "unexpected_keyword_argument":
-        names = [item.name for item in fields(PlacedKey if len(fault["loc"]) > 1 else KeyRequest)]
-        near = get_close_matches(str(fault["loc"][-1]), names, n=1, cutoff=0)
-        return f"there is no such key; the nearest is {near[0]}; allowed: {', '.join(names)}"
-    if fault["type"] == "missing":
-        return "this key is needed"
-    came, message = json.dumps(fault["input"], default=str), str(fault["msg"])
-    return f"{message[0].lower()}{message[1:]}, got {came if len(came) <= 60 else came[:57] + '...'}"
+def _nearest(key: Sequence[int | str]) -> str:
+    names = [item.name for item in fields(PlacedKey if len(key) > 1 else KeyRequest)]
+    near = get_close_matches(str(key[-1]), names, n=1, cutoff=0)
+    return f"the nearest is {near[0]}; allowed: {', '.join(names)}"

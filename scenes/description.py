@@ -1,23 +1,21 @@
 """Scene files: who walks along what, how it is filmed and where it goes. TOML, checked before any work."""
 
-import json
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path, PurePath
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from mapctl import curves
+from mapctl import curves, toml_files
 from mapctl.body import colours
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.toml_files import STRICT
 from scenes.cameras import CameraSettings
 
-_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 _FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".png"), (".bvh", ".npz"), (".json",)
 _ENDINGS = (*_FILMS, *_MOTIONS, *_REPORTS)
 _MOST_SECONDS = 3600.0
@@ -30,7 +28,7 @@ Place = Annotated[float, Field(ge=-1000, le=1000)]
 class Actor:
     """One character of a scene."""
 
-    __pydantic_config__ = _STRICT
+    __pydantic_config__ = STRICT
 
     curve: Annotated[str, Field(min_length=1)]
     """A built-in shape (`circle:4`) or a CSV or SVG file, relative to the scene file."""
@@ -56,7 +54,7 @@ class Actor:
 class SceneDescription:
     """A whole scene file."""
 
-    __pydantic_config__ = _STRICT
+    __pydantic_config__ = STRICT
 
     actors: Annotated[tuple[Actor, ...], Field(min_length=1, max_length=100)]
     """Who walks; one [[actors]] table each."""
@@ -94,11 +92,8 @@ class SceneDescription:
 
 def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]]:
     """The scene and each actor's curve in the world, checked. FileFormatError names the file and the key."""
-    table = _read(path)
     try:
-        scene = TypeAdapter(SceneDescription).validate_json(json.dumps(table, default=str), strict=True)
-    except ValidationError as error:
-        raise FileFormatError(path, _first_fault(error)) from error
+        scene = toml_files.read(path, SceneDescription, what="scene file", unknown=_allowed)
     except RequestError as error:
         raise FileFormatError(path, f"camera: {error}") from error
     scene = _with_names(scene)
@@ -124,34 +119,9 @@ def place(actor: Actor, folder: Path) -> Curve:
     return curves.from_points(points, closed=curve.closed)
 
 
-def _read(path: str | PathLike[str]) -> Mapping[str, Any]:
-    try:
-        return tomllib.loads(Path(path).read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise FileFormatError(path, error.strerror or str(error)) from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(path, "a scene file is UTF-8 text, and this is not") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileFormatError(path, f"not TOML: {error}") from error
-
-
-def _first_fault(error: ValidationError) -> str:
-    """`actors[1].speed: ...` in one line."""
-    fault = error.errors(include_url=False)[0]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in fault["loc"]).lstrip(".")
-    return f"{key}: {_words(fault)}"
-
-
-def _words(fault: Mapping[str, Any]) -> str:
-    if fault["type"] == "unexpected_keyword_argument":
-        known = {"actors": Actor, "camera": CameraSettings} if len(fault["loc"]) > 1 else {}
-        table = known.get(fault["loc"][0], SceneDescription)
-        return f"there is no such key; allowed: {', '.join(item.name for item in fields(table))}"
-    if fault["type"] == "missing":
-        return "this key is needed"
-    came = json.dumps(fault["input"], default=str)
-    message = str(fault["msg"])
-    return f"{message[0].lower()}{message[1:]}, got {came if len(came) <= 60 else came[:57] + '...'}"
+def _allowed(key: Sequence[int | str]) -> str:
+    known = {"actors": Actor, "camera": CameraSettings} if len(key) > 1 else {}
+    return f"allowed: {', '.join(item.name for item in fields(known.get(str(key[0]), SceneDescription)))}"
 
 
 def _with_names(scene: SceneDescription) -> SceneDescription:

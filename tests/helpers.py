@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mapctl import cli, retarget, rigs, rotations
-from mapctl.features import LAYOUT, encode
+from mapctl.features import LAYOUT, Place, encode, root_places
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+from mapctl.trial import Trial
 from priors.checkpoints import Card
 from priors.density import LstmGmmDensity
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
@@ -182,6 +183,17 @@ def tiny_density(*, width: int = 8, components: int = 3, seed: int = 0, starts: 
         for part in ("previous", "hidden", "cell"):
             object.__setattr__(found.state, part, getattr(found.state, part).to(dtype))
     return density
+
+
+def walking_trial(frames: int) -> Trial:
+    """So many frames of a walk, no toe planted, and the two before them."""
+    motion = walk(frames + 2)
+    vectors, start = encode(motion)
+    ground, heading = root_places(vectors[:2], start)
+    nothing = torch.zeros(1, frames, 1).double()
+    bits = torch.zeros(1, frames, 2, dtype=torch.bool)
+    return Trial(vectors[None, 2:], Place(ground[-1], heading[-1]), nothing, nothing[..., 0], bits,
+                 motion.joint_positions()[:2], contacts_before=bits[0, 0])  # fmt: skip
 
 
 def noise(batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Float[Tensor, "b f c"]:

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import walk
+from helpers import walking_trial
 
-from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import Clearance
 from mapctl.terms.footing import TOES
-from mapctl.trial import Trial
 
 FRAMES = 20
 INDICES = [CANONICAL.index(name) for name in TOES]
@@ -18,14 +17,7 @@ INDICES = [CANONICAL.index(name) for name in TOES]
 
 @pytest.fixture
 def trial():
-    """A walk, with no toe planted."""
-    motion = walk(FRAMES + 2)
-    vectors, start = encode(motion)
-    ground, heading = root_places(vectors[:2], start)
-    nothing = torch.zeros(1, FRAMES, 1).double()
-    bits = torch.zeros(1, FRAMES, 2, dtype=torch.bool)
-    return Trial(vectors[None, 2:], Place(ground[-1], heading[-1]), nothing, nothing[..., 0], bits,
-                 motion.joint_positions()[:2], contacts_before=bits[0, 0])  # fmt: skip
+    return walking_trial(FRAMES)
 
 
 def speeds(trial):

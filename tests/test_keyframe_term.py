@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import walk
+from helpers import walking_trial
 
-from mapctl.features import Place, encode, root_places
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import Keyframe
-from mapctl.trial import Trial
 
 FRAMES = 6
 HAND, FOOT = CANONICAL.index("leftHand"), CANONICAL.index("rightFoot")
@@ -17,13 +15,7 @@ HAND, FOOT = CANONICAL.index("leftHand"), CANONICAL.index("rightFoot")
 
 @pytest.fixture
 def trial():
-    motion = walk(FRAMES + 2)
-    vectors, start = encode(motion)
-    ground, heading = root_places(vectors[:2], start)
-    nothing = torch.zeros(1, FRAMES, 1).double()
-    bits = torch.zeros(1, FRAMES, 2, dtype=torch.bool)
-    return Trial(vectors[None, 2:], Place(ground[-1], heading[-1]), nothing, nothing[..., 0], bits,
-                 motion.joint_positions()[:2], contacts_before=bits[0, 0])  # fmt: skip
+    return walking_trial(FRAMES)
 
 
 def beside(trial, *wanted, sigma=0.002):

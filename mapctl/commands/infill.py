@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from controllers.infill import Infilled
     from mapctl.capture.masks import Mask
     from mapctl.motion import Motion
+    from mapctl.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Infill:
         rig = options.read_rig(self.rig)
         motion, marked, holed = options.read_lossy(self.source, rig)
         masks = (*marked, *self._asked(motion)) or (() if holed else self._found(motion))
-        done = self._infilled(motion, masks)
+        done = self._infilled(motion, masks, rig)
         from mapctl import formats
 
         formats.save(done.motion, self.out)
@@ -97,14 +98,14 @@ class Infill:
 
         return find(motion)
 
-    def _infilled(self, motion: "Motion", masks: Sequence["Mask"]) -> "Infilled":
+    def _infilled(self, motion: "Motion", masks: Sequence["Mask"], rig: "Rig | None") -> "Infilled":
         import priors
         from controllers.infill import InfillSettings, infill
 
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
         extending = () if self.method != "map" else priors.load_choice(self.prior or "auto")
-        settings, rig = InfillSettings(method=self.method), options.read_rig(self.rig)
+        settings = InfillSettings(method=self.method)
         course = None if self.curve is None else options.read_curve(self.curve, None)
         return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course,
                       extending=extending)  # fmt: skip

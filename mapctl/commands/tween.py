@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from controllers.filling import Infilled
     from controllers.keyed import Keyed
     from controllers.timing import Interval
+    from mapctl.key_files import KeyRequest
     from mapctl.rigs import Rig
 
 
@@ -67,8 +68,9 @@ class Tween:
     def run(self) -> int:
         """Check everything, make, write, tell."""
         compute_on_one()
-        self._check()
-        asked = self._asked()
+        request = self._key_request()
+        self._check([self.source] if request is None else [self.source, *map(Path, request.files)])
+        asked = self._asked(request)
         if self.variations > 1:
             tween_variations.run(self, asked)
             return 0
@@ -105,36 +107,36 @@ class Tween:
         """Whether the keys are those of a TOML file."""
         return self.source.suffix.lower() == ".toml"
 
-    def _check(self) -> None:
+    def _key_request(self) -> "KeyRequest | None":
+        if not self._of_file:
+            return None
+        from mapctl.key_files import read_keys
+
+        return read_keys(self.source)
+
+    def _check(self, given: Sequence[Path]) -> None:
+        """Of the options; files that are given are read, and so not written."""
         if self.joints is not None and self.root_only:
             raise RequestError("--joints and --root-only are two kinds of keys; choose one")
-        given = [name for name, value in (("--keyframes", self.keyframes), ("--joints", self.joints),
+        idle = [name for name, value in (("--keyframes", self.keyframes), ("--joints", self.joints),
                                           ("--root-only", self.root_only or None)) if value is not None]  # fmt: skip
-        if self._of_file and given:
-            raise RequestError(f"{given[0]} is for motion files; {self.source} says itself what its keys are")
+        if self._of_file and idle:
+            raise RequestError(f"{idle[0]} is for motion files; {self.source} says itself what its keys are")
         if not self._of_file and self.keyframes is None:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-        tween_variations.check(self, self._given())
+        tween_variations.check(self, given)
         # Variations are rolled by a density whatever the method.
         prior = self.prior if self.variations == self.best_of == 1 else None
         beside.check_method(self.method, prior=prior, infiller=self.infiller)
 
-    def _given(self) -> Sequence[Path]:
-        """Files that are read, and so not written."""
-        if not self._of_file:
-            return [self.source]
-        from mapctl.key_files import read_keys
-
-        return [self.source, *map(Path, read_keys(self.source).files)]
-
-    def _asked(self) -> "Keyed":
+    def _asked(self, request: "KeyRequest | None") -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""
         from controllers.keyed import Keyed
         from controllers.keys import Keys, check_limbs
 
         rig = options.read_rig(self.rig)
-        if self._of_file:
-            return self._of_key_file(rig)
+        if request is not None:
+            return self._of_key_file(request, rig)
         motion = options.read_motion(self.source, rig)
         frames = [parse_frame(word, fps=float(motion.fps)) for word in (self.keyframes or "").split(",")]
         if len(set(frames)) == 2 and (self.root_only or self.joints is not None):
@@ -145,11 +147,9 @@ class Tween:
             check_limbs(limbs, motion, rig)
         return Keyed(motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig)
 
-    def _of_key_file(self, rig: "Rig | None") -> "Keyed":
+    def _of_key_file(self, request: "KeyRequest", rig: "Rig | None") -> "Keyed":
         from controllers.keyed import keyed
-        from mapctl.key_files import read_keys
 
-        request = read_keys(self.source)
         try:
             return keyed(request, rig)
         except RequestError as error:
