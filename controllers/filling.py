@@ -13,7 +13,7 @@ from torch import Tensor
 
 from controllers.canonical_gap import CanonicalGap
 from controllers.gap_standing import FINISHING, stood
-from controllers.proposing import proposed
+from controllers.partial_keys import propose_through
 from controllers.standing import StandingSettings
 from mapctl import contacts, rotations
 from mapctl.capture.bands import upsampled
@@ -106,14 +106,13 @@ def fill(
         canonical = along(canonical, lost.root, course)
     gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
     shown = None if targets is None else targets.shown(gap.seconds, fps=float(motion.fps))
-    proposal, bits = proposed(gap, infiller, shown, held=course is not None)
+    proposal, bits, shown = propose_through(gap, infiller, shown, held=course is not None)
     if another is not None:
         proposal, bits = another(gap, proposal, bits, shown)
     stands, ledger = contacts.steadied(bits > 0), Ledger()
     if settings.method == "map":
         proposal, ledger = stood(proposal, bits, gap, settings.standing, densities, shown)
-    whole = _at_rate_of(canonical, proposal, gap.seconds)
-    filled = from_canonical(whole, rigmap, base)
+    filled = from_canonical(_at_rate_of(canonical, proposal, gap.seconds), rigmap, base)
     done = _closed(put_back(filled, base, lost), lost, motion)
     done, notes = _on_target(done, targets, lost, motion, rig)
     return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes)

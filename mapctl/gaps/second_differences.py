@@ -1,10 +1,13 @@
 """The smoothest offsets of some frames: least second differences, and each frame held as firmly as it is told."""
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.linalg import solveh_banded
+from torch import Tensor
 
+_FIRM = 1e9  # how much more a value that is told counts than smoothness
 WEIGHTS = (1.0, -2.0, 1.0)
 """Of three frames in a second difference."""
 
@@ -34,3 +37,17 @@ def solved(
             bands[2 - beside, held] += weight * WEIGHTS[tap + beside]
     bands[2] += firm
     return solveh_banded(bands, right)
+
+
+def spread(
+    values: Float[Tensor, "frames width"], firm: Bool[Tensor, " frames"], *, seconds: float, fps: float
+) -> Float[Tensor, "frames width"]:
+    """The smoothest offsets that are the values in the frames that are firm, and fade to nothing away from them over
+    about so many seconds: a value v then asks for an acceleration of v / seconds^2.
+    """
+    count = len(values)
+    if count < 3:
+        return torch.where(firm[:, None], values, 0.0)
+    weight = fading(seconds, fps) + _FIRM * firm.double().numpy()
+    right = _FIRM * (values * firm[:, None]).double().numpy()
+    return torch.as_tensor(solved(right, weight, start=0, frames=count)).to(values)

@@ -23,7 +23,6 @@ LIMBS = {
 }  # fmt: skip
 """Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
 _REACH = 0.15  # seconds over which a limb goes to its place and back
-_FIRM = 1e9  # how much more a place counts than smoothness
 _NOTHING = 1e-12  # metres
 
 
@@ -72,22 +71,10 @@ def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> 
             continue
         places = motion.joint_positions().clone()
         away = torch.where(wanted[:, None], targets.places[:, limb.end] - places[:, limb.end], 0.0)
-        offset = torch.where(free[:, None], _smooth(away, wanted | ~free, fps=float(motion.fps)), 0.0)
+        offset = torch.where(free[:, None], second_differences.spread(away, wanted | ~free, seconds=_REACH, fps=float(motion.fps)), 0.0)
         places[:, limb.end] += offset
         turning = torch.zeros(places.shape[:2], dtype=torch.bool)
         turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NOTHING)[:, None]
         quats = inverse_kinematics.solve(places, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,))
         motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
     return motion
-
-
-def _smooth(
-    values: Float[Tensor, "frames 3"], firm: Bool[Tensor, " frames"], *, fps: float
-) -> Float[Tensor, "frames 3"]:
-    """The smoothest offsets, nothing far away, that are the values in the frames that are firm."""
-    count = len(values)
-    if count < 3:
-        return torch.where(firm[:, None], values, 0.0)
-    weight = second_differences.fading(_REACH, fps) + _FIRM * firm.double().numpy()
-    right = _FIRM * (values * firm[:, None]).double().numpy()
-    return torch.as_tensor(second_differences.solved(right, weight, start=0, frames=count)).to(values)
