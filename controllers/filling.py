@@ -3,7 +3,7 @@ kinematics makes them rotations of rigid bones, and the MAP stage puts the feet 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controllers.answers import Another, GapSource
 from controllers.canonical_gap import CanonicalGap
 from controllers.gap_standing import FINISHING, stood
 from controllers.partial_keys import propose_through
@@ -32,11 +33,6 @@ from mapctl.rigs import Rig
 from mapctl.solver.result import Ledger
 
 Method = Literal["infiller", "map", "linear"]
-Another = Callable[
-    [CanonicalGap, Motion, Float[Tensor, "frames 2"], Targets | None], tuple[Motion, Float[Tensor, "frames 2"]]
-]
-"""From what an infiller proposes for a gap and the log odds of its contacts to another proposal and its odds; see
-controllers.steered."""
 _MISSED = 0.001  # metres from a wanted place that are worth a word
 _HAIR = 1e-4  # metres from it that are nothing
 _AIMS = 6  # tries at most
@@ -68,6 +64,8 @@ class Infilled:
     """Compute, wall clock."""
     notes: tuple[str, ...] = ()
     """What the user should know."""
+    sources: tuple[GapSource, ...] = ()
+    """Who proposed what in gaps that were not the infiller's alone."""
 
     def summary(self) -> dict[str, Any]:
         """For a report, in plain numbers."""
@@ -106,16 +104,14 @@ def fill(
         canonical = along(canonical, lost.root, course)
     gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
     shown = None if targets is None else targets.shown(gap.seconds, fps=float(motion.fps))
-    proposal, bits, shown = propose_through(gap, infiller, shown, held=course is not None)
-    if another is not None:
-        proposal, bits = another(gap, proposal, bits, shown)
-    stands, ledger = contacts.steadied(bits > 0), Ledger()
+    answer, shown = propose_through(gap, infiller, shown, held=course is not None, another=another)
+    stands, ledger, made = contacts.steadied(answer.odds > 0), Ledger(), answer.motion
     if settings.method == "map":
-        proposal, ledger = stood(proposal, bits, gap, settings.standing, densities, shown)
-    filled = from_canonical(_at_rate_of(canonical, proposal, gap.seconds), rigmap, base)
+        made, ledger = stood(made, answer.odds, gap, settings.standing, densities, shown)
+    filled = from_canonical(_at_rate_of(canonical, made, gap.seconds), rigmap, base)
     done = _closed(put_back(filled, base, lost), lost, motion)
     done, notes = _on_target(done, targets, lost, motion, rig)
-    return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes)
+    return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes, answer.sources)
 
 
 def end_notes(lost: Lost, first: str, by: str) -> tuple[str, ...]:

@@ -7,7 +7,9 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.answers import Answer
 from controllers.canonical_gap import CanonicalGap
+from controllers.choosing_proposals import choose_proposals
 from controllers.filling import Infilled, InfillSettings, Method, end_notes, fill
 from controllers.steered import extended
 from mapctl.capture.masks import Mask, hidden
@@ -40,15 +42,17 @@ def infill(
     if course is not None and not lost.root.any():
         raise RequestError("a curve leads the hips where they are lost, and they never are; leave it out")
     first = "infiller" if settings is None or settings.method != "linear" else "nearest known frame"
-    by = [first]
 
     def another(
         gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None
-    ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        proposal, odds, name = extended(gap, proposal, odds, densities=extending)
-        by[0] = first if name is None else f"density {name}"
-        return proposal, odds
+    ) -> Answer:
+        chosen = Answer(proposal, odds)
+        if course is None:
+            chosen = choose_proposals(gap, proposal, odds, targets, densities=extending)
+        end = extended(gap, chosen.motion, chosen.odds, densities=extending)
+        return replace(end, sources=(*chosen.sources, *end.sources))
 
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course,
                 another=another)  # fmt: skip
-    return replace(done, notes=end_notes(lost, first, by[0]))
+    last = done.sources[-1].by if done.sources and lost.root[-1] else first
+    return replace(done, notes=end_notes(lost, first, last))

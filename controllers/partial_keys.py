@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
+from controllers.answers import Another, Answer
 from controllers.canonical_gap import CanonicalGap
 from controllers.proposing import proposed
 from mapctl import rotations
@@ -44,10 +45,10 @@ _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
 def propose_through(
-    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool
-) -> tuple[Motion, Float[Tensor, "frames 2"], Targets | None]:
-    """What an infiller proposes for a gap (see `controllers.proposing.proposed`), with hands and feet at their places
-    and the hips at theirs where single frames tell no more; the log odds of its contacts; and the places, brought in
+    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool, another: Another | None = None
+) -> tuple[Answer, Targets | None]:
+    """What an infiller, or `another` that starts from its proposal, makes of a gap (see `controllers.proposing`), with
+    hands and feet at their places and the hips at theirs where single frames tell no more; and the places, brought in
     reach where they are not.
     """
     hips = _hips_alone(gap)
@@ -55,17 +56,38 @@ def propose_through(
     blind = replace(gap, turns=gap.turns.index_put((hips, torch.tensor(0)), torch.tensor(True)), root=gap.root | hips)
     first, bits = proposed(blind, infiller, None, held=held)
     if not bool((hips | wanted).any()):
-        return first, bits, targets
-    second = first
+        return _asked(another, gap, Answer(first, bits), targets, hips), targets
+    led, second = blind, first
     if bool(gap.root.any()):
-        second, bits = proposed(_lead(gap, blind, first, targets, hips), infiller, None, held=True)
+        led = _lead(gap, blind, first, targets, hips)
+        second, bits = proposed(led, infiller, None, held=True)
+    answer = _asked(another, led, Answer(second, bits), targets, hips)
+    second = answer.motion
     posed = _under_hips(second, gap.motion, hips)
     if targets is None:
-        return _go_there(second, posed, hips, blind), bits, None
+        return replace(answer, motion=_go_there(second, posed, hips, blind)), None
     posed = reach_with_body(posed, targets, turning=gap.turns, moving=gap.root,
                             stray=torch.full(hips.shape, _STILL))[0]  # fmt: skip
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
-    return _go_there(second, posed, hips | wanted, blind), bits, Targets(reached, targets.wanted)
+    there = replace(answer, motion=_go_there(second, posed, hips | wanted, blind))
+    return there, Targets(reached, targets.wanted)
+
+
+def _asked(
+    another: Another | None, gap: CanonicalGap, answer: Answer, targets: Targets | None, hips: Bool[Tensor, " frames"]
+) -> Answer:
+    """What another makes of an answer, told where hands, feet and hips are wanted on the way."""
+    if another is None:
+        return answer
+    if bool(hips.any()):
+        places = gap.motion.joint_positions()
+        wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+        wanted[hips, 0] = True
+        if targets is not None:
+            places = torch.where(targets.wanted[..., None], targets.places, places)
+            wanted = wanted | targets.wanted
+        targets = Targets(places, wanted)
+    return another(gap, answer.motion, answer.odds, targets)
 
 
 def _hips_alone(gap: CanonicalGap) -> Bool[Tensor, " frames"]:

@@ -13,14 +13,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controllers.answers import Answer, GapSource
 from controllers.canonical_gap import CanonicalGap
-from mapctl import choosing, gaussian, rotations
+from controllers.standing import rest_height
+from mapctl import choosing, contacts, gaussian, rotations
 from mapctl.capture.faults import runs
 from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, encode, root_places
 from mapctl.gaps.closing import closed_places, closed_rotations
+from mapctl.gaps.footholds import hold_planted
 from mapctl.gaps.targets import Targets
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.methods import LatentMethod, SolvedWindow
@@ -53,6 +56,9 @@ class RolloutSettings:
     """Planted feet."""
     shortest: int = 2
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
+    tempo: float = 1.0
+    """How much longer than the gap a rollout is before its time is brought to the gap's: below 1, it is slowed down.
+    A step that would end too early or too late ends in time."""
     longest: int = 180
     """Frames that are rolled at a time; what is longer is left to the given proposal."""
     method: LatentMethod = field(default_factory=lambda: LatentMethod(
@@ -64,36 +70,135 @@ class RolloutSettings:
 def rolled(
     gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None = None, *,
     densities: Sequence[Any], generator: torch.Generator, settings: RolloutSettings | None = None,
-) -> tuple[Motion, Float[Tensor, "frames 2"]]:  # fmt: skip
+) -> Answer:  # fmt: skip
     """The proposal with rollouts in those of its gaps in which nothing is known and that have known frames on both
-    sides; and the log odds of its contacts.
+    sides; the log odds of its contacts; and which gaps these are.
 
     Of the densities the one is rolled under which the proposal is likeliest. `targets` are places wanted on the way.
     """
-    settings, skeleton = settings or RolloutSettings(), proposal.skeleton
-    body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
-    density = likeliest(densities, body)
-    lost, state, done, odds = gap.turns.all(dim=1) & gap.root, None, 0, odds.clone()
-    for _, start, stop in runs(lost[:, None]):
-        if start == 0 or stop == len(lost) or not settings.shortest <= stop - start <= settings.longest:
-            continue
-        features, place = _until(body, odds, start)
-        state = density.likely_state(features) if state is None else state
-        state, done = density.advance(state, features[None, done:]), start
-        arrival = _arrival(body, lost, (start, stop), gap.scale, targets, settings)
-        context = Context(density, state, place, _past(body, start), len(arrival.places))
+    settings = settings or RolloutSettings()
+    roller, sources = Roller.of(gap, proposal, odds, densities, targets), []
+    for start, stop in whole_gaps(gap):
+        if settings.shortest <= stop - start <= settings.longest:
+            roller.put_in(roller.roll(start, stop, generator, settings))
+            sources.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
+    return Answer(roller.motion, roller.odds, tuple(sources))
+
+
+def whole_gaps(gap: CanonicalGap) -> list[tuple[int, int]]:
+    """First frames and one past the last of gaps in which nothing is known, with known frames on both sides."""
+    lost = gap.turns.all(dim=1) & gap.root
+    return [(start, stop) for _, start, stop in runs(lost[:, None]) if start > 0 and stop < len(lost)]
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """What a density makes of one gap."""
+
+    start: int
+    """First frame of the gap, at the prior's rate."""
+    body: Motion
+    """The whole motion on canonical bones, the gap filled."""
+    odds: Float[Tensor, "frames 2"]
+    """Log odds of its contacts."""
+    missed: float
+    """Mean distance of the joints from where they were to arrive, before that was spread over the gap, metres."""
+
+
+@dataclass(eq=False)
+class Roller:
+    """Rolls a density through gaps, one after the other in time; what is put into one is what the next goes on from."""
+
+    gap: CanonicalGap
+    """What is known."""
+    skeleton: Skeleton
+    """Bones of the performer."""
+    body: Motion
+    """All frames so far, on canonical bones."""
+    odds: Float[Tensor, "frames 2"]
+    """Log odds of contacts."""
+    density: Any
+    """That is rolled."""
+    targets: Targets | None
+    """Places wanted on the way."""
+    state: Any = None
+    """Of the density, after `done` frames."""
+    done: int = 0
+    """Frames that the state has seen."""
+
+    @staticmethod
+    def of(
+        gap: CanonicalGap, proposal: Motion, odds: Tensor, densities: Sequence[Any], targets: Targets | None
+    ) -> "Roller":
+        """By the density under which the proposal is likeliest."""
+        body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
+        return Roller(gap, proposal.skeleton, body, odds.clone(), likeliest(densities, body), targets)
+
+    @property
+    def motion(self) -> Motion:
+        """So far, on the performer's bones."""
+        return self.on_performer(self.body)
+
+    def on_performer(self, body: Motion) -> Motion:
+        """On the performer's bones."""
+        return replace(body, skeleton=self.skeleton, root_position=body.root_position * self.gap.scale)
+
+    def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
+        """A rollout through frames start to stop; changes nothing but what was seen before them."""
+        features, place = _until(self.body, self.odds, start)
+        state = self.density.likely_state(features) if self.state is None else self.state
+        if self.done < start:
+            state = self.density.advance(state, features[None, self.done :])
+        self.state, self.done = state, start
+        arrival = self._arrival(start, stop, settings)
+        context = Context(self.density, self.state, place, _past(self.body, start), len(arrival.places))
         terms = (Noise(settings.sigma_noise), settings.footing, arrival)
         window = settings.method(context, terms, _drawn(context.frames, generator, settings), generator)
-        body, odds = _put_in(body, odds, window, place, start, stop)
-    return replace(body, skeleton=skeleton, root_position=body.root_position * gap.scale), odds
+        body, odds, missed = _put_in(self.body, self.odds, window, place, start, stop, settings.tempo)
+        return Rollout(start, self._planted(body, odds), odds, missed)
+
+    def put_in(self, rollout: Rollout) -> None:
+        """Go on from this one."""
+        self.body, self.odds = rollout.body, rollout.odds
+
+    def _planted(self, body: Motion, odds: Tensor) -> Motion:
+        """With toes that stay where they stand: arriving where it must has moved them."""
+        stands = contacts.steadied(odds > 0)
+        lost = self.gap.turns.all(dim=1) & self.gap.root
+        return hold_planted(body, stands, free=lost, rest_height=rest_height(body, stands))
+
+    def _arrival(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
+        """Where a rollout is to be in the known frames after its gap, and at places wanted on the way, in its own
+        time.
+        """
+        count = stop - start
+        own = max(1, round(count * settings.tempo))
+        part = slice(start, stop + settings.ahead)
+        known = ~(self.gap.turns.all(dim=1) & self.gap.root)[part]
+        last = int(known.nonzero()[-1]) + 1
+        places, known = self.body.joint_positions()[part][:last], known[:last]
+        wanted = known[:, None].expand(-1, CANONICAL.num_joints)
+        if self.targets is not None:
+            told = self.targets.wanted[part][:last]
+            places = torch.where(told[..., None], self.targets.places[part][:last] / self.gap.scale, places)
+            wanted = wanted | told
+        if own == count:
+            return Keyframe(places.float(), wanted, settings.arrival)
+        frames, joints = own + last - count, CANONICAL.num_joints
+        goals, asked = torch.zeros(frames, joints, 3), torch.zeros(frames, joints, dtype=torch.bool)
+        goals[own:], asked[own:] = places[count:].float(), wanted[count:]
+        for frame in wanted[:count].any(dim=1).nonzero()[:, 0].tolist():
+            at = min(own - 1, round((frame + 1) * (own + 1) / (count + 1)) - 1)
+            goals[at], asked[at] = places[frame].float(), wanted[frame]
+        return Keyframe(goals, asked, settings.arrival)
 
 
 def extended(
     gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], *, densities: Sequence[Any],
     settings: RolloutSettings | None = None,
-) -> tuple[Motion, Float[Tensor, "frames 2"], str | None]:  # fmt: skip
+) -> Answer:  # fmt: skip
     """The proposal with the likeliest rollout from where it is last known to its end, if nothing is known there; the
-    log odds of its contacts; and the name of the density that was rolled, None if the proposal stays as it is.
+    log odds of its contacts; and by which density, if it does not stay as it is.
 
     It does where the first density (that of locomotion) does not find what comes before as likely as its own data:
     densities then stop or turn away. None runs backwards, so a beginning stays as well.
@@ -103,13 +208,13 @@ def extended(
     # What stood before other gaps tells, and not what fills them.
     since = int(lost[:start].nonzero()[-1]) + 1 if bool(lost[:start].any()) else 0
     if start == stop or start - since < _BEFORE or not densities:
-        return proposal, odds, None
+        return Answer(proposal, odds)
     body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
     known = body.slice(since, start)
     judge = densities[0].blurred(choosing.spread())
     if choosing.likeliest_of_motion([judge], known).weight < 1:
-        return proposal, odds, None
-    density = likeliest(densities, known)
+        return Answer(proposal, odds)
+    density, first = likeliest(densities, known), start
     while start < stop:
         features, place = _until(body, odds, start)
         state = density.advance(density.likely_state(features), features[None])
@@ -117,10 +222,10 @@ def extended(
         terms = (Noise(settings.sigma_noise), settings.footing)
         still = torch.zeros(context.frames, LAYOUT.continuous)
         window = replace(settings.method, proposal=zero_start)(context, terms, still, torch.Generator())
-        body, odds = _put_in(body, odds, window, place, start, start + context.frames)
+        body, odds, _ = _put_in(body, odds, window, place, start, start + context.frames)
         start += context.frames
     body = replace(body, skeleton=proposal.skeleton, root_position=body.root_position * gap.scale)
-    return body, odds, density.name
+    return Answer(body, odds, (GapSource(first, stop, f"density {density.name}"),))
 
 
 def likeliest(densities: Sequence[Any], motion: Motion) -> Any:
@@ -144,23 +249,6 @@ def _past(body: Motion, start: int) -> Float[Tensor, "past joints 3"]:
     return body.slice(first, start).joint_positions().float()
 
 
-def _arrival(
-    body: Motion, lost: Bool[Tensor, " frames"], gap: tuple[int, int], scale: float, targets: Targets | None,
-    settings: RolloutSettings,
-) -> Keyframe:  # fmt: skip
-    """Where a rollout is to be in the known frames after its gap, and at places wanted on the way."""
-    part = slice(gap[0], gap[1] + settings.ahead)
-    known = ~lost[part]
-    last = int(known.nonzero()[-1]) + 1
-    places, known = body.joint_positions()[part][:last], known[:last]
-    wanted = known[:, None].expand(-1, CANONICAL.num_joints)
-    if targets is not None:
-        told = targets.wanted[part][:last]
-        places = torch.where(told[..., None], targets.places[part][:last] / scale, places)
-        wanted = wanted | told
-    return Keyframe(places.float(), wanted, settings.arrival)
-
-
 def _drawn(frames: int, generator: torch.Generator, settings: RolloutSettings) -> Float[Tensor, "frames continuous"]:
     """Noise that changes slowly."""
     white = torch.randn(frames, LAYOUT.continuous, generator=generator)
@@ -169,15 +257,20 @@ def _drawn(frames: int, generator: torch.Generator, settings: RolloutSettings) -
 
 
 def _put_in(
-    body: Motion, odds: Tensor, window: SolvedWindow, place: Place, start: int, stop: int
-) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-    """The rollout in its gap, moved so that it arrives at the frame after it, if there is one; its contacts."""
+    body: Motion, odds: Tensor, window: SolvedWindow, place: Place, start: int, stop: int, tempo: float = 1.0
+) -> tuple[Motion, Float[Tensor, "frames 2"], float]:
+    """The rollout in its gap, moved so that it arrives at the frame after it, if there is one; its contacts; and by how
+    much it had missed that frame, mean distance of the joints, metres.
+    """
     made = decode(window.trial.features[0], Place(place.position_xz.double(), place.heading.double()))
-    count = stop - start
+    stands, count, missed = window.trial.contacts[0], stop - start, 0.0
+    made, stands = _in_time(made, stands, max(1, round(count * tempo)), count)
     share = torch.sin(0.5 * torch.pi * torch.arange(1, count + 1) / (count + 1)).square()[:, None].double()
     root, quats, odds = body.root_position.clone(), body.local_quat_xyzw.clone(), odds.clone()
     root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
     if count < len(made.root_position):
+        there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
+        missed = float((there.joint_positions() - here.joint_positions()).norm(dim=-1).mean())
         root[start:stop] += share * (root[stop] - made.root_position[count])
         turn = rotations.multiply(rotations.inverse(made.local_quat_xyzw[count]), quats[stop])
         turned = rotations.from_rotation_vector(share[..., None] * rotations.to_rotation_vector(turn))
@@ -186,5 +279,22 @@ def _put_in(
     put[start:stop] = True
     root = closed_places(root, put, fps=PRIOR_FPS)
     quats = closed_rotations(quats, put[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
-    odds[start:stop] = _SURE * (2 * window.trial.contacts[0, :count].to(odds) - 1)
-    return replace(body, root_position=root, local_quat_xyzw=quats), odds
+    odds[start:stop] = _SURE * (2 * stands[:count].to(odds) - 1)
+    return replace(body, root_position=root, local_quat_xyzw=quats), odds, missed
+
+
+def _in_time(
+    made: Motion, stands: Bool[Tensor, "rolled 2"], own: int, count: int
+) -> tuple[Motion, Bool[Tensor, "frames 2"]]:
+    """What took `own` frames, from the frame before to the one after them, in `count`; nothing more after that."""
+    if own == count:
+        return made, stands
+    last = min(len(made.root_position) - 1, own)
+    at = (torch.arange(count + 1, dtype=torch.float64) + 1) * (own + 1) / (count + 1) - 1
+    at = at.clamp(0, last)
+    low, high = at.floor().long(), at.ceil().long()
+    share = (at - low)[:, None]
+    quats = rotations.slerp(made.local_quat_xyzw[low], made.local_quat_xyzw[high],
+                            share.expand(-1, made.num_joints))  # fmt: skip
+    root = torch.lerp(made.root_position[low], made.root_position[high], share)
+    return replace(made, root_position=root, local_quat_xyzw=quats), stands[at.round().long()]

@@ -4,12 +4,15 @@ where it only tells the place of a hand or a foot, the limb is bent until it is 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 
 from controllers import feasibility
-from controllers.filling import Another, Infilled, InfillSettings, end_notes, fill
+from controllers.answers import Another
+from controllers.choosing_proposals import choose_proposals
+from controllers.filling import Infilled, InfillSettings, end_notes, fill
 from controllers.keys import Key, Keys, lost_between, missed_by, targets_of
 from mapctl.gaps.lost import Lost, straight
 from mapctl.motion import Motion
@@ -21,16 +24,19 @@ from mapctl.rigs import Rig
 def tween(
     motion: Motion, keys: Keys, infiller: Inbetweener | None, *,
     settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
-    another: Another | None = None,
+    rollable: Sequence[Any] = (), another: Another | None = None,
 ) -> Infilled:  # fmt: skip
     """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
 
+    Where keys are so far apart that the infiller does not know enough, one of the densities `rollable` proposes if a
+    viewer would see less sliding (see `controllers.choosing_proposals`); `another` takes the place of that choice.
     RequestError for keys that do not fit the motion or its rig; keys that nobody could reach in time get a note.
     """
     wanted = keys.checked(motion)
     canonical, rigmap, shown = shown_by(wanted, motion, rig)
     lost, targets = lost_between(wanted, motion, rigmap), targets_of(wanted, shown, rigmap)
     hasty = feasibility.between_keys(shown, canonical, rigmap, lost, targets)
+    another = another or partial(choose_proposals, densities=rollable)
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=settled(rigmap), targets=targets,
                 another=another)  # fmt: skip
     by = "nearest key" if infiller is None else "infiller"

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.answers import Answer
 from controllers.canonical_gap import CanonicalGap
 from controllers.energy import energy_of
 from controllers.filling import Infilled, InfillSettings
@@ -126,9 +127,9 @@ def _rollouts(
 
 def _straight(
     gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None
-) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+) -> Answer:
     """Slerp's proposal, with the infiller's contacts."""
-    return gap.motion, odds
+    return Answer(gap.motion, odds)
 
 
 def _seeds(count: int, generator: torch.Generator) -> Iterator[int]:

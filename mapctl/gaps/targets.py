@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import inverse_kinematics
-from mapctl.errors import RequestError
 from mapctl.gaps import second_differences
 from mapctl.inverse_kinematics import Limb
 from mapctl.motion import Motion
@@ -28,18 +27,12 @@ _NOTHING = 1e-12  # metres
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Wanted places, by frame and canonical joint."""
+    """Wanted places, by frame and canonical joint; limbs bend to those of `LIMBS`."""
 
     places: Float[Tensor, "frames joints 3"]
     """World, metres; anything finite where no place is wanted."""
     wanted: Bool[Tensor, "frames joints"]
     """Whether a place is."""
-
-    def __post_init__(self):
-        other = self.wanted.any(dim=0)
-        names = [name for name, some in zip(CANONICAL.names, other.tolist(), strict=True) if some and name not in LIMBS]
-        if names:
-            raise RequestError(f"places are for {', '.join(LIMBS)}; {names[0]} has none")
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "Targets":
         """At other moments, rising: every wanted place is one of the moment that is nearest to its own."""

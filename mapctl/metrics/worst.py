@@ -1,0 +1,67 @@
+"""What a viewer sees first: the fastest hand, the hardest jolt, and how long a body goes on feet that do not carry it.
+
+Means hide all three: a hand that jumps by half a metre in one frame of two hundred moves the mean by nothing.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import contacts
+
+_NEAR = 0.05  # metres over its floor, of the lower toe: no flight
+_LOW, _SLOW = 0.03, 0.35  # metres and m/s of a toe that carries
+_GOING = 0.3  # m/s of the hips
+
+
+class Peaks(NamedTuple):
+    """Of hands and feet, hips held still."""
+
+    step: float
+    """Largest way in a thirtieth of a second, metres."""
+    acceleration: float
+    """Largest, m/s^2."""
+
+
+def peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"], fps: float) -> Peaks:
+    """Of world positions in metres; 0 for what so few frames do not show."""
+    seen = ends - hips[:, None]
+    steps, bends = (torch.diff(seen, n=order, dim=0).norm(dim=-1) for order in (1, 2))
+    return Peaks(float(steps.max()) * fps / 30 if steps.numel() else 0.0,
+                 float(bends.max()) * fps**2 if bends.numel() else 0.0)  # fmt: skip
+
+
+def unsupported(
+    toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
+) -> Bool[Tensor, " steps"]:
+    """Whether, on the way to each frame but the first, the hips go over the ground while no toe is planted and the
+    lower one is near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's
+    own 5th percentile.
+    """
+    height = (toes[..., 1] - contacts.floor_heights(toes))[1:]
+    speed, pace = (torch.diff(places[..., ::2], dim=0).norm(dim=-1) * fps for places in (toes, hips))
+    planted = ((height < _LOW) & (speed < _SLOW)).any(dim=1)
+    return ~planted & (height.amin(dim=1) < _NEAR) & (pace > _GOING)
+
+
+def longest_unsupported(toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float) -> float:
+    """Seconds of the longest stretch of `unsupported`."""
+    longest = run = 0
+    for bad in unsupported(toes, hips, fps).tolist():
+        run = run + 1 if bad else 0
+        longest = max(longest, run)
+    return longest / fps
+
+
+def support_slide(
+    toes: Float[Tensor, "frames feet 3"], rest_height: float, fps: float
+) -> Float[Tensor, " steps"]:
+    """Speed over the ground, m/s, of the slowest toe within 5 cm of its rest height (metres), which is what the body
+    stands on, on the way to each frame but the first; 0 in flight.
+    """
+    near = (toes[1:, :, 1] < rest_height + _NEAR) & (toes[:-1, :, 1] < rest_height + _NEAR)
+    speed = torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
+    slowest = torch.where(near, speed, torch.inf).amin(dim=1)
+    return torch.where(near.any(dim=1), slowest, 0.0)
