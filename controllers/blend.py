@@ -1,5 +1,6 @@
 """Tertiary blending (infilling paper, section 4.2): a hand or foot does for a while what it does in another motion."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,16 +10,21 @@ from torch import Tensor
 
 from controllers.filling import Infilled, InfillSettings, fill
 from controllers.keys import limb_end
-from mapctl import rotations
+from mapctl import inverse_kinematics, rotations
 from mapctl.errors import RequestError
-from mapctl.gaps.lost import Lost
-from mapctl.gaps.targets import LIMBS, Targets
+from mapctl.gaps.lost import Lost, put_back
+from mapctl.gaps.targets import LIMBS
+from mapctl.inverse_kinematics import Limb
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
-from mapctl.retarget import to_canonical
+from mapctl.retarget import from_canonical, to_canonical
 from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
+
+_LEAST = 0.3  # seconds
+_JERKLESS = 5.77  # peak acceleration of the smoothest way, of least jerk, over distance and time squared (Flash 1985)
+_CALM, _HASTY = 20.0, 80.0  # m/s^2 of a hand
 
 
 @dataclass(frozen=True)
@@ -33,15 +39,16 @@ class Borrowed:
     """One past the last."""
     at: int
     """Frame of the motion that the first one goes to."""
-    margin: float = 0.5
-    """Seconds before and after in which the limb is free to go there and back."""
+    margin: float | None = None
+    """Seconds before and after in which the limb is free to go there and back; as the distance asks for, if None."""
 
 
 def blend(
     motion: Motion, source: Motion, borrowed: Borrowed, infiller: Inbetweener | None, *,
     settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
 ) -> Infilled:  # fmt: skip
-    """The motion with its limbs where the source's are, seen from shoulder or hip, in size; all else stays to the bit.
+    """The motion with its limbs where the source's are, seen from shoulder or hip, in size, and bent as those are; all
+    else stays to the bit. In the margins before and after, the limbs go there and come back.
 
     RequestError for frames that either motion has not, and for joints that are no hand or foot.
     """
@@ -49,37 +56,92 @@ def blend(
     _check(motion, source, borrowed)
     own, rigmap = to_canonical(motion, rig)
     other, _ = to_canonical(source)
-    ends = [limb_end(name, rigmap) for name in borrowed.limbs]
+    limbs = [LIMBS[CANONICAL.names[limb_end(name, rigmap)]] for name in borrowed.limbs]
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
-    margin = round(borrowed.margin * float(motion.fps))
-    free = slice(max(0, there.start - margin), min(motion.num_frames, there.stop + margin))
-    joints = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
-    places = torch.zeros_like(own.joint_positions())
-    wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
-    for end in ends:
-        limb = LIMBS[CANONICAL.names[end]]
-        for joint in (limb.upper, limb.lower, limb.end):
-            rigged = rigmap.joint_of[joint]
-            if rigged is not None:
-                joints[free, rigged] = True
-        places[there, end] = _carried_over(own, other, limb.upper, end, borrowed)
-        wanted[there, end] = True
-    lost = Lost(joints, torch.zeros(motion.num_frames, dtype=torch.bool))
-    done = fill(
-        motion, lost, infiller, settings=settings, densities=densities, rig=rig, targets=Targets(places, wanted)
-    )
-    return replace(done, notes=(*done.notes, f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new"))
+    posed = own
+    for limb in limbs:
+        posed = _with_limb(posed, own, other, limb, borrowed)
+    before, after = _margins(own, posed, limbs, there, borrowed.margin)
+    free = slice(max(0, there.start - before), min(motion.num_frames, there.stop + after))
+    joints = [rigmap.joint_of[joint] for limb in limbs for joint in (limb.upper, limb.lower, limb.end)]
+    new = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
+    new[there] = True
+    moved = torch.zeros_like(new)
+    moved[:, [joint for joint in joints if joint is not None]] = True
+    nothing = torch.zeros(motion.num_frames, dtype=torch.bool)
+    lent = put_back(from_canonical(posed, rigmap, motion), motion, Lost(new & moved, nothing))
+    lost = torch.zeros_like(new)
+    lost[free] = True
+    lost[there] = False
+    done = fill(lent, Lost(lost & moved, nothing), infiller, settings=settings, densities=densities, rig=rig)
+    notes = (*_haste(own, posed, borrowed, limbs, free, there),
+             f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new")  # fmt: skip
+    return replace(done, lost=Lost((lost | new) & moved, nothing), notes=(*done.notes, *notes))
 
 
-def _carried_over(own: Motion, other: Motion, root: int, end: int, borrowed: Borrowed) -> Tensor:
-    """Where the limb's end is to be: as far from its own root as the source's is, in the length of its own bones."""
+def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: Borrowed) -> Motion:
+    """With one limb bent as the source's is, seen from the heading of the hips, and its end as far from its root as the
+    source's, in the length of its own bones.
+    """
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
     here = slice(borrowed.start, borrowed.stop)
-    theirs = other.joint_positions()[here]
-    way = theirs[:, end] - theirs[:, root]
-    turn = heading(own.local_quat_xyzw[there, 0]) - heading(other.local_quat_xyzw[here, 0])
-    way = rotations.rotate(rotations.about_y(turn), way)
-    return own.joint_positions()[there, root] + way * _length(own, root, end) / _length(other, root, end)
+    part, theirs = own.slice(there.start, there.stop), other.slice(here.start, here.stop)
+    turn = rotations.about_y(heading(part.local_quat_xyzw[:, 0]) - heading(theirs.local_quat_xyzw[:, 0]))
+    places, quats = theirs.joint_positions(), part.local_quat_xyzw.clone()
+    world, given = part.joint_rotations(), theirs.joint_rotations()
+    above = world[:, CANONICAL.parents[limb.upper]]
+    for joint in (limb.upper, limb.lower, limb.end):
+        wanted = rotations.multiply(turn, given[:, joint])
+        quats[:, joint] = rotations.multiply(rotations.inverse(above), wanted)
+        above = wanted
+    bent = replace(part, local_quat_xyzw=quats)
+    goals = bent.joint_positions().clone()
+    size = _length(own, limb.upper, limb.end) / _length(other, limb.upper, limb.end)
+    way = rotations.rotate(turn, places[:, limb.end] - places[:, limb.upper])
+    goals[:, limb.end] = goals[:, limb.upper] + size * way
+    free = torch.zeros(goals.shape[:2], dtype=torch.bool)
+    free[:, [limb.upper, limb.lower]] = True
+    solved = inverse_kinematics.solve(goals, quats, own.skeleton, free=free, limbs=(limb,),
+                                      root_position=part.root_position)  # fmt: skip
+    whole = posed.local_quat_xyzw.clone()
+    whole[there] = torch.where(free[..., None] | _is(limb.end), solved, whole[there])
+    whole[there, limb.end] = quats[:, limb.end]
+    return replace(posed, local_quat_xyzw=rotations.sign_continuous(whole))
+
+
+def _is(joint: int) -> Tensor:
+    return (torch.arange(CANONICAL.num_joints) == joint)[None, :, None]
+
+
+def _margins(own: Motion, posed: Motion, limbs: Sequence[Limb], there: slice, asked: float | None) -> tuple[int, int]:
+    """Frames before and after in which limbs go there and back: as asked, or as long as they take so far without
+    haste.
+    """
+    fps, found = float(own.fps), []
+    for frame in (there.start, there.stop - 1):
+        way = (posed.slice(frame, frame + 1).joint_positions() - own.slice(frame, frame + 1).joint_positions())[0]
+        far = max(float(way[limb.end].norm()) for limb in limbs)
+        found.append(round(fps * (max(_LEAST, math.sqrt(_JERKLESS * far / _CALM)) if asked is None else asked)))
+    return found[0], found[1]
+
+
+def _haste(
+    own: Motion, posed: Motion, borrowed: Borrowed, limbs: Sequence[Limb], free: slice, there: slice
+) -> tuple[str, ...]:
+    """A word on limbs that have to go far in little time, with numbers."""
+    notes, fps = [], float(own.fps)
+    for frame, count in ((there.start, there.start - free.start), (there.stop - 1, free.stop - there.stop)):
+        way = (posed.slice(frame, frame + 1).joint_positions() - own.slice(frame, frame + 1).joint_positions())[0]
+        for name, limb in zip(borrowed.limbs, limbs, strict=True):
+            far, needed = (
+                float(way[limb.end].norm()),
+                _JERKLESS * float(way[limb.end].norm()) * (fps / max(1, count)) ** 2,
+            )
+            if needed > _HASTY:
+                notes.append(f"{name} goes {100 * far:.0f} cm in {count / fps:.2f} s beside frame {frame}, which takes "
+                             f"{needed:.0f} m/s^2; {_HASTY:.0f} is the most that is common: a margin of "
+                             f"{math.sqrt(_JERKLESS * far / _HASTY):.2f} s would do")  # fmt: skip
+    return tuple(notes)
 
 
 def _length(motion: Motion, root: int, end: int) -> float:
@@ -97,5 +159,5 @@ def _check(motion: Motion, source: Motion, borrowed: Borrowed) -> None:
     last = borrowed.at + borrowed.stop - borrowed.start
     if not 0 <= borrowed.at < last <= motion.num_frames:
         raise RequestError(f"frames {borrowed.at}:{last} are not within the motion's 0:{motion.num_frames}")
-    if not 0 <= borrowed.margin <= 10:
+    if borrowed.margin is not None and not 0 <= borrowed.margin <= 10:
         raise RequestError(f"the margin must lie between 0 and 10 seconds, got {borrowed.margin:g}")

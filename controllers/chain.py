@@ -39,10 +39,12 @@ class ChainSettings:
 def chain(
     clips: Sequence[Motion], infiller: Inbetweener | None, *, generator: torch.Generator,
     settings: ChainSettings | None = None, filling: InfillSettings | None = None, densities: Sequence[Any] = (),
+    extending: Sequence[Any] = (),
 ) -> Infilled:  # fmt: skip
     """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
 
-    Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's.
+    Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's. In gaps
+    that the infiller does not know, one of the densities `extending` is rolled if it slides less.
     """
     settings = settings or ChainSettings()
     if len(clips) < 2:
@@ -64,7 +66,7 @@ def chain(
                                    local_quat_xyzw=whole.local_quat_xyzw[held])).join(piece)  # fmt: skip
     assert whole is not None, "there are clips"
     rigged = replace(from_canonical(whole, rigmap), source=clips[0].source)
-    return infill(rigged, infiller, masks, settings=filling, densities=densities)
+    return infill(rigged, infiller, masks, settings=filling, densities=densities, extending=extending)
 
 
 def _piece(clip: Motion, body: Motion, frames: int) -> Motion:

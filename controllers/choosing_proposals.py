@@ -6,7 +6,7 @@ long way round, a limb that jumps.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -23,12 +23,17 @@ from mapctl.gaps.targets import LIMBS, Targets
 from mapctl.metrics import worst
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.solver.methods import LatentMethod
+from mapctl.solver.proposals import zero_start
 from mapctl.terms.footing import TOES
 
 INFILLER = "infiller"
 STANDING = "standing still"
 _TOES = [CANONICAL.index(name) for name in TOES]
 _ENDS = [limb.end for limb in LIMBS.values()]
+_SKATE_REACH = 0.025  # metres
 _SURE = 4.0  # log odds of contacts of somebody who stands
 
 
@@ -42,9 +47,9 @@ class ChoiceSettings:
     """Known frames on both sides of a gap from which on the infiller knows how somebody moves."""
     known: int = 60
     """Frames of the longest gap between such that it fills unasked: the mean length that it was trained on."""
-    good: float = 0.08
+    good: float = 0.15
     """Cost, m/s, of an answer with which nobody else is asked."""
-    tempos: tuple[float, ...] = (1.0, 0.94, 1.06, 0.88, 1.12)
+    tempos: tuple[float, ...] = (1.0, 0.94, 1.06)
     """Of rollouts, in this order: how long they are before they are brought to the gap's length. Steps then end
     earlier or later, which is what a rollout that starts from one pose cannot choose otherwise."""
     same_pose: float = 0.06
@@ -57,10 +62,13 @@ class ChoiceSettings:
     """Weight of a way that is longer than the straight one, m/s."""
     missed: float = 0.3
     """Weight of the distance at which a rollout would have arrived, per second: m/s for a metre."""
-    step: float = 0.16
+    step: float = 0.13
     """Metres that hands and feet go in a frame, seen from the hips, from which on it counts."""
-    rolling: RolloutSettings = RolloutSettings(temperature=0.0, longest=300)
-    """Rollouts: the likeliest ones."""
+    rolling: RolloutSettings = field(default_factory=lambda: RolloutSettings(
+        temperature=0.0, longest=300, method=LatentMethod(
+            rounds=2, proposal=zero_start, lbfgs=LbfgsSettings(max_iterations=16),
+            budget=Budget(evaluations=48))))  # fmt: skip
+    """Rollouts: the likeliest ones, without a swarm before L-BFGS, which did not lower the cost here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +96,7 @@ def choose_proposals(
     best = _Candidate(proposal, odds, INFILLER, 0.0)
     for start, stop in whole_gaps(gap):
         if _knows_enough(gap, start, stop, settings):
+            sources.append(GapSource(start, stop, INFILLER))
             continue
         best = _best(gap, best, roller, (start, stop), settings, wanted=targets)
         sources.append(GapSource(start, stop, best.by))
@@ -112,9 +121,9 @@ def _best(
     """Of the infiller's answer, standing still, and rollouts of several tempos, the one that costs least."""
     start, stop = part
     first = replace(before, by=INFILLER, cost=viewers_cost(before.body, before.odds, part, settings))
-    if wanted is None or not bool(wanted.wanted[start:stop].any()):
-        if _stands(gap, start, stop, settings):
-            return _standing(gap, first, part)
+    on_the_way = wanted is not None and bool(wanted.wanted[start:stop].any())
+    if not on_the_way and _stands(gap, start, stop, settings):
+        return _standing(gap, first, part)
     found = [first]
     if roller is None or not settings.rolling.shortest <= stop - start <= settings.rolling.longest:
         return first
@@ -139,9 +148,9 @@ def viewers_cost(
     places, fps = motion.joint_positions()[start:stop], float(motion.fps)
     toes, hips = places[:, _TOES], places[:, 0]
     height = rest_height(motion, contacts.steadied(odds > 0))
-    slide = float(worst.support_slide(toes, height, fps).mean())
-    low = (height + 0.025 - toes[1:, :, 1]).clamp(0, 0.025) / 0.025
-    skate = float((torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps * low).mean())
+    above, speeds = toes[1:, :, 1] - height, torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
+    slide = float(contacts.support_speed(above, speeds).mean())
+    skate = float((speeds * (1 - above / _SKATE_REACH).clamp(0, 1)).mean())
     ground = hips[:, ::2]
     way = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
     jump = max(0.0, worst.peaks(places[:, _ENDS], hips, fps).step - settings.step)

@@ -15,7 +15,7 @@ from mapctl.retarget import to_canonical
 from mapctl.rigs import Rig
 from mapctl.solver.objective import Objective
 from mapctl.solver.result import Ledger
-from mapctl.terms import Clearance, Likelihood, Seam, Term
+from mapctl.terms import Clearance, Likelihood, Seam, Support, Term
 from mapctl.trial import Trial
 
 _PAST = 3  # frames that the others are seen after
@@ -24,8 +24,8 @@ _PAST = 3  # frames that the others are seen after
 def energy_of(
     motion: Motion, stands: Bool[Tensor, "frames 2"], density: Any, settings: StandingSettings, rig: Rig | None = None
 ) -> Ledger:
-    """By term: the likelihood under a density, footing, clearance and jerk, of a motion on any rig of more than three
-    frames at the prior's rate; `stands` are its contacts at that rate.
+    """By term: the likelihood under a density, footing, clearance, what the body stands on, and jerk, of a motion on
+    any rig of more than three frames at the prior's rate; `stands` are its contacts at that rate.
     """
     canonical = to_canonical(motion, rig)[0].resample(PRIOR_FPS)
     bits = stands[: canonical.num_frames]
@@ -42,6 +42,7 @@ def energy_of(
     height = rest_height(canonical, bits)
     terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, rest_height=height)]
     terms.append(replace(settings.clearance or Clearance(), rest_height=height))
+    terms.append(Support(rest_height=height))
     terms.append(settings.seam or Seam(sigma=50.0, frames=len(features)))
     contacts = features[:, LAYOUT.slices["contacts"]] > 0.5
     trial = Trial(shown, place, torch.zeros_like(shown), nats, contacts[None, _PAST:],

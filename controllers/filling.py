@@ -13,6 +13,7 @@ from torch import Tensor
 
 from controllers.answers import Another, GapSource
 from controllers.canonical_gap import CanonicalGap
+from controllers.gap_notes import notes_of
 from controllers.gap_standing import FINISHING, stood
 from controllers.partial_keys import propose_through
 from controllers.standing import StandingSettings
@@ -111,6 +112,7 @@ def fill(
     filled = from_canonical(_at_rate_of(canonical, made, gap.seconds), rigmap, base)
     done = _closed(put_back(filled, base, lost), lost, motion)
     done, notes = _on_target(done, targets, lost, motion, rig)
+    notes = (*notes, *notes_of(gap, made, answer.sources, fps=float(motion.fps)))
     return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes, answer.sources)
 
 

@@ -55,4 +55,4 @@ def infill(
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course,
                 another=another)  # fmt: skip
     last = done.sources[-1].by if done.sources and lost.root[-1] else first
-    return replace(done, notes=end_notes(lost, first, last))
+    return replace(done, notes=(*end_notes(lost, first, last), *done.notes))

@@ -35,8 +35,8 @@ _ASTRAY = 0.4  # of the way that is gone meanwhile: how far a trajectory may wel
 _STROLL = 0.2  # m/s from which a trajectory tells where somebody faces
 _STEP_SECONDS = 0.25
 _ARM_SECONDS, _ARM_CALM = 0.15, 15.0
-"""Least time over which a limb goes to its place, and the acceleration (m/s^2) at which it goes farther: a sixth of what
-hands and feet of walking people reach."""
+"""Least time over which a limb goes to its place, and the acceleration (m/s^2) at which it goes farther: a sixth of
+what hands and feet of walking people reach."""
 _TRUNK_SECONDS, _TRUNK_CALM = 0.25, 3.0
 """The same of hips and trunk."""
 _ARMS = tuple(joint for name, limb in LIMBS.items() if name.endswith("Hand")
@@ -162,7 +162,7 @@ def _course(ground: Float[Tensor, "frames 2"], fps: float) -> tuple[Float[Tensor
 
 
 def _under_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
-    """The motion with the hips of `known` in these frames; it faces with them, and what they carry keeps its own tilt."""
+    """The motion with the hips of `known` in these frames; it faces with them, and what they carry keeps its tilt."""
     quats, root = body.local_quat_xyzw.clone(), body.root_position.clone()
     facing = heading(known.local_quat_xyzw[:, 0]) - heading(quats[:, 0])
     turned = rotations.multiply(rotations.about_y(facing), quats[:, 0])

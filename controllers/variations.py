@@ -38,7 +38,7 @@ class Variation:
     infilled: Infilled
     """The motion, and how it became so."""
     ledger: Ledger
-    """Of the finished motion, by term: likelihood, footing, clearance and jerk."""
+    """Of the finished motion, by term: likelihood, footing, clearance, support and jerk."""
 
     @property
     def energy(self) -> float:
@@ -70,7 +70,7 @@ def variations(
         raise RequestError(f"variations are 2 to {MOST}, got {count}")
     settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [_first(motion, make)]
+    found = [_first(motion, partial(make, rollable=rollable))]
     density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
     found += _rollouts(make, count - 1, density, generator, rolling, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
@@ -125,9 +125,7 @@ def _rollouts(
     return found
 
 
-def _straight(
-    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None
-) -> Answer:
+def _straight(gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None) -> Answer:
     """Slerp's proposal, with the infiller's contacts."""
     return Answer(gap.motion, odds)
 

@@ -63,6 +63,16 @@ def without_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bo
     return spread.unfold(-1, shortest, 1).any(dim=-1).T
 
 
+def support_speed(
+    heights: Float[Tensor, "*batch feet"], speeds: Float[Tensor, "*batch feet"], near: float = 0.05
+) -> Float[Tensor, "*batch"]:
+    """Speed over the ground, m/s, of the slowest of the toes less than `near` metres over their rest height: of what
+    the body stands on; 0 where none is near, in flight.
+    """
+    close = heights < near
+    return torch.where(close.any(dim=-1), torch.where(close, speeds, torch.inf).amin(dim=-1), 0.0)
+
+
 STEADY = 3
 """Frames at the prior's rate that a contact, or a gap in one, lasts at least: `ContactSettings.shortest`."""
 

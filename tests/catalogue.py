@@ -17,6 +17,7 @@ from mapctl.terms import (
     Path,
     Seam,
     Steps,
+    Support,
     Term,
     Travel,
 )
@@ -47,6 +48,7 @@ TERMS: dict[str, Term] = {
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
     "footing": Footing(),
     "steps": Steps(0.6),
+    "support": Support(rest_height=0.08),
     "observation": _OBSERVED,
     "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
     "seam": Seam(sigma=300.0),

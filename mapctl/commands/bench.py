@@ -1,6 +1,7 @@
 """`mapctl bench`: cost of the solver, and the ablation of its choices, on this machine."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -25,9 +26,19 @@ class Bench:
     what: Positional[
         Annotated[
             Literal[
-                "speed", "ablation", "free-run", "generation", "steer", "live", "denoise", "infill", "tween", "timing"
+                "speed",
+                "ablation",
+                "free-run",
+                "generation",
+                "steer",
+                "live",
+                "denoise",
+                "infill",
+                "tween",
+                "timing",
+                "gaps",
             ],
-            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill|tween|timing"),
+            arg(metavar="speed|ablation|free-run|generation|steer|live|denoise|infill|tween|timing|gaps"),
         ]
     ] = "speed"
     """`speed`: milliseconds a frame, fast path and reference; `ablation`: starts and unknowns compared;
@@ -36,7 +47,8 @@ class Bench:
     same against the wall clock, for one, two and four characters at once; `denoise`: clips that training did not see,
     spoilt in several ways, beside filters tuned on the truth; `infill`: such clips with pieces taken out; `tween`: such
     clips of which keys are left, and such clips without their ends; `timing`: pairs of their poses, and the time
-    between them that `mapctl tween --suggest-timing` would suggest."""
+    between them that `mapctl tween --suggest-timing` would suggest; `gaps`: such clips without frames in their middle,
+    and how far the answers are from the truth, by who gave them."""
     prior: options.MaybeName = None
     """A bundled prior, or the file or run folder of a trained one; locomotion, and locomotion-live for `steer` and
     `live`, if not given; for `denoise` as that command takes it; for `tween` auto."""
@@ -67,7 +79,8 @@ class Bench:
         compute_on_one()
         from mapctl import report
 
-        others = {"denoise": self._denoise, "infill": self._infill, "tween": self._tween, "timing": self._timing}
+        others = {"denoise": self._denoise, "infill": self._infill, "tween": self._tween, "timing": self._timing,
+                  "gaps": self._gaps}  # fmt: skip
         rows = others.get(self.what, self._of_a_prior)()
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
@@ -124,15 +137,25 @@ class Bench:
         return [*rows, *by_kind(kinds, infiller), *lost_joints(kinds, infiller)]
 
     def _tween(self) -> list[dict[str, Any]]:
-        import priors
         from controllers.bench_tween import table
+
+        return self._of_kinds(table)
+
+    def _gaps(self) -> list[dict[str, Any]]:
+        from controllers.bench_gaps import table
+
+        return self._of_kinds(table)
+
+    def _of_kinds(self, table: "Callable[..., list[dict[str, Any]]]") -> list[dict[str, Any]]:
+        """A table over canonical clips by kind, of the infiller and densities."""
+        import priors
         from mapctl import retarget
         from mapctl.features import PRIOR_FPS
 
         infiller, kinds = priors.load_infiller(self.infiller), {}
         for clip in self._clips_by_kind(infiller.card):
             kinds.setdefault(clip.kind, []).append(retarget.to_canonical(clip.motion)[0].resample(PRIOR_FPS))
-        with bar("tweening") as progress:
+        with bar(self.what) as progress:
             return table(kinds, infiller, priors.load_choice(self.prior or "auto"), progress=progress)
 
     def _timing(self) -> list[dict[str, Any]]:

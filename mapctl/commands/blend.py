@@ -27,8 +27,9 @@ class Blend:
     """Where they go in IN, or seconds as in 1.5s."""
     out: options.OutFile
     """Where the motion goes."""
-    margin: options.Number = 0.5
-    """Seconds before and after in which the limb goes there and back."""
+    margin: options.MaybeNumber = None
+    """Seconds before and after in which the limb goes there and back; as long as the distance asks for, if not
+    given."""
     method: Annotated[Literal["infiller", "map"], arg(metavar="infiller|map")] = "map"
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones."""
     infiller: options.Name = "infiller"

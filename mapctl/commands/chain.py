@@ -53,6 +53,7 @@ class Chain:
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         done = chain([options.read_motion(path, None) for path in self.clips], infiller, settings=settings,
                      filling=InfillSettings(method=self.method),
+                     extending=priors.load_choice("auto") if self.method == "map" else (),
                      generator=torch.Generator().manual_seed(self.seed))  # fmt: skip
         formats.save(done.motion, self.out)
         if self.video is not None:
@@ -66,6 +67,8 @@ class Chain:
             filled = int(done.lost.frames.sum())
             print(f"{self.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(self.clips)}"
                   f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame")  # fmt: skip
+            for note in done.notes:
+                print(note)
         return 0
 
     def _gap(self) -> tuple[int, int]:

@@ -42,7 +42,9 @@ class Tween:
     """Tell how many frames the way from each whole pose to the next takes in mocap, beside what is given; the motion
     keeps the given timing."""
     method: Annotated[Literal["map", "infiller", "slerp"], arg(metavar="map|infiller|slerp")] = "map"
-    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. slerp: none of it."""
+    """map: the infiller proposes, or a density is rolled between keys so far apart that the infiller would slide, and
+    the MAP stage finishes; a note tells for every gap who proposed. infiller: its proposal on rigid bones. slerp: none
+    of it."""
     rig: options.MaybeRig = None
     """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
     infiller: options.MaybeName = None
@@ -166,7 +168,9 @@ class Tween:
         settings = InfillSettings(method=method)
         if self.best_of > 1 and infiller is not None:
             return tween_variations.best(self, asked, infiller, settings)
-        return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig)
+        rollable = () if method != "map" else priors.load_choice(self.prior or "auto")
+        return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig,
+                     rollable=rollable)  # fmt: skip
 
     def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:
         from controllers.tween import key_errors

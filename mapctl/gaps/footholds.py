@@ -26,15 +26,22 @@ def hold_planted(
     """
     places, ends = motion.joint_positions(), motion.joint_positions().clone()
     for foot, toe in enumerate(_TOES):
-        moved, firm = torch.zeros_like(places[:, toe]), ~free
+        moved = torch.zeros_like(places[:, toe])
         for _, start, stop in runs(stands[:, foot, None]):
-            held = ~free[start:stop]
-            track = places[start:stop, toe]
-            anchor = track[held].mean(dim=0) if bool(held.any()) else track.mean(dim=0)
-            anchor = torch.where(held.any() & torch.tensor([True] * 3), anchor, anchor.index_fill(0, torch.tensor(1), rest_height))
-            moved[start:stop] = torch.where(held[:, None], 0.0, anchor - track)
-            firm = firm | (stands[:, foot] & (torch.arange(len(free)) >= start) & (torch.arange(len(free)) < stop))
-        ankle = CANONICAL.parents[toe]
-        ends[:, ankle] += spread(moved, firm, seconds=_SECONDS, fps=float(motion.fps))
+            part = slice(start, stop)
+            moved[part] = _to_one_place(places[part, toe], ~free[part], rest_height)
+        firm = ~free | stands[:, foot]
+        ends[:, CANONICAL.parents[toe]] += spread(moved, firm, seconds=_SECONDS, fps=float(motion.fps))
     turning = free[:, None].expand(-1, CANONICAL.num_joints)
     return bend_limbs(motion, motion, ends, torch.zeros_like(turning), turning)
+
+
+def _to_one_place(
+    track: Float[Tensor, "stand 3"], held: Bool[Tensor, " stand"], rest_height: float
+) -> Float[Tensor, "stand 3"]:
+    """What brings a stand's frames, but those that are held, to the place of these, or to its own middle."""
+    if bool(held.any()):
+        return torch.where(held[:, None], 0.0, track[held].mean(dim=0) - track)
+    middle = track.mean(dim=0)
+    middle[1] = rest_height
+    return middle - track

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import inverse_kinematics, rotations
-from mapctl.gaps.targets import LIMBS, Targets
+from mapctl.gaps.targets import LIMBS, Targets, check_limbs
 from mapctl.kinematics import forward_kinematics
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
@@ -46,8 +46,10 @@ def reach_with_body(
     `turning` are joints that may turn and `moving` frames in which the hips may move; all else stays. By about `stray`
     (metres) the whole body, feet and all, may as well be elsewhere on the ground. Feet that are not wanted elsewhere
     keep their places but for that, and how they lie. Frames without a wanted place stay to the bit; a place that is out
-    of reach is pointed at. Also returns that shift over the ground, metres; nothing in all other frames.
+    of reach is pointed at. Also returns that shift over the ground, metres; nothing in all other frames. RequestError
+    for wanted places of joints that end no limb.
     """
+    check_limbs(targets)
     frames = targets.wanted.any(dim=1).nonzero()[:, 0]
     shifts = torch.zeros_like(body.root_position)
     if not len(frames):
@@ -96,7 +98,9 @@ def _least_offsets(
         # Woodbury: (1 + damping) I + J'J is inverted by way of the few residuals.
         gradient = unit + (jacobian.transpose(1, 2) @ now[..., None])[..., 0]
         firm = 1 + damping
-        inner = torch.linalg.solve(firm * identity + jacobian @ jacobian.transpose(1, 2), jacobian @ gradient[..., None])
+        inner = torch.linalg.solve(
+            firm * identity + jacobian @ jacobian.transpose(1, 2), jacobian @ gradient[..., None]
+        )
         step = -(gradient - (jacobian.transpose(1, 2) @ inner)[..., 0]) / firm[..., 0]
         tried = ask.residual((unit + step) * sigma)
         tried_cost = (unit + step).square().sum(1) + tried.square().sum(1)

@@ -1,5 +1,6 @@
 """Places that joints are to be at in frames that are otherwise free, and meeting them to the hair."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import inverse_kinematics
+from mapctl.errors import RequestError
 from mapctl.gaps import second_differences
 from mapctl.inverse_kinematics import Limb
 from mapctl.motion import Motion
@@ -21,7 +23,8 @@ LIMBS = {
     for side in ("left", "right")
 }  # fmt: skip
 """Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
-_REACH = 0.15  # seconds over which a limb goes to its place and back
+_REACH = 0.15  # seconds over which a limb goes to its place and back, at least
+_CALM = 15.0  # m/s^2 at which it goes farther
 _NOTHING = 1e-12  # metres
 
 
@@ -48,6 +51,14 @@ class Targets:
         return Targets(places, wanted)
 
 
+def check_limbs(targets: Targets) -> None:
+    """RequestError unless only ends of limbs, which can be brought to a place, are wanted somewhere."""
+    other = [name for name, some in zip(CANONICAL.names, targets.wanted.any(dim=0).tolist(), strict=True)
+             if some and name not in LIMBS]  # fmt: skip
+    if other:
+        raise RequestError(f"places are for {', '.join(LIMBS)}; {other[0]} has none")
+
+
 def missed(places: Float[Tensor, "frames joints 3"], targets: Targets) -> Float[Tensor, " frames"]:
     """By frame, how far the worst joint is from its place, metres."""
     away = (places - targets.places).norm(dim=-1)
@@ -56,15 +67,18 @@ def missed(places: Float[Tensor, "frames joints 3"], targets: Targets) -> Float[
 
 def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> Motion:
     """A canonical motion with limbs bent so that they are at their places, if these are in reach; they go there and
-    back smoothly within frames that are `free`.
+    back smoothly within frames that are `free`. RequestError for wanted places of joints that end no limb.
     """
+    check_limbs(targets)
     for limb in LIMBS.values():
         wanted = targets.wanted[:, limb.end] & free
         if not bool(wanted.any()):
             continue
         places = motion.joint_positions().clone()
         away = torch.where(wanted[:, None], targets.places[:, limb.end] - places[:, limb.end], 0.0)
-        offset = torch.where(free[:, None], second_differences.spread(away, wanted | ~free, seconds=_REACH, fps=float(motion.fps)), 0.0)
+        seconds = max(_REACH, math.sqrt(float(away.norm(dim=-1).max()) / _CALM))
+        offset = second_differences.spread(away, wanted | ~free, seconds=seconds, fps=float(motion.fps))
+        offset = torch.where(free[:, None], offset, 0.0)
         places[:, limb.end] += offset
         turning = torch.zeros(places.shape[:2], dtype=torch.bool)
         turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NOTHING)[:, None]

@@ -53,15 +53,3 @@ def longest_unsupported(toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor
         run = run + 1 if bad else 0
         longest = max(longest, run)
     return longest / fps
-
-
-def support_slide(
-    toes: Float[Tensor, "frames feet 3"], rest_height: float, fps: float
-) -> Float[Tensor, " steps"]:
-    """Speed over the ground, m/s, of the slowest toe within 5 cm of its rest height (metres), which is what the body
-    stands on, on the way to each frame but the first; 0 in flight.
-    """
-    near = (toes[1:, :, 1] < rest_height + _NEAR) & (toes[:-1, :, 1] < rest_height + _NEAR)
-    speed = torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
-    slowest = torch.where(near, speed, torch.inf).amin(dim=1)
-    return torch.where(near.any(dim=1), slowest, 0.0)

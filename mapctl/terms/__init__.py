@@ -11,9 +11,10 @@ from mapctl.terms.observation import Observation
 from mapctl.terms.path import Path
 from mapctl.terms.seam import Seam
 from mapctl.terms.steps import Steps
+from mapctl.terms.support import Support
 from mapctl.terms.travel import Travel
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe, Clearance)
+ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe, Clearance, Support)
 
 __all__ = [
     "ALL",
@@ -27,6 +28,7 @@ __all__ = [
     "Path",
     "Seam",
     "Steps",
+    "Support",
     "Term",
     "Travel",
 ]
