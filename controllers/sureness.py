@@ -15,7 +15,12 @@ GOING = 0.35
 its way."""
 KNOWN_FRAMES = 75
 """Of the longest gaps that the infiller was trained on: their mean length and a standard deviation."""
-MEASURED: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float]]] = {}
+MEASURED: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float]]] = {
+    ("infiller", "going", False): ((15, 5, 9), (180, 40, 80)),
+    ("infiller", "in place", False): ((15, 3, 9), (180, 20, 40)),
+    ("infiller", "going", True): ((15, 5, 9), (180, 40, 80)),
+    ("infiller", "in place", True): ((15, 5, 9), (180, 40, 80)),
+}
 """By who answered, whether the body was on its way, and whether frames beside the gap were known: frames of the gap and
 centimetres in half and in nine of ten of the clips; `mapctl bench gaps --data DATA --count 30`."""
 

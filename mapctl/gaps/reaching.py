@@ -159,8 +159,8 @@ def _softly_above(value: Tensor) -> Tensor:
 
 
 def _offset_pose(
-    x: Float[Tensor, "*batch offsets"], root: Float[Tensor, "*batch 3"], quats: Float[Tensor, "*batch joints 4"]
-) -> tuple[Tensor, Tensor, Float[Tensor, "*batch 3"]]:
+    x: Float[Tensor, "*more poses offsets"], root: Float[Tensor, "poses 3"], quats: Float[Tensor, "poses joints 4"]
+) -> tuple[Tensor, Tensor, Float[Tensor, "*more poses 3"]]:
     """Root and rotations with their offsets, and the shift of the whole body."""
     shift = torch.stack([x[..., 0], torch.zeros_like(x[..., 0]), x[..., 1]], dim=-1)
     turns = rotations.from_rotation_vector(x[..., 5:].unflatten(-1, (-1, 3)))
