@@ -20,5 +20,9 @@ class RequestError(MapctlError):
     """A wish, option or argument that cannot be."""
 
 
+class WriteError(RequestError):
+    """A place that cannot be written, or a disk that is full."""
+
+
 class CheckpointError(MapctlError):
     """Weights or a training run that do not fit this code."""

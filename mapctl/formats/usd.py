@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
 
 _ROOT = "/character"
+_REASON = re.compile(r"rror occurred writing file: (.+?)'")
 
 
 def is_installed() -> bool:
@@ -47,8 +49,18 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     check_finite(motion, path)
     stage = _stage(motion)
     with atomic_path(path) as scratch:
-        if not stage.GetRootLayer().Export(str(scratch)):
-            raise RequestError(f"cannot write {path}: USD does not say why")
+        _export(stage, scratch)
+
+
+def _export(stage: "Usd.Stage", scratch: Path) -> None:
+    """OSError where it cannot be written: USD itself raises an error of many lines, the reason among them."""
+    try:
+        written = stage.GetRootLayer().Export(str(scratch))
+    except RuntimeError as error:
+        found = _REASON.search(str(error))
+        raise OSError(found[1] if found else "USD cannot write there") from error
+    if not written:
+        raise OSError("USD does not say why")
 
 
 def _stage(motion: Motion) -> "Usd.Stage":

@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from mapctl import retarget, rigs
@@ -18,7 +17,7 @@ from mapctl.contacts import ContactSettings
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.formats import load
-from mapctl.formats.atomic import atomic_path
+from priors.tensor_files import write_tensors
 
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
@@ -169,5 +168,4 @@ def _read_cache(stored: Path) -> Corpus | None:
 
 def _write_cache(corpus: Corpus, stored: Path) -> None:
     index = json.dumps({"names": corpus.names, "lengths": corpus.lengths})
-    with atomic_path(stored) as beside:
-        save_file({"features": corpus.features}, beside, metadata={"index": index})
+    write_tensors(stored, {"features": corpus.features}, metadata={"index": index})

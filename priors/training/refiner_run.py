@@ -23,7 +23,7 @@ from priors import checkpoints, density
 from priors.density import LstmGmmDensity
 from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
 from priors.training import corpus as corpora
-from priors.training import run_files
+from priors.training import loop, run_files
 from priors.training.corpus import Corpus
 from priors.training.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
 
@@ -89,7 +89,7 @@ def train(request: RefinerRequest, progress: Progress = lambda line: None) -> Pa
     judge = Judge.of(sampled(prior, parts.train, request.judged, frames, generator), parts, request.realism)
     trainer = AdversarialTrainer(request.config, request.settings, parts.train, raw)
     run = _Run(request, trainer, judge, corpus.identity() | {"density": request.density, "match": match}, progress)
-    run.go()
+    loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
     return run.export(prior, raw)
 
 
@@ -161,42 +161,52 @@ _NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.of_lay
 
 
 class _Run:
-    """The loop, its guard and its checkpoints."""
+    """What `loop.go` does to a trainer, its guard and its checkpoints."""
 
     def __init__(
         self, request: RefinerRequest, trainer: AdversarialTrainer, judge: Judge, data: dict, progress: Progress
     ):
-        self.request, self.trainer, self.judge, self.data, self.progress = request, trainer, judge, data, progress
+        self.request, self.trainer, self.data, self.progress = request, trainer, data, progress
+        self.judge_samples = judge
         self.curve: list[Row] = []
-        self.losses: list[Losses] = []  # since the last line of news
+        self.losses: list[Losses] = []  # since the last line of news but one, where there has just been one
+        self.verdict: str | None = None
+        self.began = time.monotonic()
         self.best = {name: value.clone() for name, value in trainer.averaged.state_dict().items()}
         if request.resume:
             self._load()
             progress(f"resumed at round {trainer.round}")
         else:
             request.out.mkdir(parents=True, exist_ok=True)
-            self._judge()
+            self.judge()
 
-    def go(self) -> None:
-        """To the end of the recipe, or until one side has won."""
-        request, trainer = self.request, self.trainer
-        saved = began = time.monotonic()
-        while trainer.round < request.settings.rounds:
-            self.losses.append(trainer.train_round())
-            last = trainer.round == request.settings.rounds
-            report = last or trainer.round % request.report_rounds == 0
-            if report:
-                self._report(time.monotonic() - began)
-            if (verdict := self._verdict()) is not None:
-                self.progress(f"{verdict}: training ends with the best refiner seen")
-                break
-            if last or (report and trainer.round % request.judge_rounds == 0):
-                self._judge()
-            if report:
-                self.losses = []
-            if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
-                self._save()
-                saved = time.monotonic()
+    @property
+    def finished(self) -> bool:
+        """At the end of the recipe, or where one side has won."""
+        return self.verdict is not None or self.trainer.round >= self.request.settings.rounds
+
+    @property
+    def judgement_due(self) -> bool:
+        """At some lines of news and at the end of the recipe."""
+        measured = bool(self.curve) and self.curve[-1]["round"] == self.trainer.round
+        last = self.trainer.round >= self.request.settings.rounds
+        at_last = last or (self._reported and self.trainer.round % self.request.judge_rounds == 0)
+        return at_last and not measured and self.verdict is None
+
+    @property
+    def _reported(self) -> bool:
+        return self.trainer.round % self.request.report_rounds == 0
+
+    def update(self) -> None:
+        """One round."""
+        if self._reported:
+            self.losses = []
+        self.losses.append(self.trainer.train_round())
+        if self._reported or self.trainer.round >= self.request.settings.rounds:
+            self._report(time.monotonic() - self.began)
+        self.verdict = self._verdict()
+        if self.verdict is not None:
+            self.progress(f"{self.verdict}: training ends with the best refiner seen")
 
     def export(self, prior: LstmGmmDensity, raw: Corpus) -> Path:
         """Write the best refiner in float16 with its card."""
@@ -225,8 +235,9 @@ class _Run:
             return "the critic has won"
         return None
 
-    def _judge(self) -> None:
-        row = self.judge(self.trainer.averaged)
+    def judge(self) -> None:
+        """A row of the curve; the best refiner is kept."""
+        row = self.judge_samples(self.trainer.averaged)
         if not self.curve or score(row) < min(score(before) for before in self.curve):
             self.best = {name: value.clone() for name, value in self.trainer.averaged.state_dict().items()}
         row |= {"round": self.trainer.round, "score": score(row)}
@@ -237,7 +248,10 @@ class _Run:
     def _mean(self, kind: str) -> float:
         return sum(getattr(loss, kind) for loss in self.losses) / len(self.losses)
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """A checkpoint, unless training went wrong since the last: what is resumed there comes to the same end."""
+        if self.verdict is not None:
+            return
         tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
         index = self._index() | {"losses": [asdict(loss) for loss in self.losses]}
         run_files.write(self.request.out, step=self.trainer.round, tensors=tensors, index=index)
@@ -253,7 +267,7 @@ class _Run:
             index, tensors = run_files.read(out)
             for part in ("settings", "network", "data"):
                 run_files.check_same(out, part, then=index[part], now=self._index()[part])
-            self.curve = [dict(row) for row in index["curve"]]
+            self.curve = run_files.rows(index, "round")
             self.losses = [Losses(**row) for row in index["losses"]]
             self.best = {name: tensors[f"best.{name}"] for name in self.best}
             self.trainer.load_state(tensors)

@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from priors import checkpoints, density, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.settings import check_least
 from priors.training import corpus as corpora
-from priors.training import resume, run_files
+from priors.training import loop, resume, run_files
 from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
 from priors.training.starts import abilities, choose
@@ -84,7 +83,7 @@ def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path
     data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed),
                                 "labels": request.labels, "init": request.init or ""}  # fmt: skip
     curve = _resume(request, trainer, data, progress)
-    _loop(request, trainer, parts, curve, progress, save=partial(resume.save, request.out, trainer, curve, data))
+    loop.go(_Run(request, trainer, parts, curve, data, progress), checkpoint_minutes=request.checkpoint_minutes)
     return export(request, trainer, parts, curve)
 
 
@@ -151,27 +150,49 @@ def _mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
     return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
 
 
-def _loop(
-    request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve, progress: Progress, *,
-    save: Callable[[], None],
-) -> None:  # fmt: skip
-    saved, losses, began = time.monotonic(), [], time.monotonic()
-    while trainer.step < request.settings.steps:
-        losses.append(trainer.train_step())
-        last = trainer.step == request.settings.steps
-        if trainer.step % request.report_steps == 0 or last:
-            progress(f"step {trainer.step}: {sum(losses) / len(losses):.2f} nats, {time.monotonic() - began:.0f} s")
-            losses = []
-        due = last or time.monotonic() - saved > 60 * request.checkpoint_minutes
-        validate = last or trainer.step % request.validate_steps == 0
-        if due or validate:
-            trainer.check_finite()
-        if validate:
-            curve.append(_validate(trainer, parts))
-            progress(json.dumps(curve[-1]))
-        if due:
-            save()
-            saved = time.monotonic()
+class _Run:
+    """What `loop.go` does to a trainer, its curve and its checkpoints."""
+
+    def __init__(
+        self, request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve,
+        data: dict[str, str], progress: Progress,
+    ):  # fmt: skip
+        self.request, self.trainer, self.parts, self.curve = request, trainer, parts, curve
+        self.data, self.progress = data, progress
+        self.losses: list[float] = []  # since the last line of news
+        self.began = time.monotonic()
+
+    @property
+    def finished(self) -> bool:
+        """At the end of the recipe."""
+        return self.trainer.step >= self.request.settings.steps
+
+    @property
+    def judgement_due(self) -> bool:
+        """Every so many steps and at the end."""
+        step, measured = self.trainer.step, (self.curve[-1]["step"] or 0) if self.curve else 0
+        return step > measured and (self.finished or step % self.request.validate_steps == 0)
+
+    def update(self) -> None:
+        """One step."""
+        losses = self.losses
+        losses.append(self.trainer.train_step())
+        step = self.trainer.step
+        if self.finished or step % self.request.report_steps == 0:
+            mean, seconds = sum(losses) / len(losses), time.monotonic() - self.began
+            self.progress(f"step {step}: {mean:.2f} nats, {seconds:.0f} s")
+            losses.clear()
+
+    def judge(self) -> None:
+        """A row of the curve; MapctlError where the weights are no numbers."""
+        self.trainer.check_finite()
+        self.curve.append(_validate(self.trainer, self.parts))
+        self.progress(json.dumps(self.curve[-1]))
+
+    def save(self) -> None:
+        """A checkpoint; MapctlError, and none, where the weights are no numbers."""
+        self.trainer.check_finite()
+        resume.save(self.request.out, self.trainer, self.curve, self.data)
 
 
 def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float | None]:
