@@ -56,10 +56,11 @@ def test_help_names_what_a_refiner_takes(capsys):
 def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
     train = refiner_run.train
 
-    def tiny(request, say):
+    def tiny(request, say, *, warn):
         settings = replace(request.settings, window=10, batch=4, history=8, head_start=1, warm_up=1, critic_width=6)
         config = RefinerConfig(width=6, memory=5)
-        return train(replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say)
+        return train(replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say,
+                     warn=warn)  # fmt: skip
 
     monkeypatch.setattr(refiner_run, "train", tiny)
     data, prior = write_corpus(tmp_path / "data"), str(save_tiny_prior(tmp_path / "tiny.safetensors"))

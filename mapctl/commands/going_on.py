@@ -44,5 +44,5 @@ def _how(given: "Train") -> str:
     from priors.training.run_files import last_step
 
     step = last_step(given.out)
-    typed = shlex.join(words(replace(given, resume=True)))
+    typed = shlex.join([*words(replace(given, resume=False)), "--resume"])
     return "" if step is None else f"step {step} is saved; go on with: {typed}"

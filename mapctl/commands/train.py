@@ -68,6 +68,8 @@ class Train:
     """How much a kill may cost."""
     skip_first: bool = False
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used; if not given, such files are left out and listed."""
     licence: Annotated[str, arg(metavar="TEXT")] = "that of the training data"
     """Of the weights, for their card."""
     quiet: bool = False
@@ -97,7 +99,7 @@ class Train:
         outputs.check_folder(self.out)
         from priors.training import run
 
-        return run.train(request, say), "--prior"
+        return run.train(request, say, warn=training.warn), "--prior"
 
     def request(self) -> "TrainRequest":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -109,6 +111,7 @@ class Train:
             data=self.data, out=self.out, match=self.match or "", config=config, settings=settings,
             resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
             licence=self.licence, skip_first=self.skip_first, labels=self.labels, init=self.init,
+            strict_data=self.strict_data,
         )  # fmt: skip
 
     def _recipe(self) -> tuple["LstmGmmConfig", "TrainingSettings"]:

@@ -3,7 +3,6 @@
 import json
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -18,12 +17,10 @@ from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.settings import check_least
 from priors.training import corpus as corpora
 from priors.training import loop, resume, run_files
+from priors.training.gathering import Progress, Source, gather, of_card
 from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
 from priors.training.starts import abilities, choose
-
-Progress = Callable[[str], None]
-"""Called with one line of news."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +55,8 @@ class TrainRequest:
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     labels: str = ""
     """Regular expression whose named groups read labels from a clip's path, which the density can then be told."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     init: str | None = None
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
@@ -65,26 +64,27 @@ class TrainRequest:
         check_least(self, 1, "starts", "report_steps", "validate_steps")
 
 
-def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path:
-    """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
+def train(request: TrainRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path. `warn` is told of files that
+    cannot be used.
 
-    Killed and resumed, a run gives the same weights bit for bit on one machine (a test holds it to that). MapctlError
-    where training diverges; the last checkpoint then stays as it was.
+    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
+    the same weights bit for bit on one machine. MapctlError where training diverges; the last checkpoint then stays as
+    it was.
     """
     device = _device(request.device)
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-    corpus = corpora.read(request.data, match=request.match, cache=request.out / "cache",
-                          skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
-    parts = corpora.split(corpus, request.settings.seed)
-    progress(f"{len(corpus.names)} clips, {len(corpus.features)} frames; training on {len(parts.train.names)}")
+    source = Source(request.data, request.out, request.match, request.skip_first, request.strict_data,
+                    request.settings.seed)  # fmt: skip
+    corpus, parts = gather(source, progress=progress, warn=warn)
     trainer = _trainer(request, parts.train, device)
     data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed),
                                 "labels": request.labels, "init": request.init or ""}  # fmt: skip
     curve = _resume(request, trainer, data, progress)
     loop.go(_Run(request, trainer, parts, curve, data, progress), checkpoint_minutes=request.checkpoint_minutes)
-    return export(request, trainer, parts, curve)
+    return export(request, trainer, corpus, parts, curve)
 
 
 def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trainer:
@@ -97,7 +97,9 @@ def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trai
                    init=before.state_dict())  # fmt: skip
 
 
-def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve) -> Path:
+def export(
+    request: TrainRequest, trainer: Trainer, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve
+) -> Path:
     """Write the model in float16 with its starts and card."""
     model = trainer.model.cpu().eval()
     found = choose(
@@ -108,15 +110,15 @@ def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve:
                 "starts.cell": found.state.cell, "starts.speed": found.speed,
                 "starts.weight": found.weight}  # fmt: skip
     path = request.out / "model.safetensors"
-    checkpoints.save(tensors, _card(request, model, parts, curve, found.names), path)
+    checkpoints.save(tensors, _card(request, model, corpus, parts, curve, found.names), path)
     return path
 
 
 def _card(
-    request: TrainRequest, model: LstmGmm, parts: corpora.Split, curve: resume.Curve, starts: tuple[str, ...]
-) -> checkpoints.Card:
-    data = {"clips": sum(len(p.names) for p in (parts.train, parts.validation, parts.test)),
-            "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
+    request: TrainRequest, model: LstmGmm, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve,
+    starts: tuple[str, ...],
+) -> checkpoints.Card:  # fmt: skip
+    data = {"clips": len(corpus.names), "frames": len(corpus.features), **of_card(corpus),
             "match": request.match, "labels": request.labels,
             "split_seed": request.settings.seed, "starts": list(starts),
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
@@ -222,11 +224,3 @@ def _device(wanted: str) -> str:
     if wanted == "cuda" and not torch.cuda.is_available():
         raise RequestError("this machine has no CUDA device; use --device cpu")
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
-
-
-def _reading(progress: Progress) -> Callable[[int, int], None]:
-    def news(done: int, total: int) -> None:
-        if done % 200 == 0 or done == total:
-            progress(f"read {done} of {total} clips")
-
-    return news

@@ -15,10 +15,8 @@ from priors import checkpoints
 from priors.settings import NetworkConfig
 from priors.training import corpus as corpora
 from priors.training import loop, run_files
+from priors.training.gathering import Progress, Source, gather, of_card
 from priors.training.trainer import Trainer
-
-Progress = Callable[[str], None]
-"""Called with one line of news."""
 
 
 @runtime_checkable
@@ -66,6 +64,8 @@ class WindowRequest(Generic[C, S]):
     """Of the weights, for the card."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""
 
@@ -84,19 +84,23 @@ class Kind(Generic[C, S]):
     """Options of the command that the network's shape needs; those that are the defaults are left out."""
 
 
-def train(request: WindowRequest[C, S], kind: Kind[C, S], progress: Progress = lambda line: None) -> Path:
-    """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
+def train(
+    request: WindowRequest[C, S], kind: Kind[C, S], progress: Progress = lambda line: None, *,
+    warn: Progress = lambda line: None,
+) -> Path:  # fmt: skip
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path. `warn` is told of files that
+    cannot be used.
 
-    Killed and resumed, a run gives the same weights bit for bit on one machine.
+    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
+    the same weights bit for bit on one machine.
     """
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-    corpus = corpora.read(
-        request.data, match=request.match, cache=request.out / "cache", skip_first=request.skip_first,
-        progress=lambda done, of: progress(f"read {done} of {of} clips") if done % 200 == 0 or done == of else None,
-    )  # fmt: skip
-    run = _Run(request, kind, corpus.identity(), corpora.split(corpus, request.settings.seed), progress)
+    source = Source(request.data, request.out, request.match, request.skip_first, request.strict_data,
+                    request.settings.seed)  # fmt: skip
+    corpus, parts = gather(source, progress=progress, warn=warn)
+    run = _Run(request, kind, corpus, parts, progress)
     loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
     return run.export()
 
@@ -105,10 +109,11 @@ class _Run(Generic[C, S]):
     """What `loop.go` does to a trainer, its curve and its checkpoints."""
 
     def __init__(
-        self, request: WindowRequest[C, S], kind: Kind[C, S], data: dict[str, str], parts: corpora.Split,
+        self, request: WindowRequest[C, S], kind: Kind[C, S], corpus: corpora.Corpus, parts: corpora.Split,
         progress: Progress,
     ):  # fmt: skip
-        self.request, self.kind, self.data, self.parts, self.progress = request, kind, data, parts, progress
+        self.request, self.kind, self.parts, self.progress = request, kind, parts, progress
+        self.data, self.skipped = corpus.identity(), of_card(corpus)
         self.trainer = kind.trainer(request.config, request.settings, parts.train)
         self.curve: list[dict[str, float]] = []
         self.news: list[dict[str, float]] = []  # since the last line
@@ -164,7 +169,8 @@ class _Run(Generic[C, S]):
         held = {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
         card = checkpoints.Card(
             kind=self.kind.name, config=request.config.as_card(), licence=request.licence,
-            data={**self.data, "match": request.match, "split_seed": request.settings.seed, "held_out": held},
+            data={**self.data, **self.skipped, "match": request.match, "split_seed": request.settings.seed,
+                  "held_out": held},
             training={"settings": _fields(request.settings), "curve": self.curve,
                       "command": command(request, self.kind)},
             quality={"test": self.kind.validate(self.trainer.network, self.parts.test, request.settings)},
