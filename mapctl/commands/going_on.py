@@ -1,7 +1,7 @@
-"""How a training run that ended early goes on: one line that can be typed."""
+"""What there is of work that ended early, and how it goes on, in one line."""
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
@@ -20,7 +20,29 @@ def telling_how_to_go_on(given: "Train") -> Iterator[None]:
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(_how(given) or "nothing was saved yet") from stop
     except WriteError as error:
-        raise WriteError("; ".join(filter(None, (str(error), _how(given))))) from error
+        raise WriteError(_joined(str(error), _how(given))) from error
+
+
+@contextmanager
+def telling_what_is_finished(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
+    """Yield a function that is told how many are finished; Ctrl-C, SIGTERM and a full disk say it, and what to do
+    `then`.
+    """
+    finished = 0
+
+    def tell(number: int) -> None:
+        nonlocal finished
+        finished = number
+
+    def kept() -> tuple[str, ...]:
+        return (f"{finished} of {count} {what} are finished", then) if finished else ()
+
+    try:
+        yield tell
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(_joined(str(stop), *kept())) from stop
+    except WriteError as error:
+        raise WriteError(_joined(str(error), *kept())) from error
 
 
 def words(given: "Train") -> list[str]:
@@ -37,6 +59,10 @@ def words(given: "Train") -> list[str]:
         else:
             typed += [name, str(value)]
     return typed
+
+
+def _joined(*parts: str) -> str:
+    return "; ".join(filter(None, parts))
 
 
 def _how(given: "Train") -> str:

@@ -1,5 +1,6 @@
 """Output files appear whole or not at all: written beside their place, then renamed onto it."""
 
+import errno
 import os
 import secrets
 import stat
@@ -9,7 +10,7 @@ from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
-from mapctl.errors import WriteError
+from mapctl.errors import DiskFullError, WriteError
 
 
 @contextmanager
@@ -32,7 +33,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         _permit(scratch, mode)
         scratch.replace(target)
     except OSError as error:
-        raise WriteError(f"cannot write {path}: {error.strerror or error}") from error
+        raise _refusal(path, error) from error
     finally:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
@@ -57,7 +58,7 @@ def check_writable(path: str | PathLike[str]) -> None:
         with tempfile.NamedTemporaryFile(dir=target.parent):
             pass
     except OSError as error:
-        raise WriteError(f"cannot write {path}: {error.strerror or error}") from error
+        raise _refusal(path, error) from error
 
 
 def check_folder(folder: str | PathLike[str]) -> None:
@@ -68,6 +69,11 @@ def check_folder(folder: str | PathLike[str]) -> None:
     if not place.is_dir():
         raise WriteError(f"cannot write to {folder}: {place} is not a folder")
     check_writable(place / ".mapctl")
+
+
+def _refusal(path: str | PathLike[str], error: OSError) -> WriteError:
+    kind = DiskFullError if error.errno in (errno.ENOSPC, errno.EDQUOT) else WriteError
+    return kind(f"cannot write {path}: {error.strerror or error}")
 
 
 def _check_place(path: str | PathLike[str], target: Path) -> None:

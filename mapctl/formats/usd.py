@@ -8,6 +8,8 @@ Needs the package usd-core: pip install 'mapctl[usd]'.
 # The package loads its modules at run time and declares no types.
 # pyright: reportAttributeAccessIssue=false
 
+import errno
+import os
 import re
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -58,7 +60,9 @@ def _export(stage: "Usd.Stage", scratch: Path) -> None:
         written = stage.GetRootLayer().Export(str(scratch))
     except RuntimeError as error:
         found = _REASON.search(str(error))
-        raise OSError(found[1] if found else "USD cannot write there") from error
+        reason = found[1] if found else "USD cannot write there"
+        number = next((number for number in (errno.ENOSPC, errno.EDQUOT) if os.strerror(number) == reason), None)
+        raise OSError(number, reason) from error
     if not written:
         raise OSError("USD does not say why")
 
