@@ -303,6 +303,17 @@ def test_what_cannot_be_trained_on_is_refused_before_anything_is_written(tmp_pat
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
+def test_two_clips_are_enough_and_a_third_that_is_none_is_left_out(tmp_path, request_in):
+    folder = write_corpus(tmp_path / "two", count=2, frames=100)
+    (folder / "walk-broken.bvh").write_text("HIERARCHY")
+    request, warnings = replace(request_in(tmp_path / "run"), data=folder), []
+    card = priors.load_refiner(str(train(request, warn=warnings.append))).card
+    assert set(card.data["skipped"]) == {"walk-broken.bvh"}
+    assert warnings[0].startswith(f"left out 1 of 3 files: {folder / 'walk-broken.bvh'}: ")
+    with pytest.raises(RequestError, match=r"--strict-data: .*walk-broken\.bvh: "):
+        train(replace(request, out=tmp_path / "strict", strict_data=True))
+
+
 def test_a_refiner_is_no_density_to_refine(tmp_path, request_in, begun):
     with pytest.raises(CheckpointError, match="a refiner is no density"):
         train(request_in(tmp_path / "run", density=str(begun)))

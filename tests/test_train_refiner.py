@@ -32,10 +32,10 @@ def test_what_is_not_asked_for_is_the_measured_recipe():
 
 def test_every_option_reaches_the_trainer():
     given = requested("--density", "mine", "--match", "walk", "--steps", "7", "--batch", "6", "--window", "20",
-                      "--seed", "3", "--bfloat16", "--resume", "--licence", "CC0", "--device", "cpu",
+                      "--seed", "3", "--bfloat16", "--resume", "--licence", "CC0", "--device", "cpu", "--strict-data",
                       "--minutes-between-checkpoints", "0.5")  # fmt: skip
     assert (given.density, given.match, given.resume, given.licence) == ("mine", "walk", True, "CC0")
-    assert given.checkpoint_minutes == 0.5
+    assert (given.checkpoint_minutes, given.strict_data) == (0.5, True)
     assert given.settings == replace(
         AdversarialSettings(), rounds=7, batch=6, window=20, seed=3, bfloat16=True
     )  # the rest stays
