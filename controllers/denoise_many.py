@@ -1,4 +1,6 @@
-"""Denoise many files, over processes (joblib) or over a cluster (ray). No file's failure stops another."""
+"""Denoise many files, over processes (joblib) or over a cluster (ray). No file's failure stops another, but a full disk
+stops all.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +14,7 @@ from controllers.denoise_piece import DenoiseSettings
 from controllers.denoised import Denoised
 from mapctl import formats
 from mapctl.capture.masks import of_missing
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import DiskFullError, MapctlError, RequestError
 from mapctl.protocols import Denoiser
 from mapctl.rigs import Rig
 
@@ -55,7 +57,9 @@ class Cleaner:
     """Called with each result, in that process: to write a report."""
 
     def __call__(self, job: Job) -> Done:
-        """Denoise one file and write the result; what goes wrong with it is said in what is returned."""
+        """Denoise one file and write the result; what goes wrong with it is said in what is returned, but for a full
+        disk, which is a DiskFullError.
+        """
         torch.set_num_threads(1)
         try:
             unit = None if self.rig is None else self.rig.metres_per_unit
@@ -67,6 +71,8 @@ class Cleaner:
                 self.after(job, done)
             # Last, so that a file which is there is a file which is done.
             formats.save(done.motion, job.out)
+        except DiskFullError:
+            raise  # no other file would find room
         except (MapctlError, OSError) as error:
             return Done(job, error=" ".join(str(error).split()))
         except Exception as error:

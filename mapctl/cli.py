@@ -1,8 +1,8 @@
 """The command line: parse, run one command, turn errors into exit statuses. Nothing imports this module.
 
-Exit status: 0 done; 1 nobody read the output; 2 the input or the command is wrong, with one line on standard
-error and nothing written; 3 done, but not all that was asked holds (--strict);
-130 interrupted (what was solved until then is written), 143 terminated.
+Exit status: 0 done; 1 nobody read the output; 2 the input or the command is wrong or a disk is full, with one line on
+standard error and nothing written; 3 done, but not all that was asked holds (--strict);
+130 interrupted (Ctrl-C), 143 terminated (SIGTERM), 129 the terminal was closed: what was solved until then is written.
 """
 
 import io
@@ -14,17 +14,16 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr
 from functools import reduce
 from operator import or_
-from types import FrameType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import tyro
 
-from mapctl import __version__
+from mapctl import __version__, interruption
 from mapctl.commands import COMMANDS, Command
 from mapctl.commands.walks import INTERRUPTED
 from mapctl.errors import MapctlError, RequestError
 
-_WRONG, _UNREAD, _TERMINATED = 2, 1, 143
+_WRONG, _UNREAD, _SIGNALLED = 2, 1, 128
 _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
     "live": {"viser"},
@@ -49,25 +48,24 @@ _STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `mapctl` with the given words (those of the process if None); returns the exit status."""
-    if argv is None:
-        signal.signal(signal.SIGTERM, _terminate)
+    received = interruption.listen() if argv is None else []
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         status = _version() if words == ["--version"] else parse(words).run()
         sys.stdout.flush()
         if status == INTERRUPTED:
-            _say("interrupted; what was solved until then is written", status)
+            status = _ended(received, "what was solved until then is written")
     except MapctlError as error:
         status = _say(str(error), _WRONG)
-    except KeyboardInterrupt:
-        status = _say("interrupted", INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        status = _ended(received, str(stop))
     except ModuleNotFoundError as error:
         status = _say(_missing(error.name or str(error)), _WRONG)
     except BrokenPipeError:
-        # As the Python documentation advises: the interpreter flushes standard output once more at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _forget_output()
         status = _UNREAD
     except OSError as error:
+        _forget_output()
         status = _say(f"{error.filename or 'input or output'}: {error.strerror or error}", _WRONG)
     return status
 
@@ -136,9 +134,19 @@ def _say(message: str, status: int) -> int:
     return status
 
 
-def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    """Leave by an exception, so that half-written files are removed on the way out."""
-    raise SystemExit(_TERMINATED)
+def _ended(received: Sequence[int], kept: str) -> int:
+    """Say that work was ended, and what there is of it; without a signal it was Ctrl-C."""
+    number = received[-1] if received else signal.SIGINT
+    how = "interrupted" if number == signal.SIGINT else "terminated"
+    return _say("; ".join(filter(None, (how, kept))), _SIGNALLED + number)
+
+
+def _forget_output() -> None:
+    """The interpreter flushes standard output once more at exit, which would fail again (see Python's signal page)."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """How numba kernels are compiled: kept on disk where that can be, one core, no Python objects inside."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from numba import njit
@@ -18,11 +19,24 @@ def compilers(*relaxed: str) -> tuple[Compile, Compile]:
 
     def entry(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
-            return _njit(cache=True, nogil=True, **shared)(function)
+            return _forgiving(_njit(cache=True, nogil=True, **shared)(function))
         except RuntimeError:  # numba found no folder that it may write to
             return _njit(nogil=True, **shared)(function)
 
     return entry, _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
+
+
+def _forgiving(compiled: Any) -> Any:
+    """Where the disk is full that numba keeps compiled code on, the next start takes longer; nothing fails."""
+    cache = compiled._cache
+    keep = cache.save_overload
+
+    def keep_if_possible(*overload: Any) -> None:
+        with suppress(OSError):
+            keep(*overload)
+
+    cache.save_overload = keep_if_possible
+    return compiled
 
 
 def _njit(**options: Any) -> Compile:

@@ -20,5 +20,13 @@ class RequestError(MapctlError):
     """A wish, option or argument that cannot be."""
 
 
+class WriteError(RequestError):
+    """A place that cannot be written, or a disk that is full."""
+
+
+class DiskFullError(WriteError):
+    """No space left, or none for this user: what writes many files can as well stop."""
+
+
 class CheckpointError(MapctlError):
     """Weights or a training run that do not fit this code."""

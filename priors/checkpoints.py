@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
 from mapctl.formats.atomic import atomic_path
+from priors.tensor_files import write_tensors
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,12 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
     CheckpointError, and nothing written, for a card that holds NaN or infinity, which JSON does not know.
     """
     text = as_json(vars(card), path, indent=1)
-    kept = {name: (t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t).contiguous()
+    kept = {name: t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t
             for name, t in tensors.items()}  # fmt: skip
-    with atomic_path(path) as scratch:
-        save_file(kept, scratch)
+    # The card is written first and renamed last: a full disk leaves neither file, nor one that fits no other.
     with atomic_path(path.with_suffix(".json")) as scratch:
         scratch.write_text(text, encoding="utf-8")
+        write_tensors(path, kept)
 
 
 def as_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:

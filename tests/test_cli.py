@@ -280,17 +280,37 @@ def _ended(process: subprocess.Popen[str]) -> tuple[str, str]:
         raise
 
 
-def test_interruption_leaves_nothing_half_done(prior, tmp_path):
-    """Ctrl-C in the middle of hours of motion: status 130, no traceback, no file, no folder."""
+@pytest.mark.parametrize(("number", "said"), [(signal.SIGINT, (130, "mapctl: interrupted\n")),
+                                              (signal.SIGTERM, (143, "mapctl: terminated\n"))])  # fmt: skip
+def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
+    """Ctrl-C or SIGTERM in the middle of hours of motion: no traceback, no file, no folder."""
     words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
     process = _started(words)
     give_up = time.monotonic() + 100
     while not list(tmp_path.glob("gen/.*")) and time.monotonic() < give_up:
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
+    process.send_signal(number)  # `timeout` sends it twice
     _, told = _ended(process)
-    assert (process.returncode, told) == (130, "mapctl: interrupted\n")
+    assert (process.returncode, told) == said
     assert list(tmp_path.iterdir()) == []
+
+
+def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
+    from mapctl.formats.bvh_stream import BvhStream
+
+    append = BvhStream.append
+
+    def interrupted(stream, piece):
+        if Path(stream.path).name == "generated_002.bvh":
+            raise KeyboardInterrupt
+        append(stream, piece)
+
+    monkeypatch.setattr(BvhStream, "append", interrupted)
+    words = ("generate", "-o", tmp_path / "gen", "--seconds", 1, "--count", 4, "--prior", prior)
+    assert run(*words, "--quiet") == 130
+    assert capsys.readouterr().err == "mapctl: interrupted; 2 of 4 clips are finished\n"
+    assert sorted(path.name for path in (tmp_path / "gen").iterdir()) == ["generated_000.bvh", "generated_001.bvh"]
 
 
 def presses_ctrl_c(monkeypatch, *, after):
@@ -342,11 +362,11 @@ def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_
     words = ("follow", "circle:4", "-o", tmp_path / "walk.bvh", "--seconds", 3000, "--prior", prior)
     process = _started(words)
     time.sleep(5)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
     _, told = _ended(process)
-    assert process.returncode == 130
+    assert process.returncode == 143
     assert "Traceback" not in told
-    assert told.startswith("mapctl: interrupted")
+    assert told.startswith("mapctl: terminated")
     written = (tmp_path / "walk.bvh").exists()
     assert written == ("what was solved until then is written" in told)
     assert not written or 2 < mapctl.load(tmp_path / "walk.bvh").num_frames < 90_000
@@ -365,6 +385,13 @@ def test_a_closed_pipe_is_no_error():
     os.close(writer)
     assert b"Traceback" not in done.stderr
     assert done.returncode == 1
+
+
+def test_a_full_disk_for_what_is_printed_is_one_line():
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run([sys.executable, "-m", "mapctl.cli", "--version"], stdout=full, stderr=subprocess.PIPE,
+                              timeout=120)  # fmt: skip
+    assert (done.returncode, done.stderr) == (2, b"mapctl: input or output: No space left on device\n")
 
 
 def test_sizes_are_read():

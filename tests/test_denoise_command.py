@@ -1,6 +1,8 @@
 """`mapctl denoise` as a user types it: files, folders, reports, and what is refused."""
 
+import errno
 import json
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from tiny_denoiser import save_tiny_denoiser
 from tiny_prior import save_tiny_prior
 
 import mapctl
+from mapctl import formats
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +145,41 @@ def test_failures_are_listed_and_stop_no_other_file(denoise, folder, tmp_path, c
     assert (tmp_path / "out" / "a.bvh").exists()
     assert (tmp_path / "out" / "c.npz").exists()
     assert not (tmp_path / "out" / "0-broken.bvh").exists()
+
+
+def test_an_interrupted_folder_says_what_is_done_and_goes_on(denoise, folder, tmp_path, monkeypatch, capsys):
+    save, out = formats.save, tmp_path / "out"
+
+    def interrupted(motion, path):
+        if path.name != "a.bvh":
+            raise KeyboardInterrupt
+        save(motion, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(formats, "save", interrupted)
+        assert denoise(folder, "-o", out) == 130
+    told = capsys.readouterr().err
+    assert told == "mapctl: interrupted; 1 of 2 files are finished; the same command goes on with the others\n"
+    assert denoise(folder, "-o", out) == 0
+    assert ", 1 there already" in capsys.readouterr().out
+
+
+def test_a_full_disk_ends_a_folder_in_one_line(denoise, folder, tmp_path, monkeypatch, capsys):
+    write, out = Path.write_bytes, tmp_path / "out"
+
+    def full(path, content):
+        if list(out.rglob("[a-z]*.bvh")):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    assert denoise(folder, "-o", out) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("mapctl: cannot write ")
+    goes_on = "1 of 2 files are finished; the same command goes on with the others"
+    assert told.endswith(f": No space left on device; {goes_on}\n")
+    assert told.count("\n") == 1
+    assert [path.name for path in out.rglob("*") if path.is_file()] == ["a.bvh"]
 
 
 def test_an_output_folder_inside_the_input_is_not_denoised_itself(denoise, folder, capsys):

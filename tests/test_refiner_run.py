@@ -181,7 +181,7 @@ def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, sc
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 5
     again = []
     assert kept(train(replace(request, resume=True), again.append)) == 4
-    assert again[0] == "resumed at round 5"
+    assert "resumed at round 5" in again
     assert again[-1] == news[-1]
 
 
@@ -296,11 +296,22 @@ def test_what_cannot_be_trained_on_is_refused_before_anything_is_written(tmp_pat
         train(request_in(tmp_path / "run", density="nobody"))
     with pytest.raises(RequestError, match=r"no .bvh below .* matches 'dance'"):
         train(request_in(tmp_path / "run", match="dance"))
-    with pytest.raises(RequestError, match="at least 3 clips, got 2"):
-        train(request_in(tmp_path / "run", match="walk-[01]"))
+    with pytest.raises(RequestError, match="75 to hold out in the longest clip; got clips of 80"):
+        train(request_in(tmp_path / "run", match="walk-0"))
     with pytest.raises(RequestError, match="no clip is as long as the window of 43 frames"):
         train(request_in(tmp_path / "run", settings={"window": 40}))
     assert not (tmp_path / "run" / "checkpoint.json").exists()
+
+
+def test_two_clips_are_enough_and_a_third_that_is_none_is_left_out(tmp_path, request_in):
+    folder = write_corpus(tmp_path / "two", count=2, frames=100)
+    (folder / "walk-broken.bvh").write_text("HIERARCHY")
+    request, warnings = replace(request_in(tmp_path / "run"), data=folder), []
+    card = priors.load_refiner(str(train(request, warn=warnings.append))).card
+    assert set(card.data["skipped"]) == {"walk-broken.bvh"}
+    assert warnings[0].startswith(f"left out 1 of 3 files: {folder / 'walk-broken.bvh'}: ")
+    with pytest.raises(RequestError, match=r"--strict-data: .*walk-broken\.bvh: "):
+        train(replace(request, out=tmp_path / "strict", strict_data=True))
 
 
 def test_a_refiner_is_no_density_to_refine(tmp_path, request_in, begun):

@@ -32,10 +32,10 @@ def test_what_is_not_asked_for_is_the_measured_recipe():
 
 def test_every_option_reaches_the_trainer():
     given = requested("--density", "mine", "--match", "walk", "--steps", "7", "--batch", "6", "--window", "20",
-                      "--seed", "3", "--bfloat16", "--resume", "--licence", "CC0", "--device", "cpu",
+                      "--seed", "3", "--bfloat16", "--resume", "--licence", "CC0", "--device", "cpu", "--strict-data",
                       "--minutes-between-checkpoints", "0.5")  # fmt: skip
     assert (given.density, given.match, given.resume, given.licence) == ("mine", "walk", True, "CC0")
-    assert given.checkpoint_minutes == 0.5
+    assert (given.checkpoint_minutes, given.strict_data) == (0.5, True)
     assert given.settings == replace(
         AdversarialSettings(), rounds=7, batch=6, window=20, seed=3, bfloat16=True
     )  # the rest stays
@@ -56,10 +56,11 @@ def test_help_names_what_a_refiner_takes(capsys):
 def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
     train = refiner_run.train
 
-    def tiny(request, say):
+    def tiny(request, say, *, warn):
         settings = replace(request.settings, window=10, batch=4, history=8, head_start=1, warm_up=1, critic_width=6)
         config = RefinerConfig(width=6, memory=5)
-        return train(replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say)
+        return train(replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say,
+                     warn=warn)  # fmt: skip
 
     monkeypatch.setattr(refiner_run, "train", tiny)
     data, prior = write_corpus(tmp_path / "data"), str(save_tiny_prior(tmp_path / "tiny.safetensors"))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapctl.commands import options, outputs
+from mapctl.commands.going_on import telling_what_is_finished
 from mapctl.errors import RequestError
 from mapctl.progress import bar
 
@@ -33,10 +34,13 @@ def run(given: "Denoise") -> int:
         ended = over_processes(jobs, cleaner, processes=given.jobs)
     failed: list[Done] = []
     frames, seconds = 0, 0.0
-    with bar("denoising", quiet=given.quiet) as progress:
+    again = "" if given.again else "the same command goes on with the others"
+    counted = telling_what_is_finished(len(jobs), "files", again)
+    with bar("denoising", quiet=given.quiet) as progress, counted as finished:
         for number, done in enumerate(ended, start=1):
             failed += [done] if done.error else []
             frames, seconds = frames + done.frames, seconds + done.seconds
+            finished(number)
             if progress is not None:
                 progress(number, len(jobs))
     if not given.quiet:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from mapctl.commands import options, outputs, rigged
+from mapctl.commands.going_on import telling_what_is_finished
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
 from mapctl.progress import bar
@@ -74,11 +75,12 @@ class Generate:
             settings = replace(settings, finishing=replace(settings.finishing, footing=footing))
         draw = partial(stream, prior, seconds=self.seconds, start_clip=clip, refiner=refiner, skeleton=person.skeleton)
         starts = spread_starts(prior, self.count, torch.Generator().manual_seed(self.seed))
-        with outputs.made_folder(self.out) as folder:
+        with outputs.made_folder(self.out) as folder, telling_what_is_finished(self.count, "clips") as finished:
             for number, seed in enumerate(self._seeds()):
                 own = settings if settings.start is not None else replace(settings, start=starts[number])
                 pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
                 self._write(map(person.on_rig, pieces), folder / f"generated_{number:03d}.bvh", frames)
+                finished(number + 1)
         return 0
 
     def _checked(self) -> tuple["GenerateSettings", "Motion | None"]:

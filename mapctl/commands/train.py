@@ -1,6 +1,8 @@
 """`mapctl train`: a prior from a folder of BVH."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
@@ -20,7 +22,7 @@ _Architectures = Literal["skips", "image", "vanilla", "manifold"]
 
 @dataclass(frozen=True)
 class Train:
-    """Train a prior on a folder of BVH; killed and resumed, a run gives the same weights."""
+    """Train a prior on a folder of BVH; interrupted or killed and resumed, a run gives the same weights."""
 
     model: Positional[Annotated[_Models, arg(metavar="lstm-gmm|refiner|denoiser|infiller")]]
     """What to train: lstm-gmm is the density that follow and generate use; refiner makes its samples look captured;
@@ -66,6 +68,8 @@ class Train:
     """How much a kill may cost."""
     skip_first: bool = False
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used; if not given, such files are left out and listed."""
     licence: Annotated[str, arg(metavar="TEXT")] = "that of the training data"
     """Of the weights, for their card."""
     quiet: bool = False
@@ -73,24 +77,29 @@ class Train:
 
     def run(self) -> int:
         """Check, train, name the result."""
-        say = (lambda line: None) if self.quiet else _say
-        if self.model == "refiner":
-            from mapctl.commands import train_refiner
+        from mapctl.commands.going_on import telling_how_to_go_on
 
-            path, use = train_refiner.run(self, say), "--refiner"
-        elif self.model in ("denoiser", "infiller"):
-            from mapctl.commands import train_windows
-
-            path, use = train_windows.run(self, say), f"--{self.model}"
-        else:
-            request = self.request()
-            outputs.check_folder(self.out)
-            from priors.training import run
-
-            path, use = run.train(request, say), "--prior"
+        with telling_how_to_go_on(self):
+            path, use = self._trained((lambda line: None) if self.quiet else _say)
         if not self.quiet:
             print(f"wrote {path}; use it with {use} {self.out}")
         return 0
+
+    def _trained(self, say: Callable[[str], None]) -> tuple[Path, str]:
+        """The result, and the option that takes it."""
+        if self.model == "refiner":
+            from mapctl.commands import train_refiner
+
+            return train_refiner.run(self, say), "--refiner"
+        if self.model in ("denoiser", "infiller"):
+            from mapctl.commands import train_windows
+
+            return train_windows.run(self, say), f"--{self.model}"
+        request = self.request()
+        outputs.check_folder(self.out)
+        from priors.training import run
+
+        return run.train(request, say, warn=training.warn), "--prior"
 
     def request(self) -> "TrainRequest":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -102,6 +111,7 @@ class Train:
             data=self.data, out=self.out, match=self.match or "", config=config, settings=settings,
             resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
             licence=self.licence, skip_first=self.skip_first, labels=self.labels, init=self.init,
+            strict_data=self.strict_data,
         )  # fmt: skip
 
     def _recipe(self) -> tuple["LstmGmmConfig", "TrainingSettings"]:

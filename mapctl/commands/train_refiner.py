@@ -22,7 +22,7 @@ def run(given: "Train", say: Callable[[str], None]) -> Path:
     compute_on_one()
     from priors.training import refiner_run
 
-    return refiner_run.train(wanted, say)
+    return refiner_run.train(wanted, say, warn=training.warn)
 
 
 def request(given: "Train") -> "RefinerRequest":
@@ -36,5 +36,5 @@ def request(given: "Train") -> "RefinerRequest":
     return RefinerRequest(
         data=given.data, out=given.out, density=given.density, match=given.match, config=config,
         settings=replace(settings, bfloat16=given.bfloat16, **recipe), resume=given.resume,
-        checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence,
+        checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence, strict_data=given.strict_data,
     )  # fmt: skip

@@ -22,7 +22,7 @@ def run(given: "Train", say: Callable[[str], None]) -> Path:
     wanted = request(given)
     outputs.check_folder(given.out)
     compute_on_one()
-    return _runs(given).train(wanted, say)
+    return _runs(given).train(wanted, say, warn=training.warn)
 
 
 def request(given: "Train") -> Any:
@@ -36,7 +36,7 @@ def request(given: "Train") -> Any:
         usual, match=given.match or "", config=replace(usual.config, **training.asked(given, *shape)),
         settings=replace(usual.settings, bfloat16=given.bfloat16, **recipe), resume=given.resume,
         checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence, skip_first=given.skip_first,
-        init=given.init,
+        init=given.init, strict_data=given.strict_data,
     )  # fmt: skip
 
 

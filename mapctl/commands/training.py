@@ -1,5 +1,6 @@
 """What `mapctl train` checks of any model's options before its trainer is imported."""
 
+import sys
 from collections.abc import Collection
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,11 @@ def check(given: "Train", *, model: str, foreign: Collection[str] = (), on_gpu: 
         raise RequestError(f"the learning rate must lie between 0 and 1, got {given.learning_rate:g}")
     if not given.minutes_between_checkpoints > 0:
         raise RequestError(f"minutes between checkpoints must be positive, got {given.minutes_between_checkpoints:g}")
+
+
+def warn(line: str) -> None:
+    """Say it where --quiet and redirected output do not hide it."""
+    print(f"mapctl: {line}", file=sys.stderr, flush=True)
 
 
 def asked(given: "Train", *names: str, **renamed: str) -> dict[str, Any]:

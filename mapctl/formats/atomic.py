@@ -1,80 +1,102 @@
 """Output files appear whole or not at all: written beside their place, then renamed onto it."""
 
+import errno
 import os
 import secrets
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
-from mapctl.errors import RequestError
+from mapctl.errors import DiskFullError, WriteError
 
 
 @contextmanager
 def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Yield an empty scratch file beside `path`, which becomes `path` when the block ends well.
 
-    Whatever ends the block early (an error, Ctrl-C) removes the scratch file and leaves an older `path`
-    alone. RequestError if the place cannot be written, before the block runs where that can be known.
+    Whatever ends the block early (an error, a full disk, Ctrl-C) removes the scratch file and leaves an older `path`
+    alone. The file has the permissions of the one that it replaces, a new one those that the umask allows, whoever
+    wrote the scratch file. WriteError if the place cannot be written, before the block runs where that can be known.
     """
     target = Path(os.path.realpath(path))
     scratch = target.with_name(f".{secrets.token_hex(4)}{target.suffix}")
     try:
         _check_place(path, target)
         scratch.touch(exist_ok=False)
+        mode = _mode(target if target.exists() else scratch)
+        _permit(scratch, mode | stat.S_IWUSR)  # from the beginning: what nobody may read is not shown in the meantime
         yield scratch
         _flush_to_disk(scratch)
+        _permit(scratch, mode)
         scratch.replace(target)
     except OSError as error:
-        raise RequestError(f"cannot write {path}: {error.strerror or error}") from error
+        raise _refusal(path, error) from error
     finally:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
 
 
 def write_bytes(path: str | PathLike[str], content: bytes) -> None:
-    """Write `content` as the whole file `path`; RequestError if that cannot be."""
+    """Write `content` as the whole file `path`; WriteError if that cannot be."""
     with atomic_path(path) as scratch:
         scratch.write_bytes(content)
 
 
 def write_text(path: str | PathLike[str], content: str) -> None:
-    """Write `content` as UTF-8 with line feeds as they are; RequestError if that cannot be."""
+    """Write `content` as UTF-8 with line feeds as they are; WriteError if that cannot be."""
     write_bytes(path, content.encode("utf-8"))
 
 
 def check_writable(path: str | PathLike[str]) -> None:
-    """RequestError if `path` cannot be written; leaves no trace. For use before long work."""
+    """WriteError if `path` cannot be written; leaves no trace. For use before long work."""
     target = Path(os.path.realpath(path))
     try:
         _check_place(path, target)
         with tempfile.NamedTemporaryFile(dir=target.parent):
             pass
     except OSError as error:
-        raise RequestError(f"cannot write {path}: {error.strerror or error}") from error
+        raise _refusal(path, error) from error
 
 
 def check_folder(folder: str | PathLike[str]) -> None:
-    """RequestError unless the folder is there and can be written in, or can be made; leaves no trace."""
+    """WriteError unless the folder is there and can be written in, or can be made; leaves no trace."""
     place = Path(os.path.realpath(folder))
     while not place.exists():
         place = place.parent
     if not place.is_dir():
-        raise RequestError(f"cannot write to {folder}: {place} is not a folder")
+        raise WriteError(f"cannot write to {folder}: {place} is not a folder")
     check_writable(place / ".mapctl")
+
+
+def _refusal(path: str | PathLike[str], error: OSError) -> WriteError:
+    kind = DiskFullError if error.errno in (errno.ENOSPC, errno.EDQUOT) else WriteError
+    return kind(f"cannot write {path}: {error.strerror or error}")
 
 
 def _check_place(path: str | PathLike[str], target: Path) -> None:
     """Renaming onto a folder or a device (/dev/null) would fail late or replace it, so refuse both early."""
     if not os.fspath(path):
-        raise RequestError("cannot write a file with an empty name")
+        raise WriteError("cannot write a file with an empty name")
     if not target.parent.is_dir():
-        raise RequestError(f"cannot write {path}: the folder {target.parent} does not exist")
+        raise WriteError(f"cannot write {path}: the folder {target.parent} does not exist")
     if target.is_dir():
-        raise RequestError(f"cannot write {path}: it is a folder")
+        raise WriteError(f"cannot write {path}: it is a folder")
     if target.exists() and not target.is_file():
-        raise RequestError(f"cannot write {path}: it is not a regular file")
+        raise WriteError(f"cannot write {path}: it is not a regular file")
+
+
+def _mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def _permit(scratch: Path, mode: int) -> None:
+    """Libraries that write a file of their own and rename it (safetensors) leave it readable by nobody else."""
+    if _mode(scratch) != mode:
+        with suppress(PermissionError):  # file systems that know no permissions
+            scratch.chmod(mode)
 
 
 def _flush_to_disk(scratch: Path) -> None:

@@ -8,10 +8,13 @@ Needs the package usd-core: pip install 'mapctl[usd]'.
 # The package loads its modules at run time and declares no types.
 # pyright: reportAttributeAccessIssue=false
 
+import errno
+import os
 import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdSkel
 
 _ROOT = "/character"
+_REASON = re.compile(r"rror occurred writing file: (.+?)'")
 
 
 def is_installed() -> bool:
@@ -47,8 +51,20 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     check_finite(motion, path)
     stage = _stage(motion)
     with atomic_path(path) as scratch:
-        if not stage.GetRootLayer().Export(str(scratch)):
-            raise RequestError(f"cannot write {path}: USD does not say why")
+        _export(stage, scratch)
+
+
+def _export(stage: "Usd.Stage", scratch: Path) -> None:
+    """OSError where it cannot be written: USD itself raises an error of many lines, the reason among them."""
+    try:
+        written = stage.GetRootLayer().Export(str(scratch))
+    except RuntimeError as error:
+        found = _REASON.search(str(error))
+        reason = found[1] if found else "USD cannot write there"
+        number = next((number for number in (errno.ENOSPC, errno.EDQUOT) if os.strerror(number) == reason), None)
+        raise OSError(number, reason) from error
+    if not written:
+        raise OSError("USD does not say why")
 
 
 def _stage(motion: Motion) -> "Usd.Stage":

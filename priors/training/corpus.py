@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from mapctl import retarget, rigs
@@ -18,12 +17,24 @@ from mapctl.contacts import ContactSettings
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.formats import load
-from mapctl.formats.atomic import atomic_path
+from priors.tensor_files import write_tensors
 
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
+FEW = 5
+"""Clips under which parts of one clip are held out instead of whole clips."""
 SHORTEST = 75
 """Frames that the longest clip of each part must have at least: free runs and starts warm up on it, 2.5 s."""
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A file that cannot be used."""
+
+    name: str
+    """Its path below the data folder."""
+    reason: str
+    """Why, without the name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +47,8 @@ class Corpus:
     """Frames of each clip."""
     features: Float[Tensor, "frames size"]
     """All frames, float32, physical units."""
+    skipped: tuple[Skipped, ...] = ()
+    """Files of the same folder that are not among the clips."""
 
     def identity(self) -> dict[str, str]:
         """What tells this corpus from others: its size, and short hashes of names, lengths and features."""
@@ -57,24 +70,25 @@ class Corpus:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Disjoint parts of a corpus."""
+    """Parts of a corpus. What is trained on is in no other."""
 
     train: Corpus
     """90 % of the clips."""
     validation: Corpus
-    """5 %, for choosing the checkpoint."""
+    """5 %, for the curve."""
     test: Corpus
-    """5 %, for the measures of the card."""
+    """5 %, for the measures of the card; of few clips the very part that `validation` is."""
 
 
 def split(corpus: Corpus, seed: int) -> Split:
     """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part.
 
-    RequestError for fewer than 3 clips, or where a part has only clips too short to warm up on.
+    Of fewer than FEW clips none can be spared: the end of the longest is held out, a tenth of all frames and SHORTEST
+    at least, for validation and test alike. RequestError where a part has only clips too short to warm up on.
     """
     count = len(corpus.names)
-    if count < 3:
-        raise RequestError(f"training needs at least 3 clips, got {count}")
+    if count < FEW:
+        return _split_by_frames(corpus)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
     held = max(1, round(0.05 * count))
     parts = order[2 * held :], order[:held], order[held : 2 * held]
@@ -86,13 +100,31 @@ def split(corpus: Corpus, seed: int) -> Split:
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
 
+def _split_by_frames(corpus: Corpus) -> Split:
+    at = corpus.lengths.index(longest := max(corpus.lengths))
+    held = max(SHORTEST, round(0.1 * len(corpus.features)))
+    lengths = tuple(length - held * (number == at) for number, length in enumerate(corpus.lengths))
+    if longest < held or max(lengths) < SHORTEST:
+        raise RequestError(
+            f"training needs {SHORTEST} frames at {PRIOR_FPS} fps, and {held} to hold out in the longest clip;"
+            f" got clips of {', '.join(map(str, corpus.lengths))}"
+        )
+    clips = corpus.clips()
+    kept = [number for number, length in enumerate(lengths) if length > 1]
+    train = Corpus(tuple(corpus.names[i] for i in kept), tuple(lengths[i] for i in kept),
+                   torch.cat([clips[i][: lengths[i]] for i in kept]))  # fmt: skip
+    # Whoever looks for clips by their names shall not take the clip that was trained on for one that was not.
+    end = Corpus((f"{corpus.names[at]}[{lengths[at]}:{longest}]",), (held,), clips[at][lengths[at] :])
+    return Split(train, end, end)
+
+
 def read(
     data: Path, *, match: str, cache: Path, skip_first: bool = False, progress: Callable[[int, int], None] | None = None
 ) -> Corpus:
     """Every BVH below `data` whose path matches the pattern, as features at 30 fps; from the cache where it is fresh.
 
-    Clips that cannot be read or fit no known rig raise, naming the file. `skip_first` drops frame 0 (the T-pose of
-    CMU takes).
+    Files that cannot be read or fit no known rig are left out, and listed in the corpus; RequestError where no other
+    is left. `skip_first` drops frame 0 (the T-pose of CMU takes).
     """
     try:
         pattern = re.compile(match)
@@ -103,28 +135,57 @@ def read(
         raise RequestError(f"no .bvh below {data} matches {match!r}")
     key = _fingerprint(data, files, skip_first)
     stored = cache / f"corpus-{key}.safetensors"
-    if (kept := _read_cache(stored)) is not None:
+    if (kept := _read_cache(stored)) is not None and not _readable_now(kept.skipped, data, skip_first):
         return kept
-    clips, names = [], []
-    for number, file in enumerate(files):
-        clips.append(clip_features(file, skip_first=skip_first))
-        names.append(file.relative_to(data).as_posix())
-        if progress is not None:
-            progress(number + 1, len(files))
-    corpus = Corpus(tuple(names), tuple(len(c) for c in clips), torch.cat(clips).float())
+    corpus = _read_files(data, files, skip_first, progress or (lambda done, total: None))
     cache.mkdir(parents=True, exist_ok=True)
     _write_cache(corpus, stored)
     return corpus
 
 
+def _read_files(data: Path, files: Sequence[Path], skip_first: bool, progress: Callable[[int, int], None]) -> Corpus:
+    clips, names, skipped = [], [], []
+    for number, file in enumerate(files, start=1):
+        name, found = file.relative_to(data).as_posix(), _usable(file, skip_first)
+        if isinstance(found, str):
+            skipped.append(Skipped(name, found))
+        else:
+            clips.append(found)
+            names.append(name)
+        progress(number, len(files))
+    if not clips:
+        first = f"{data / skipped[0].name}: {skipped[0].reason}"
+        raise RequestError(f"none of the {len(files)} .bvh below {data} can be trained on ({first})")
+    return Corpus(tuple(names), tuple(len(c) for c in clips), torch.cat(clips), tuple(skipped))
+
+
+def _usable(file: Path, skip_first: bool) -> Float[Tensor, "frames size"] | str:
+    """The clip, or why there is none. What no reader foresaw is a reason too: one file must not end a run."""
+    try:
+        return clip_features(file, skip_first=skip_first)
+    except (MapctlError, OSError) as error:
+        # The list has the name already.
+        return " ".join(str(error).split()).removeprefix(str(file)).lstrip(":, ")
+    except Exception as error:
+        return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _readable_now(skipped: Sequence[Skipped], data: Path, skip_first: bool) -> bool:
+    """Whether a file can be used that could not, though it is the same: permissions, a network drive."""
+    return any(not isinstance(_usable(data / file.name, skip_first), str) for file in skipped)
+
+
 def clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size"]:
-    """One file as features at 30 fps on the canonical joints."""
+    """One file as features at 30 fps on the canonical joints; MapctlError, naming it, where that cannot be."""
     motion = load(file)
     if skip_first and motion.num_frames > 2:
         motion = motion.slice(1, motion.num_frames)
     try:
         canonical, _ = retarget.to_canonical(motion)
-        return encode(canonical.resample(PRIOR_FPS))[0].float()
+        features = encode(canonical.resample(PRIOR_FPS))[0].float()
+        if not bool(torch.isfinite(features).all()):
+            raise MapctlError("its motion is not finite")
+        return features
     except MapctlError as error:
         raise MapctlError(f"{file}: {error}") from error
 
@@ -151,8 +212,17 @@ def folder_of_clips(corpus: Corpus) -> Int[Tensor, " clips"]:
 def _fingerprint(data: Path, files: list[Path], skip_first: bool) -> str:
     """Of everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
     parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known()), repr(ContactSettings()), str(skip_first)]
-    parts += [f"{f.relative_to(data)} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files]
-    return sha256("\n".join(parts).encode()).hexdigest()[:16]
+    parts += [f"{f.relative_to(data)} {_state(f)}" for f in files]
+    return sha256("\n".join(parts).encode(errors="surrogateescape")).hexdigest()[:16]
+
+
+def _state(file: Path) -> str:
+    """Size and time; of a link that leads nowhere nothing."""
+    try:
+        found = file.stat()
+    except OSError:
+        return "-"
+    return f"{found.st_size} {found.st_mtime_ns}"
 
 
 def _read_cache(stored: Path) -> Corpus | None:
@@ -160,7 +230,8 @@ def _read_cache(stored: Path) -> Corpus | None:
     try:
         with safe_open(stored, framework="pt") as file:
             index = json.loads(file.metadata()["index"])
-            corpus = Corpus(tuple(index["names"]), tuple(index["lengths"]), file.get_tensor("features"))
+            corpus = Corpus(tuple(index["names"]), tuple(index["lengths"]), file.get_tensor("features"),
+                            tuple(Skipped(*row) for row in index["skipped"]))  # fmt: skip
     except (OSError, SafetensorError, ValueError, KeyError, TypeError):
         return None
     whole = len(corpus.names) == len(corpus.lengths) and sum(corpus.lengths) == len(corpus.features)
@@ -168,6 +239,6 @@ def _read_cache(stored: Path) -> Corpus | None:
 
 
 def _write_cache(corpus: Corpus, stored: Path) -> None:
-    index = json.dumps({"names": corpus.names, "lengths": corpus.lengths})
-    with atomic_path(stored) as beside:
-        save_file({"features": corpus.features}, beside, metadata={"index": index})
+    index = json.dumps({"names": corpus.names, "lengths": corpus.lengths,
+                        "skipped": [(file.name, file.reason) for file in corpus.skipped]})  # fmt: skip
+    write_tensors(stored, {"features": corpus.features}, metadata={"index": index})

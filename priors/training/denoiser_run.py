@@ -5,7 +5,8 @@ from pathlib import Path
 
 from priors.denoiser import DenoiserConfig
 from priors.training.denoiser import DenoiserSettings, DenoiserTrainer, validate
-from priors.training.window_run import Kind, Progress, WindowRequest
+from priors.training.gathering import Progress
+from priors.training.window_run import Kind, WindowRequest
 from priors.training.window_run import train as train_on_windows
 
 
@@ -26,6 +27,8 @@ def _shape(config: DenoiserConfig) -> list[str]:
 KIND = Kind("denoiser", DenoiserTrainer, validate, _shape)
 
 
-def train(request: DenoiserRequest, progress: Progress = lambda line: None) -> Path:
-    """Train to the end of the recipe and write RUN/model.safetensors; returns its path."""
-    return train_on_windows(request, KIND, progress)
+def train(
+    request: DenoiserRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None
+) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path. See `window_run.train`."""
+    return train_on_windows(request, KIND, progress, warn=warn)

@@ -4,8 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from priors.infiller import InfillerConfig
+from priors.training.gathering import Progress
 from priors.training.infiller import InfillerSettings, InfillerTrainer, validate
-from priors.training.window_run import Kind, Progress, WindowRequest
+from priors.training.window_run import Kind, WindowRequest
 from priors.training.window_run import train as train_on_windows
 
 
@@ -27,6 +28,8 @@ def _shape(config: InfillerConfig) -> list[str]:
 KIND = Kind("infiller", InfillerTrainer, validate, _shape)
 
 
-def train(request: InfillerRequest, progress: Progress = lambda line: None) -> Path:
-    """Train to the end of the recipe and write RUN/model.safetensors; returns its path."""
-    return train_on_windows(request, KIND, progress)
+def train(
+    request: InfillerRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None
+) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path. See `window_run.train`."""
+    return train_on_windows(request, KIND, progress, warn=warn)

@@ -6,29 +6,21 @@ A guard watches held-out samples: the best refiner seen is kept, and training st
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import Place, decode
-from mapctl.metrics import measure
-from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows
-from mapctl.metrics.realism.classifier import held_out_accuracy
+from mapctl.metrics.realism import RealismSettings
 from priors import checkpoints, density
 from priors.density import LstmGmmDensity
-from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
-from priors.training import corpus as corpora
-from priors.training import run_files
+from priors.refiner import RefinerConfig
+from priors.training import loop, run_files
 from priors.training.corpus import Corpus
+from priors.training.gathering import Progress, Source, gather, of_card
 from priors.training.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
-
-Progress = Callable[[str], None]
-"""Called with one line of news."""
+from priors.training.refiner_judge import Judge, score
 
 Row = dict[str, float | None]
 """Measures of held-out samples; None stands for what is not finite."""
@@ -59,6 +51,8 @@ class RefinerRequest:
     """Of each."""
     judged: int = 24
     """Motions drawn to be measured, and held-out clips at least, if there are as many."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     resume: bool = False
     """Continue from the run folder's last checkpoint."""
     checkpoint_minutes: float = 3.0
@@ -73,23 +67,29 @@ class RefinerRequest:
     """How samples are told from mocap."""
 
 
-def train(request: RefinerRequest, progress: Progress = lambda line: None) -> Path:
+def train(
+    request: RefinerRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None
+) -> Path:
     """Train to the end of the recipe, or until one side wins, and write RUN/model.safetensors; returns its path.
+    `warn` is told of files that cannot be used.
 
-    Killed and resumed, a run gives the same weights bit for bit on one machine.
+    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
+    the same weights bit for bit on one machine.
     """
     _check(request)
     prior = density.load(request.density)
     match = prior.card.data.get("match", "") if request.match is None else request.match
-    corpus = corpora.read(request.data, match=match, cache=request.out / "cache")
-    parts = corpora.split(corpus, prior.card.data.get("split_seed", request.settings.seed))
+    seed = prior.card.data.get("split_seed", request.settings.seed)
+    source = Source(request.data, request.out, match, strict=request.strict_data, seed=seed)
+    corpus, parts = gather(source, progress=progress, warn=warn)
     generator = torch.Generator().manual_seed(request.settings.seed)
     frames = round(request.seconds * 30)
     raw = sampled(prior, parts.train, request.samples, frames, generator)
     judge = Judge.of(sampled(prior, parts.train, request.judged, frames, generator), parts, request.realism)
     trainer = AdversarialTrainer(request.config, request.settings, parts.train, raw)
-    run = _Run(request, trainer, judge, corpus.identity() | {"density": request.density, "match": match}, progress)
-    run.go()
+    data = corpus.identity() | {"density": request.density, "match": match}
+    run = _Run(request, trainer, judge, data, of_card(corpus), progress)
+    loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
     return run.export(prior, raw)
 
 
@@ -107,96 +107,54 @@ def sampled(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, gene
     return Corpus(tuple(f"sample {k}" for k in range(count)), (frames,) * count, features.float().flatten(0, 1))
 
 
-@dataclass(frozen=True, eq=False)
-class Judge:
-    """Measures refined samples beside the raw ones and mocap that training does not see."""
-
-    raw: Float[Tensor, "count frames size"]
-    """Samples that are refined anew each time."""
-    mocap: dict[str, float]
-    """Mocap's measures."""
-    windows: list[Tensor]
-    """Mocap's windows for the classifier."""
-    settings: RealismSettings
-    """Of the classifier."""
-
-    @staticmethod
-    def of(raw: Corpus, parts: corpora.Split, settings: RealismSettings) -> "Judge":
-        """Against validation and test clips."""
-        clips = [c for part in (parts.validation, parts.test) for c in part.clips() if len(c) > settings.windows.frames]
-        motions = [decode(clip, Place.origin()) for clip in clips]
-        windows = [clip_windows(canonical_positions(motion), settings.windows) for motion in motions]
-        return Judge(torch.stack(raw.clips()), _means(clips), windows, settings)
-
-    def __call__(self, network: RefinerNetwork) -> dict[str, float]:
-        """Contact speed and jitter as ratios to mocap's, and the share told apart."""
-        refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
-        refined = refiner.refine(self.raw)
-        means = _means(list(refined))
-        row = {f"{name}_ratio": means[name] / self.mocap[name]
-               for name in ("contact_speed_cm_s", "jitter_m_s3") if self.mocap[name] > 0}  # fmt: skip
-        if min(len(refined), len(self.windows)) >= self.settings.fewest_clips:
-            made = [clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
-                    for clip in refined]  # fmt: skip
-            seeded = torch.Generator().manual_seed(0)
-            row["told_apart"] = held_out_accuracy(
-                made, self.windows, generator=seeded, settings=self.settings.classifier
-            )
-        return row
-
-
-def score(row: Mapping[str, float | None]) -> float:
-    """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart.
-
-    Infinite where a measure cannot be had, as of feet that never touch the floor.
-    """
-    ratios = [value or math.nan for name, value in row.items() if name.endswith("_ratio")]
-    if not all(value > 0 for value in ratios):
-        return math.inf
-    told = row.get("told_apart") or 0.0
-    return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, told - 0.5)
-
-
-_NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.of_layout())
-
-
 class _Run:
-    """The loop, its guard and its checkpoints."""
+    """What `loop.go` does to a trainer, its guard and its checkpoints."""
 
     def __init__(
-        self, request: RefinerRequest, trainer: AdversarialTrainer, judge: Judge, data: dict, progress: Progress
-    ):
-        self.request, self.trainer, self.judge, self.data, self.progress = request, trainer, judge, data, progress
+        self, request: RefinerRequest, trainer: AdversarialTrainer, judge: Judge, data: dict[str, str],
+        skipped: dict[str, dict[str, str]], progress: Progress,
+    ):  # fmt: skip
+        self.request, self.trainer, self.data, self.progress = request, trainer, data, progress
+        self.judge_samples, self.skipped = judge, skipped
         self.curve: list[Row] = []
-        self.losses: list[Losses] = []  # since the last line of news
+        self.losses: list[Losses] = []  # since the last line of news but one, where there has just been one
+        self.verdict: str | None = None
+        self.began = time.monotonic()
         self.best = {name: value.clone() for name, value in trainer.averaged.state_dict().items()}
         if request.resume:
             self._load()
             progress(f"resumed at round {trainer.round}")
         else:
             request.out.mkdir(parents=True, exist_ok=True)
-            self._judge()
+            self.judge()
 
-    def go(self) -> None:
-        """To the end of the recipe, or until one side has won."""
-        request, trainer = self.request, self.trainer
-        saved = began = time.monotonic()
-        while trainer.round < request.settings.rounds:
-            self.losses.append(trainer.train_round())
-            last = trainer.round == request.settings.rounds
-            report = last or trainer.round % request.report_rounds == 0
-            if report:
-                self._report(time.monotonic() - began)
-            if (verdict := self._verdict()) is not None:
-                self.progress(f"{verdict}: training ends with the best refiner seen")
-                break
-            if last or (report and trainer.round % request.judge_rounds == 0):
-                self._judge()
-            if report:
-                self.losses = []
-            if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
-                self._save()
-                saved = time.monotonic()
+    @property
+    def finished(self) -> bool:
+        """At the end of the recipe, or where one side has won."""
+        return self.verdict is not None or self.trainer.round >= self.request.settings.rounds
+
+    @property
+    def judgement_due(self) -> bool:
+        """At some lines of news and at the end of the recipe."""
+        measured = bool(self.curve) and self.curve[-1]["round"] == self.trainer.round
+        last = self.trainer.round >= self.request.settings.rounds
+        at_last = last or (self._reported and self.trainer.round % self.request.judge_rounds == 0)
+        return at_last and not measured and self.verdict is None
+
+    @property
+    def _reported(self) -> bool:
+        return self.trainer.round % self.request.report_rounds == 0
+
+    def update(self) -> None:
+        """One round."""
+        if self._reported:
+            self.losses = []
+        self.losses.append(self.trainer.train_round())
+        if self._reported or self.trainer.round >= self.request.settings.rounds:
+            self._report(time.monotonic() - self.began)
+        self.verdict = self._verdict()
+        if self.verdict is not None:
+            self.progress(f"{self.verdict}: training ends with the best refiner seen")
 
     def export(self, prior: LstmGmmDensity, raw: Corpus) -> Path:
         """Write the best refiner in float16 with its card."""
@@ -204,7 +162,7 @@ class _Run:
         card = checkpoints.Card(
             kind="refiner", config=request.config.as_card(), licence=request.licence,
             data={"density": request.density, "density_config": prior.reference.config.as_card(),
-                  "samples": len(raw.lengths), **self.data},
+                  "samples": len(raw.lengths), **self.data, **self.skipped},
             training={"settings": asdict(request.settings), "curve": self.curve, "command": command(request)},
             quality=min(self.curve, key=score), **checkpoints.Card.of_layout(),
         )  # fmt: skip
@@ -225,8 +183,9 @@ class _Run:
             return "the critic has won"
         return None
 
-    def _judge(self) -> None:
-        row = self.judge(self.trainer.averaged)
+    def judge(self) -> None:
+        """A row of the curve; the best refiner is kept."""
+        row = self.judge_samples(self.trainer.averaged)
         if not self.curve or score(row) < min(score(before) for before in self.curve):
             self.best = {name: value.clone() for name, value in self.trainer.averaged.state_dict().items()}
         row |= {"round": self.trainer.round, "score": score(row)}
@@ -237,7 +196,10 @@ class _Run:
     def _mean(self, kind: str) -> float:
         return sum(getattr(loss, kind) for loss in self.losses) / len(self.losses)
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """A checkpoint, unless training went wrong since the last: what is resumed there comes to the same end."""
+        if self.verdict is not None:
+            return
         tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
         index = self._index() | {"losses": [asdict(loss) for loss in self.losses]}
         run_files.write(self.request.out, step=self.trainer.round, tensors=tensors, index=index)
@@ -253,7 +215,7 @@ class _Run:
             index, tensors = run_files.read(out)
             for part in ("settings", "network", "data"):
                 run_files.check_same(out, part, then=index[part], now=self._index()[part])
-            self.curve = [dict(row) for row in index["curve"]]
+            self.curve = run_files.rows(index, "round")
             self.losses = [Losses(**row) for row in index["losses"]]
             self.best = {name: tensors[f"best.{name}"] for name in self.best}
             self.trainer.load_state(tensors)
@@ -278,8 +240,3 @@ def _check(request: RefinerRequest) -> None:
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-
-
-def _means(clips: list[Tensor]) -> dict[str, float]:
-    rows = [measure(decode(clip, Place.origin())) for clip in clips]
-    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}

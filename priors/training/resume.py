@@ -30,7 +30,7 @@ def load(run: Path, trainer: Trainer, data: Mapping[str, str]) -> Curve:
     """
     try:
         index, tensors = run_files.read(run)
-        curve = [dict(row) for row in index["curve"]]
+        curve = run_files.rows(index, "step")
         for part, now in _recipe(trainer, data).items():
             run_files.check_same(run, part, then=index[part], now=now)
         _restore(trainer, tensors, step=index["step"])

@@ -3,9 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,13 +16,11 @@ from priors import checkpoints, density, labels
 from priors.lstm_gmm import LstmGmm, LstmGmmConfig
 from priors.settings import check_least
 from priors.training import corpus as corpora
-from priors.training import resume, run_files
+from priors.training import loop, resume, run_files
+from priors.training.gathering import Progress, Source, gather, of_card
 from priors.training.health import free_run
 from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
 from priors.training.starts import abilities, choose
-
-Progress = Callable[[str], None]
-"""Called with one line of news."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +55,8 @@ class TrainRequest:
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     labels: str = ""
     """Regular expression whose named groups read labels from a clip's path, which the density can then be told."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     init: str | None = None
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
@@ -66,26 +64,27 @@ class TrainRequest:
         check_least(self, 1, "starts", "report_steps", "validate_steps")
 
 
-def train(request: TrainRequest, progress: Progress = lambda line: None) -> Path:
-    """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
+def train(request: TrainRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None) -> Path:
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path. `warn` is told of files that
+    cannot be used.
 
-    Killed and resumed, a run gives the same weights bit for bit on one machine (a test holds it to that). MapctlError
-    where training diverges; the last checkpoint then stays as it was.
+    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
+    the same weights bit for bit on one machine. MapctlError where training diverges; the last checkpoint then stays as
+    it was.
     """
     device = _device(request.device)
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-    corpus = corpora.read(request.data, match=request.match, cache=request.out / "cache",
-                          skip_first=request.skip_first, progress=_reading(progress))  # fmt: skip
-    parts = corpora.split(corpus, request.settings.seed)
-    progress(f"{len(corpus.names)} clips, {len(corpus.features)} frames; training on {len(parts.train.names)}")
+    source = Source(request.data, request.out, request.match, request.skip_first, request.strict_data,
+                    request.settings.seed)  # fmt: skip
+    corpus, parts = gather(source, progress=progress, warn=warn)
     trainer = _trainer(request, parts.train, device)
     data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed),
                                 "labels": request.labels, "init": request.init or ""}  # fmt: skip
     curve = _resume(request, trainer, data, progress)
-    _loop(request, trainer, parts, curve, progress, save=partial(resume.save, request.out, trainer, curve, data))
-    return export(request, trainer, parts, curve)
+    loop.go(_Run(request, trainer, parts, curve, data, progress), checkpoint_minutes=request.checkpoint_minutes)
+    return export(request, trainer, corpus, parts, curve)
 
 
 def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trainer:
@@ -98,7 +97,9 @@ def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trai
                    init=before.state_dict())  # fmt: skip
 
 
-def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve) -> Path:
+def export(
+    request: TrainRequest, trainer: Trainer, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve
+) -> Path:
     """Write the model in float16 with its starts and card."""
     model = trainer.model.cpu().eval()
     found = choose(
@@ -109,15 +110,15 @@ def export(request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve:
                 "starts.cell": found.state.cell, "starts.speed": found.speed,
                 "starts.weight": found.weight}  # fmt: skip
     path = request.out / "model.safetensors"
-    checkpoints.save(tensors, _card(request, model, parts, curve, found.names), path)
+    checkpoints.save(tensors, _card(request, model, corpus, parts, curve, found.names), path)
     return path
 
 
 def _card(
-    request: TrainRequest, model: LstmGmm, parts: corpora.Split, curve: resume.Curve, starts: tuple[str, ...]
-) -> checkpoints.Card:
-    data = {"clips": sum(len(p.names) for p in (parts.train, parts.validation, parts.test)),
-            "frames": sum(len(p.features) for p in (parts.train, parts.validation, parts.test)),
+    request: TrainRequest, model: LstmGmm, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve,
+    starts: tuple[str, ...],
+) -> checkpoints.Card:  # fmt: skip
+    data = {"clips": len(corpus.names), "frames": len(corpus.features), **of_card(corpus),
             "match": request.match, "labels": request.labels,
             "split_seed": request.settings.seed, "starts": list(starts),
             "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
@@ -151,27 +152,49 @@ def _mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
     return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
 
 
-def _loop(
-    request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve, progress: Progress, *,
-    save: Callable[[], None],
-) -> None:  # fmt: skip
-    saved, losses, began = time.monotonic(), [], time.monotonic()
-    while trainer.step < request.settings.steps:
-        losses.append(trainer.train_step())
-        last = trainer.step == request.settings.steps
-        if trainer.step % request.report_steps == 0 or last:
-            progress(f"step {trainer.step}: {sum(losses) / len(losses):.2f} nats, {time.monotonic() - began:.0f} s")
-            losses = []
-        due = last or time.monotonic() - saved > 60 * request.checkpoint_minutes
-        validate = last or trainer.step % request.validate_steps == 0
-        if due or validate:
-            trainer.check_finite()
-        if validate:
-            curve.append(_validate(trainer, parts))
-            progress(json.dumps(curve[-1]))
-        if due:
-            save()
-            saved = time.monotonic()
+class _Run:
+    """What `loop.go` does to a trainer, its curve and its checkpoints."""
+
+    def __init__(
+        self, request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve,
+        data: dict[str, str], progress: Progress,
+    ):  # fmt: skip
+        self.request, self.trainer, self.parts, self.curve = request, trainer, parts, curve
+        self.data, self.progress = data, progress
+        self.losses: list[float] = []  # since the last line of news
+        self.began = time.monotonic()
+
+    @property
+    def finished(self) -> bool:
+        """At the end of the recipe."""
+        return self.trainer.step >= self.request.settings.steps
+
+    @property
+    def judgement_due(self) -> bool:
+        """Every so many steps and at the end."""
+        step, measured = self.trainer.step, (self.curve[-1]["step"] or 0) if self.curve else 0
+        return step > measured and (self.finished or step % self.request.validate_steps == 0)
+
+    def update(self) -> None:
+        """One step."""
+        losses = self.losses
+        losses.append(self.trainer.train_step())
+        step = self.trainer.step
+        if self.finished or step % self.request.report_steps == 0:
+            mean, seconds = sum(losses) / len(losses), time.monotonic() - self.began
+            self.progress(f"step {step}: {mean:.2f} nats, {seconds:.0f} s")
+            losses.clear()
+
+    def judge(self) -> None:
+        """A row of the curve; MapctlError where the weights are no numbers."""
+        self.trainer.check_finite()
+        self.curve.append(_validate(self.trainer, self.parts))
+        self.progress(json.dumps(self.curve[-1]))
+
+    def save(self) -> None:
+        """A checkpoint; MapctlError, and none, where the weights are no numbers."""
+        self.trainer.check_finite()
+        resume.save(self.request.out, self.trainer, self.curve, self.data)
 
 
 def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float | None]:
@@ -201,11 +224,3 @@ def _device(wanted: str) -> str:
     if wanted == "cuda" and not torch.cuda.is_available():
         raise RequestError("this machine has no CUDA device; use --device cpu")
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
-
-
-def _reading(progress: Progress) -> Callable[[int, int], None]:
-    def news(done: int, total: int) -> None:
-        if done % 200 == 0 or done == total:
-            progress(f"read {done} of {total} clips")
-
-    return news

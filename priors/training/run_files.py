@@ -7,11 +7,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.formats.atomic import atomic_path, check_folder
 from priors.checkpoints import as_json
+from priors.tensor_files import write_tensors
 
 _TENSORS, _INDEX = "checkpoint.safetensors", "checkpoint.json"
 
@@ -35,13 +36,15 @@ def check_begin(run: Path, *, resume: bool) -> None:
 
 
 def write(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor], index: Mapping[str, Any]) -> None:
-    """The index names the tensors' file of its own step, so a kill between the two leaves a pair that fits."""
+    """The index names the tensors' file of its own step, so a kill between the two leaves a pair that fits.
+
+    RequestError where they cannot be written, as on a full disk; the last pair is then as it was.
+    """
     name = f"step-{step}-{_TENSORS}"
     text = as_json({"tensors": name, "step": step, **index}, run / _INDEX)
-    with atomic_path(run / name) as scratch:
-        save_file({key: value.contiguous() for key, value in tensors.items()}, scratch)
     with atomic_path(run / _INDEX) as scratch:
         scratch.write_text(text, encoding="utf-8")
+        write_tensors(run / name, tensors)
     for old in run.glob(f"step-*-{_TENSORS}"):
         if old.name != name:
             old.unlink()
@@ -51,6 +54,19 @@ def read(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Index and tensors; one of BROKEN where they cannot be read."""
     index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
     return index, load_file(run / index["tensors"])
+
+
+def rows(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:
+    """The curve that an index holds; one of BROKEN unless every row says at what `count` it was measured."""
+    return [{**row, count: int(row[count])} for row in index["curve"]]
+
+
+def last_step(run: Path) -> int | None:
+    """Of the run folder's checkpoint; None where there is none that can be read."""
+    try:
+        return int(json.loads((run / _INDEX).read_text(encoding="utf-8"))["step"])
+    except BROKEN:
+        return None
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, torch.Tensor]:

@@ -14,11 +14,9 @@ from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors import checkpoints
 from priors.settings import NetworkConfig
 from priors.training import corpus as corpora
-from priors.training import run_files
+from priors.training import loop, run_files
+from priors.training.gathering import Progress, Source, gather, of_card
 from priors.training.trainer import Trainer
-
-Progress = Callable[[str], None]
-"""Called with one line of news."""
 
 
 @runtime_checkable
@@ -66,6 +64,8 @@ class WindowRequest(Generic[C, S]):
     """Of the weights, for the card."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""
 
@@ -84,33 +84,40 @@ class Kind(Generic[C, S]):
     """Options of the command that the network's shape needs; those that are the defaults are left out."""
 
 
-def train(request: WindowRequest[C, S], kind: Kind[C, S], progress: Progress = lambda line: None) -> Path:
-    """Train to the end of the recipe and write RUN/model.safetensors; returns its path.
+def train(
+    request: WindowRequest[C, S], kind: Kind[C, S], progress: Progress = lambda line: None, *,
+    warn: Progress = lambda line: None,
+) -> Path:  # fmt: skip
+    """Train to the end of the recipe and write RUN/model.safetensors; returns its path. `warn` is told of files that
+    cannot be used.
 
-    Killed and resumed, a run gives the same weights bit for bit on one machine.
+    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
+    the same weights bit for bit on one machine.
     """
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-    corpus = corpora.read(
-        request.data, match=request.match, cache=request.out / "cache", skip_first=request.skip_first,
-        progress=lambda done, of: progress(f"read {done} of {of} clips") if done % 200 == 0 or done == of else None,
-    )  # fmt: skip
-    run = _Run(request, kind, corpus.identity(), corpora.split(corpus, request.settings.seed), progress)
-    run.go()
+    source = Source(request.data, request.out, request.match, request.skip_first, request.strict_data,
+                    request.settings.seed)  # fmt: skip
+    corpus, parts = gather(source, progress=progress, warn=warn)
+    run = _Run(request, kind, corpus, parts, progress)
+    loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
     return run.export()
 
 
 class _Run(Generic[C, S]):
-    """The loop and its checkpoints."""
+    """What `loop.go` does to a trainer, its curve and its checkpoints."""
 
     def __init__(
-        self, request: WindowRequest[C, S], kind: Kind[C, S], data: dict[str, str], parts: corpora.Split,
+        self, request: WindowRequest[C, S], kind: Kind[C, S], corpus: corpora.Corpus, parts: corpora.Split,
         progress: Progress,
     ):  # fmt: skip
-        self.request, self.kind, self.data, self.parts, self.progress = request, kind, data, parts, progress
+        self.request, self.kind, self.parts, self.progress = request, kind, parts, progress
+        self.data, self.skipped = corpus.identity(), of_card(corpus)
         self.trainer = kind.trainer(request.config, request.settings, parts.train)
         self.curve: list[dict[str, float]] = []
+        self.news: list[dict[str, float]] = []  # since the last line
+        self.began = time.monotonic()
         if request.resume:
             self._load()
             progress(f"resumed at step {self.trainer.step}")
@@ -127,28 +134,34 @@ class _Run(Generic[C, S]):
             raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
         self.trainer.network.load_state_dict(tensors)
 
-    def go(self) -> None:
-        """To the end of the recipe."""
-        request, trainer = self.request, self.trainer
-        saved = began = time.monotonic()
-        news: list[dict[str, float]] = []
-        while trainer.step < request.settings.steps:
-            news.append(trainer.train_step())
-            if not math.isfinite(news[-1]["loss"]):
-                raise MapctlError(f"training diverged at step {trainer.step}; the last checkpoint is as it was")
-            last = trainer.step == request.settings.steps
-            if last or trainer.step % request.report_steps == 0:
-                means = {name: sum(row[name] for row in news) / len(news) for name in news[0]}
-                told = ", ".join(f"{name} {value:.3f}" for name, value in means.items())
-                self.progress(f"step {trainer.step}: {told}, {time.monotonic() - began:.0f} s")
-                news = []
-            if last or trainer.step % request.validate_steps == 0:
-                row = self.kind.validate(trainer.network, self.parts.validation, request.settings)
-                self.curve.append({"step": trainer.step, **row})
-                self.progress(json.dumps(self.curve[-1]))
-            if last or time.monotonic() - saved > 60 * request.checkpoint_minutes:
-                self._save()
-                saved = time.monotonic()
+    @property
+    def finished(self) -> bool:
+        """At the end of the recipe."""
+        return self.trainer.step >= self.request.settings.steps
+
+    @property
+    def judgement_due(self) -> bool:
+        """Every so many steps and at the end."""
+        step, measured = self.trainer.step, self.curve[-1]["step"] if self.curve else 0
+        return step > measured and (self.finished or step % self.request.validate_steps == 0)
+
+    def update(self) -> None:
+        """One step; MapctlError where its loss is no number."""
+        trainer, news = self.trainer, self.news
+        news.append(trainer.train_step())
+        if not math.isfinite(news[-1]["loss"]):
+            raise MapctlError(f"training diverged at step {trainer.step}; the last checkpoint is as it was")
+        if self.finished or trainer.step % self.request.report_steps == 0:
+            means = {name: sum(row[name] for row in news) / len(news) for name in news[0]}
+            told = ", ".join(f"{name} {value:.3f}" for name, value in means.items())
+            self.progress(f"step {trainer.step}: {told}, {time.monotonic() - self.began:.0f} s")
+            news.clear()
+
+    def judge(self) -> None:
+        """A row of the curve."""
+        row = self.kind.validate(self.trainer.network, self.parts.validation, self.request.settings)
+        self.curve.append({"step": self.trainer.step, **row})
+        self.progress(json.dumps(self.curve[-1]))
 
     def export(self) -> Path:
         """Write the model in float16 with its card."""
@@ -156,7 +169,8 @@ class _Run(Generic[C, S]):
         held = {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
         card = checkpoints.Card(
             kind=self.kind.name, config=request.config.as_card(), licence=request.licence,
-            data={**self.data, "match": request.match, "split_seed": request.settings.seed, "held_out": held},
+            data={**self.data, **self.skipped, "match": request.match, "split_seed": request.settings.seed,
+                  "held_out": held},
             training={"settings": _fields(request.settings), "curve": self.curve,
                       "command": command(request, self.kind)},
             quality={"test": self.kind.validate(self.trainer.network, self.parts.test, request.settings)},
@@ -165,7 +179,8 @@ class _Run(Generic[C, S]):
         checkpoints.save(self.trainer.network.state_dict(), card, path)
         return path
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """A checkpoint."""
         index = {**self._recipe(), "curve": self.curve}
         run_files.write(self.request.out, step=self.trainer.step, tensors=self.trainer.state(), index=index)
 
@@ -175,7 +190,7 @@ class _Run(Generic[C, S]):
             index, tensors = run_files.read(out)
             for part, now in self._recipe().items():
                 run_files.check_same(out, part, then=index[part], now=now)
-            self.curve = [dict(row) for row in index["curve"]]
+            self.curve = run_files.rows(index, "step")
             self.trainer.load_state(tensors, int(index["step"]))
         except run_files.BROKEN as error:
             raise run_files.unreadable(out, error) from error

@@ -1,0 +1,74 @@
+"""What there is of work that ended early, and how it goes on, in one line."""
+
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
+
+from mapctl.errors import WriteError
+
+if TYPE_CHECKING:
+    from mapctl.commands.train import Train
+
+
+@contextmanager
+def telling_how_to_go_on(given: "Train") -> Iterator[None]:
+    """What Ctrl-C, SIGTERM or a full disk ends within says what is saved, and what to type."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(_how(given) or "nothing was saved yet") from stop
+    except WriteError as error:
+        raise WriteError(_joined(str(error), _how(given))) from error
+
+
+@contextmanager
+def telling_what_is_finished(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
+    """Yield a function that is told how many are finished; Ctrl-C, SIGTERM and a full disk say it, and what to do
+    `then`.
+    """
+    finished = 0
+
+    def tell(number: int) -> None:
+        nonlocal finished
+        finished = number
+
+    def kept() -> tuple[str, ...]:
+        return (f"{finished} of {count} {what} are finished", then) if finished else ()
+
+    try:
+        yield tell
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(_joined(str(stop), *kept())) from stop
+    except WriteError as error:
+        raise WriteError(_joined(str(error), *kept())) from error
+
+
+def words(given: "Train") -> list[str]:
+    """What to type for a command; options that are the defaults are left out."""
+    typed = ["mapctl", "train", given.model]
+    for option in fields(given):
+        value, name = getattr(given, option.name), f"--{option.name.replace('_', '-')}"
+        if option.name == "model" or value == option.default:
+            continue
+        if value is True:
+            typed.append(name)
+        elif str(value).startswith("-"):
+            typed.append(f"{name}={value}")
+        else:
+            typed += [name, str(value)]
+    return typed
+
+
+def _joined(*parts: str) -> str:
+    return "; ".join(filter(None, parts))
+
+
+def _how(given: "Train") -> str:
+    """Empty where the run folder holds no checkpoint."""
+    from priors.training.run_files import last_step
+
+    step = last_step(given.out)
+    typed = shlex.join([*words(replace(given, resume=False)), "--resume"])
+    return "" if step is None else f"step {step} is saved; go on with: {typed}"

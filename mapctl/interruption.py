@@ -1,0 +1,107 @@
+"""Ctrl-C, SIGTERM and a terminal that closes end work alike, by KeyboardInterrupt; what must be whole holds them back.
+
+`timeout`, job schedulers and impatient fingers send a signal twice: what comes within a second is one wish.
+"""
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""What ends work. Those that a process was told to ignore (nohup) are left ignored."""
+ONE_WISH = 1.0
+"""Seconds."""
+
+
+def listen() -> list[int]:
+    """From here on every one of SIGNALS raises KeyboardInterrupt; the list gets the numbers of those that did.
+
+    For a process' main thread.
+    """
+    received: list[int] = []
+    until = 0.0
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal until
+        if (now := time.monotonic()) < until:
+            return
+        until = now + ONE_WISH
+        received.append(number)
+        raise KeyboardInterrupt
+
+    for number in _heeded():
+        signal.signal(number, stop)
+    return received
+
+
+class Held:
+    """Signals that wait until what is under way is whole."""
+
+    def __init__(self, before: dict[int, Any]):
+        """`before` holds the handlers that they would have gone to."""
+        self.wanted: int | None = None
+        """The signal that waits."""
+        self._before, self._since = before, 0.0
+        self._passes = self._shut = False
+
+    def release(self) -> None:
+        """Let a signal go that waits: KeyboardInterrupt, or whatever it did before it was held."""
+        number, self.wanted = self.wanted, None
+        if number is None:
+            return
+        if not callable(self._before[number]):
+            raise KeyboardInterrupt
+        self._before[number](number, None)
+
+    @contextmanager
+    def passing(self) -> Iterator[None]:
+        """Within, signals go through at once, as does one that waits already."""
+        self._passes = True
+        try:
+            self.release()
+            yield
+        finally:
+            self._passes = False
+
+    @contextmanager
+    def shut(self) -> Iterator[None]:
+        """Within, signals wait however often they come: for saving, which is short."""
+        self._shut = True
+        try:
+            yield
+        finally:
+            self._shut = False
+
+    def receive(self, number: int, _: FrameType | None) -> None:
+        """The handler. A second wish, more than a second after the first, is not held back."""
+        now, again = time.monotonic(), self.wanted is not None
+        if not again:
+            self.wanted, self._since = number, now
+        if not self._shut and (self._passes or (again and now > self._since + ONE_WISH)):
+            self.release()
+
+
+@contextmanager
+def held_back() -> Iterator[Held]:
+    """Hold SIGNALS back within; one that still waits at the end is then let go. In other threads nothing is held."""
+    if threading.current_thread() is not threading.main_thread():
+        yield Held({})
+        return
+    held = Held({number: signal.getsignal(number) for number in _heeded()})
+    for number in held._before:
+        signal.signal(number, held.receive)
+    try:
+        yield held
+    finally:
+        for number, handler in held._before.items():
+            signal.signal(number, handler)
+    held.release()
+
+
+def _heeded() -> list[int]:
+    """Those that are neither ignored nor in the hands of something that is not Python."""
+    return [number for number in SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]

@@ -1,0 +1,77 @@
+"""What a training run is trained on: the corpus of a folder, split, and the files that were left out, said."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.formats.atomic import write_text
+from priors.training.corpus import Corpus, Skipped, Split, read, split
+
+Progress = Callable[[str], None]
+"""Called with one line of news."""
+
+_MOST_NAMED = 5
+_LIST = "skipped.txt"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where motion comes from."""
+
+    data: Path
+    """Folder of BVH files, searched below."""
+    run: Path
+    """Run folder: features are kept there, and the list of what was left out."""
+    match: str = ""
+    """Regular expression that a file's path below `data` must contain."""
+    skip_first: bool = False
+    """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    strict: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
+    seed: int = 1
+    """Of the split."""
+
+
+def gather(source: Source, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
+    """The corpus and its parts; `warn` gets a line on files that were left out, RUN/skipped.txt has them all.
+
+    RequestError where nothing is left, what is left cannot be split, or, if that is asked for, a file cannot be used.
+    """
+
+    def news(done: int, total: int) -> None:
+        if done % 200 == 0 or done == total:
+            progress(f"read {done} of {total} clips")
+
+    corpus = read(source.data, match=source.match, cache=source.run / "cache", skip_first=source.skip_first,
+                  progress=news)  # fmt: skip
+    if source.strict and corpus.skipped:
+        raise RequestError(f"--strict-data: {_listed(corpus.skipped, source.data)}")
+    parts = split(corpus, source.seed)
+    if corpus.skipped:
+        rest = f"; all are in {source.run / _LIST}" if len(corpus.skipped) > _MOST_NAMED else ""
+        of = len(corpus.names) + len(corpus.skipped)
+        warn(f"left out {len(corpus.skipped)} of {of} files: {_listed(corpus.skipped, source.data)}{rest}")
+        write_text(source.run / _LIST, "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
+    size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
+    progress(f"{size}; training on {len(parts.train.names)}{_held(parts)}")
+    return corpus, parts
+
+
+def of_card(corpus: Corpus) -> dict[str, dict[str, str]]:
+    """For a card's data: the files that were left out and why; nothing where there are none."""
+    return {"skipped": {file.name: file.reason for file in corpus.skipped}} if corpus.skipped else {}
+
+
+def _listed(skipped: Sequence[Skipped], data: Path) -> str:
+    """The first few with their reasons, and how many more there are."""
+    named = "; ".join(f"{data / file.name}: {file.reason}" for file in skipped[:_MOST_NAMED])
+    return named + (f"; and {len(skipped) - _MOST_NAMED} more" if len(skipped) > _MOST_NAMED else "")
+
+
+def _held(parts: Split) -> str:
+    """What is held out where that is no whole clip."""
+    if parts.validation is not parts.test:
+        return ""
+    return f", without {parts.test.names[0]} (frames at {PRIOR_FPS} fps), which is held out"

@@ -1,0 +1,75 @@
+"""How a refiner in training is judged: its samples beside the raw ones and mocap that training does not see."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.features import Place, decode
+from mapctl.metrics import measure
+from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows
+from mapctl.metrics.realism.classifier import held_out_accuracy
+from priors import checkpoints
+from priors.refiner import LstmRefiner, RefinerNetwork
+from priors.training.corpus import Corpus, Split
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Measures refined samples beside the raw ones and mocap that training does not see."""
+
+    raw: Float[Tensor, "count frames size"]
+    """Samples that are refined anew each time."""
+    mocap: dict[str, float]
+    """Mocap's measures."""
+    windows: list[Tensor]
+    """Mocap's windows for the classifier."""
+    settings: RealismSettings
+    """Of the classifier."""
+
+    @staticmethod
+    def of(raw: Corpus, parts: Split, settings: RealismSettings) -> "Judge":
+        """Against validation and test clips."""
+        clips = [c for part in (parts.validation, parts.test) for c in part.clips() if len(c) > settings.windows.frames]
+        motions = [decode(clip, Place.origin()) for clip in clips]
+        windows = [clip_windows(canonical_positions(motion), settings.windows) for motion in motions]
+        return Judge(torch.stack(raw.clips()), _means(clips), windows, settings)
+
+    def __call__(self, network: RefinerNetwork) -> dict[str, float]:
+        """Contact speed and jitter as ratios to mocap's, and the share told apart."""
+        refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
+        refined = refiner.refine(self.raw)
+        means = _means(list(refined))
+        row = {f"{name}_ratio": means[name] / self.mocap[name]
+               for name in ("contact_speed_cm_s", "jitter_m_s3") if self.mocap[name] > 0}  # fmt: skip
+        if min(len(refined), len(self.windows)) >= self.settings.fewest_clips:
+            made = [clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
+                    for clip in refined]  # fmt: skip
+            seeded = torch.Generator().manual_seed(0)
+            row["told_apart"] = held_out_accuracy(
+                made, self.windows, generator=seeded, settings=self.settings.classifier
+            )
+        return row
+
+
+def score(row: Mapping[str, float | None]) -> float:
+    """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart.
+
+    Infinite where a measure cannot be had, as of feet that never touch the floor.
+    """
+    ratios = [value or math.nan for name, value in row.items() if name.endswith("_ratio")]
+    if not all(value > 0 for value in ratios):
+        return math.inf
+    told = row.get("told_apart") or 0.0
+    return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, told - 0.5)
+
+
+_NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.of_layout())
+
+
+def _means(clips: list[Tensor]) -> dict[str, float]:
+    rows = [measure(decode(clip, Place.origin())) for clip in clips]
+    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}

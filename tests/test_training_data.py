@@ -1,0 +1,229 @@
+"""What training does with files that cannot be used, and with very few clips."""
+
+import shutil
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import tiny_denoiser
+import tiny_infiller
+import torch
+from helpers import bandai_skeleton, corpus, run, walks
+
+import priors
+from mapctl import retarget
+from mapctl.errors import RequestError
+from priors.training import corpus as corpora
+from priors.training import denoiser_run, health, infiller_run
+from priors.training import run as density_run
+from priors.training.denoiser import DenoiserSettings, DenoiserTrainer, validate
+from priors.training.gathering import Source, gather
+
+BALL = (
+    "HIERARCHY\nROOT Ball\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\n"
+)
+ONE_FRAME = "one.bvh: features need at least two frames"
+
+
+@pytest.fixture(autouse=True)
+def short_free_runs(monkeypatch):
+    monkeypatch.setattr(density_run, "free_run", partial(health.free_run, runs=2, frames=20))
+
+
+def write_walks(folder, *lengths):
+    """Walks of so many frames, as BVH files of the Bandai Namco rig."""
+    folder.mkdir(parents=True)
+    rigmap = retarget.map_rig(bandai_skeleton())
+    for number, motion in enumerate(walks(len(lengths), max(lengths))):
+        motion = motion.slice(0, lengths[number])
+        retarget.from_canonical(motion, rigmap).save(folder / f"walk-{number}.bvh")
+    return folder
+
+
+@pytest.fixture
+def mixed(tmp_path, data):
+    """Five walks among files of every kind that a folder may hold."""
+    folder = shutil.copytree(data, tmp_path / "data")
+    text = (folder / "walk-0.bvh").read_text()
+    (folder / "broken.bvh").write_text(text[: len(text) // 2])
+    (folder / "empty.bvh").touch()
+    (folder / "folder.bvh").mkdir()
+    (folder / "lost.bvh").symlink_to(tmp_path / "gone")
+    (folder / "other.bvh").write_text(f"{BALL}MOTION\nFrames: 2\nFrame Time: 0.04\n0 0 0\n1 0 0\n")
+    write_walks(tmp_path / "short", 2, 1)
+    shutil.copy(tmp_path / "short" / "walk-1.bvh", folder / "one.bvh")
+    return folder
+
+
+BAD = ("broken.bvh", "empty.bvh", "folder.bvh", "lost.bvh", "one.bvh", "other.bvh")
+
+
+def gathered(folder, run_folder, **changes):
+    """Corpus, and the lines of news and of warning."""
+    news, warnings = [], []
+    found, _ = gather(Source(folder, run_folder, **changes), progress=news.append, warn=warnings.append)
+    return found, news, warnings
+
+
+def test_files_that_cannot_be_used_are_left_out_and_listed(tmp_path, data, mixed):
+    found, news, (warning,) = gathered(mixed, tmp_path / "run")
+    whole, *_ = gathered(data, tmp_path / "whole")
+    assert found.names == whole.names
+    assert torch.equal(found.features, whole.features)
+    assert tuple(file.name for file in found.skipped) == BAD
+    assert all(file.reason and file.name not in file.reason for file in found.skipped)
+    assert warning.startswith(f"left out 6 of 11 files: {mixed / 'broken.bvh'}: ")
+    assert "expected" in warning or "frames" in warning
+    assert warning.endswith(f"; and 1 more; all are in {tmp_path / 'run' / 'skipped.txt'}")
+    listed = (tmp_path / "run" / "skipped.txt").read_text().splitlines()
+    assert [line.split(":")[0] for line in listed] == list(BAD)
+    assert ONE_FRAME in listed
+    assert any(line == "read 11 of 11 clips" for line in news)
+
+
+def test_few_are_named_in_the_line_alone(tmp_path, mixed):
+    _, _, (warning,) = gathered(mixed, tmp_path / "run", match="walk|one")
+    assert warning == f"left out 1 of 6 files: {mixed / ONE_FRAME}"
+
+
+def test_a_sound_folder_is_not_warned_of(tmp_path, data):
+    _, _, warnings = gathered(data, tmp_path / "run", strict=True)
+    assert warnings == []
+    assert not (tmp_path / "run" / "skipped.txt").exists()
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_strict_data_refuses_and_names_the_file(tmp_path, mixed, cached):
+    if cached:
+        gathered(mixed, tmp_path / "run", match="walk|one")
+    with pytest.raises(RequestError, match=rf"^--strict-data: {mixed / ONE_FRAME}$"):
+        gathered(mixed, tmp_path / "run", match="walk|one", strict=True)
+
+
+def test_a_folder_of_nothing_else_is_refused(tmp_path, mixed):
+    with pytest.raises(RequestError, match=rf"none of the 1 \.bvh below .* can be trained on \({mixed / ONE_FRAME}\)"):
+        gathered(mixed, tmp_path / "run", match="one")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_fault_that_nobody_foresaw_leaves_one_file_out(tmp_path, data, monkeypatch):
+    whole = corpora.clip_features
+
+    def odd(file, *, skip_first):
+        return 1 / 0 if file.name == "walk-1.bvh" else whole(file, skip_first=skip_first)
+
+    monkeypatch.setattr(corpora, "clip_features", odd)
+    found, _, _ = gathered(data, tmp_path / "run")
+    assert found.skipped == (corpora.Skipped("walk-1.bvh", "ZeroDivisionError: division by zero"),)
+
+
+def test_the_cache_knows_what_was_left_out_and_tries_it_again(tmp_path, mixed, monkeypatch):
+    first, _, warned = gathered(mixed, tmp_path / "run")
+    whole, read = corpora.clip_features, []
+
+    def counted(file, *, skip_first):
+        read.append(file.name)
+        return whole(file, skip_first=skip_first)
+
+    monkeypatch.setattr(corpora, "clip_features", counted)
+    again, _, warned_again = gathered(mixed, tmp_path / "run")
+    assert (again.skipped, warned_again) == (first.skipped, warned)
+    assert set(read) == set(BAD)
+
+    def mended(file, *, skip_first):
+        return whole(mixed / "walk-1.bvh" if file.name == "lost.bvh" else file, skip_first=skip_first)
+
+    monkeypatch.setattr(corpora, "clip_features", mended)  # a drive that is there again: the files' dates are the same
+    after, _, _ = gathered(mixed, tmp_path / "run")
+    assert [name for name in after.names if name not in first.names] == ["lost.bvh"]
+
+
+def train_words(model, data, out, *words):
+    return ("train", model, "--data", data, "-o", out, "--steps", 2, "--batch", 3, *words)
+
+
+MODELS = {
+    "lstm-gmm": (("--width", 8, "--components", 2, "--window", 20, "--device", "cpu"), priors.load),
+    "denoiser": ((), priors.load_denoiser),
+    "infiller": (("--window", 32), priors.load_infiller),
+}
+
+
+@pytest.fixture(params=MODELS)
+def model(request, monkeypatch):
+    """Its name, words for a small one, and what loads it."""
+    tiny = {"denoiser": (denoiser_run, tiny_denoiser.CONFIG), "infiller": (infiller_run, tiny_infiller.CONFIG)}
+    if request.param in tiny:
+        runs, config = tiny[request.param]
+        train = runs.train
+        monkeypatch.setattr(runs, "train", lambda request, *words, **options:
+                            train(replace(request, config=config), *words, **options))  # fmt: skip
+    return (request.param, *MODELS[request.param])
+
+
+def test_the_command_leaves_out_lists_and_says_it_in_the_card(tmp_path, mixed, model, capsys):
+    name, words, load = model
+    assert run(*train_words(name, mixed, tmp_path / "run", *words, "--match", "walk|one", "--quiet")) == 0
+    told = capsys.readouterr()
+    assert (told.out, told.err) == ("", f"mapctl: left out 1 of 6 files: {mixed / ONE_FRAME}\n")
+    assert load(str(tmp_path / "run")).card.data["skipped"] == {"one.bvh": ONE_FRAME.split(": ")[1]}
+    refused = tmp_path / "refused"
+    assert run(*train_words(name, mixed, refused, *words, "--match", "walk|one", "--quiet", "--strict-data")) == 2
+    assert capsys.readouterr().err == f"mapctl: --strict-data: {mixed / ONE_FRAME}\n"
+    assert not (refused / "checkpoint.json").exists()
+
+
+@pytest.mark.parametrize("lengths", [(80, 76), (160,), (160, 40), (90, 90, 90)], ids=str)
+def test_few_clips_are_enough(tmp_path, model, lengths, capsys):
+    name, words, load = model
+    data = write_walks(tmp_path / "data", *lengths)
+    assert run(*train_words(name, data, tmp_path / "run", *words)) == 0
+    held = f"walk-0.bvh[{lengths[0] - 75}:{lengths[0]}]"
+    assert f", without {held} (frames at 30 fps), which is held out\n" in capsys.readouterr().out
+    card = load(str(tmp_path / "run")).card
+    assert card.data["held_out"] == {"validation": [held], "test": [held]}
+    assert int(card.data["clips"]) == len(lengths)
+
+
+def test_a_density_of_many_is_tuned_on_two(tmp_path, data):
+    words = MODELS["lstm-gmm"][0]
+    assert run(*train_words("lstm-gmm", data, tmp_path / "first", *words)) == 0
+    two = write_walks(tmp_path / "two", 100, 100)
+    tuned = ("--init", tmp_path / "first", "--window", 20, "--device", "cpu", "--learning-rate", 3e-4)
+    assert run(*train_words("lstm-gmm", two, tmp_path / "tuned", *tuned)) == 0
+    assert (
+        priors.load(str(tmp_path / "tuned")).reference.config == priors.load(str(tmp_path / "first")).reference.config
+    )
+
+
+def test_of_few_clips_the_end_of_the_longest_is_held_out():
+    few = corpora.Corpus(("a", "b"), (100, 1000), corpus(11).features)
+    parts = corpora.split(few, 1)
+    assert (parts.train.names, parts.train.lengths) == (("a", "b"), (100, 890))
+    assert parts.test is parts.validation
+    assert (parts.test.names, parts.test.lengths) == (("b[890:1000]",), (110,))
+    assert torch.equal(torch.cat([parts.train.features, parts.test.features]), few.features)
+
+
+def test_what_is_left_of_a_clip_is_no_clip_where_it_is_a_frame():
+    few = corpora.Corpus(("a", "b"), (76, 76), corpus(2, 76).features)
+    assert corpora.split(few, 1).train.names == ("b",)
+
+
+@pytest.mark.parametrize(("lengths", "got"), [((74, 70), "74, 70"), ((100,), "100"), ((149,), "149")])
+def test_too_little_is_refused_with_what_would_do(lengths, got):
+    few = corpora.Corpus(tuple("ab"[: len(lengths)]), lengths, torch.zeros(sum(lengths), corpus(1).features.shape[1]))
+    message = f"training needs 75 frames at 30 fps, and 75 to hold out in the longest clip; got clips of {got}"
+    with pytest.raises(RequestError, match=f"^{message}$"):
+        corpora.split(few, 1)
+
+
+def test_five_clips_are_held_out_whole():
+    parts = corpora.split(corpus(5), 1)
+    assert [len(part.names) for part in (parts.train, parts.validation, parts.test)] == [3, 1, 1]
+
+
+def test_a_window_longer_than_what_is_held_out_does_not_end_a_run():
+    settings = DenoiserSettings(steps=1, batch=2, window=90)
+    trainer = DenoiserTrainer(tiny_denoiser.CONFIG, settings, corpus(2, 100))
+    assert validate(trainer.network, corpus(1, 80), settings)["error_cm"] > 0

@@ -1,0 +1,181 @@
+"""Whatever writes a file: it appears whole or not at all, with the permissions that files have, and a full disk is one
+line.
+"""
+
+import os
+import resource
+import stat
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import run, tiny_density, walk
+
+from mapctl import formats, report
+from mapctl.errors import WriteError
+from mapctl.formats import usd
+from mapctl.formats.atomic import atomic_path, write_bytes
+from mapctl.formats.bvh_stream import bvh_stream
+from priors import checkpoints
+from priors.tensor_files import write_tensors
+from priors.training import run_files
+from scenes.writers import gif_writer, mp4_writer, save_png
+
+MOTION = walk(300)
+PICTURE = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+TENSORS = {"a": torch.zeros(200, 200)}
+
+
+def _save(path):
+    formats.save(MOTION, path)
+
+
+def _stream(path):
+    with bvh_stream(path, 2 * MOTION.num_frames) as file:
+        file.append(MOTION)
+        file.append(MOTION)
+
+
+def _film(writer):
+    def write(path):
+        with atomic_path(path) as scratch, writer(scratch, (320, 240), Fraction(30)) as add:
+            for _ in range(20):
+                add(PICTURE)
+
+    return write
+
+
+def _card(path):
+    density = tiny_density()
+    checkpoints.save(density.reference.state_dict() | TENSORS, density.card, path)
+
+
+def _checkpoint(path):
+    run_files.write(path.parent, step=1, tensors=TENSORS, index={"curve": []})
+
+
+WRITERS = {
+    "a.bvh": _save, "a.npz": _save, "a.glb": _save, "stream.bvh": _stream,
+    "a.mp4": _film(mp4_writer), "a.gif": _film(gif_writer), "a.png": lambda path: save_png(path, PICTURE),
+    "a.json": lambda path: report.write({"values": list(range(9000))}, path),
+    "a.safetensors": lambda path: write_tensors(path, TENSORS), "model.safetensors": _card,
+    "step-1-checkpoint.safetensors": _checkpoint,
+} | ({"a.usda": _save, "a.usdc": _save} if usd.is_installed() else {})  # fmt: skip
+
+
+@pytest.fixture(params=WRITERS)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def small_disk():
+    """No file can grow beyond 20 kB, as far as this process goes; the kernel says so in the middle of a write."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.fixture
+def umask():
+    """Sets it, and puts it back."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+def modes(folder: Path) -> set[int]:
+    return {stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()}
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o027, 0o640), (0o077, 0o600), (0, 0o666)], ids=oct)
+def test_a_new_file_has_the_permissions_that_the_umask_allows(tmp_path, name, umask, mask, mode):
+    umask(mask)
+    WRITERS[name](tmp_path / name)
+    assert modes(tmp_path) == {mode}
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o664, 0o444])
+def test_a_file_that_is_written_over_keeps_its_permissions(tmp_path, name, umask, mode):
+    WRITERS[name](tmp_path / name)
+    before = {file.name for file in tmp_path.iterdir()}
+    for file in tmp_path.iterdir():
+        file.chmod(mode)
+    WRITERS[name](tmp_path / name)
+    assert {file.name for file in tmp_path.iterdir()} == before
+    assert modes(tmp_path) == {mode}
+
+
+def test_what_nobody_else_may_read_is_not_shown_while_it_is_written(tmp_path, umask):
+    write_bytes(tmp_path / "a", b"secret")
+    (tmp_path / "a").chmod(0o600)
+    with atomic_path(tmp_path / "a") as scratch:
+        assert stat.S_IMODE(scratch.stat().st_mode) == 0o600
+
+
+def test_a_link_leads_to_the_file_that_is_replaced(tmp_path, umask):
+    write_bytes(tmp_path / "a", b"old")
+    (tmp_path / "a").chmod(0o640)
+    (tmp_path / "link").symlink_to("a")
+    write_bytes(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink()
+    assert ((tmp_path / "a").read_bytes(), stat.S_IMODE((tmp_path / "a").stat().st_mode)) == (b"new", 0o640)
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, name, small_disk):
+    with pytest.raises(WriteError, match=r"^cannot write .*: File too large$") as caught:
+        WRITERS[name](tmp_path / name)
+    assert name in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path, name, request):
+    WRITERS[name](tmp_path / name)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    request.getfixturevalue("small_disk")
+    with pytest.raises(WriteError):
+        WRITERS[name](tmp_path / name)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_a_card_that_finds_no_room_takes_the_weights_with_it(tmp_path, monkeypatch):
+    """Or there would be weights that nobody can load, or new ones under an old card."""
+    density = tiny_density()
+    monkeypatch.setattr(Path, "write_text", _no_space)
+    with pytest.raises(WriteError, match=r"model\.json: No space left on device"):
+        checkpoints.save(density.reference.state_dict(), density.card, tmp_path / "model.safetensors")
+    with pytest.raises(WriteError, match=r"checkpoint\.json: No space left on device"):
+        run_files.write(tmp_path, step=1, tensors=TENSORS, index={"curve": []})
+    assert list(tmp_path.iterdir()) == []
+
+
+def _no_space(*words, **options):
+    raise OSError(28, "No space left on device")
+
+
+def test_a_command_says_it_in_one_line(tmp_path, prior, monkeypatch, capsys, request):
+    monkeypatch.chdir(tmp_path)
+    request.getfixturevalue("small_disk")
+    assert run("generate", "--seconds", 20, "-o", "new/folder", "--prior", prior, "--no-refine", "--quiet") == 2
+    told = capsys.readouterr()
+    place = Path("new/folder/generated_000.bvh")
+    assert (told.out, told.err) == ("", f"mapctl: cannot write {place}: File too large\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_compiled_code_that_finds_no_room_works(tmp_path, monkeypatch):
+    from numba.core.caching import FunctionCache
+
+    from mapctl.compiled import compilers
+
+    monkeypatch.setattr(FunctionCache, "save_overload", _no_space)
+    monkeypatch.setattr(FunctionCache, "load_overload", lambda *words: None)
+    entry, _ = compilers()
+    assert entry(_doubled)(21) == 42
+
+
+def _doubled(number):
+    return 2 * number
