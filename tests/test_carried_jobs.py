@@ -28,6 +28,13 @@ def others_walk() -> Motion:
     return make(Make(names_of("mixamo"), size=1.2, extras=False)).motion(OTHER.walks())
 
 
+def foot_of(motion: Motion) -> str:
+    """The rig's name of the left foot."""
+    joint = retarget.map_rig(motion.skeleton).joint_of[FEET[0]]
+    assert joint is not None
+    return motion.skeleton.names[joint]
+
+
 def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
     settings = ChainSettings(piece=40, gap=(10, 10))
     done = chain([own_walk(), others_walk()], None, settings=settings, filling=LINEAR, generator=generator())
@@ -39,7 +46,7 @@ def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
 def test_a_borrowed_foot_is_as_high_as_it_was():
     """The same step of somebody else comes at the same height of the foot over the floor, in scale."""
     motion, source = own_walk(), others_walk()
-    name = motion.skeleton.names[retarget.map_rig(motion.skeleton).joint_of[FEET[0]]]
+    name = foot_of(motion)
     borrowed = Borrowed((name,), start=40, stop=60, at=40)
     done = blend(motion, source, borrowed, None, settings=LINEAR)
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
@@ -48,7 +55,7 @@ def test_a_borrowed_foot_is_as_high_as_it_was():
 
 def test_a_clip_of_the_same_rig_is_blended_as_it_is():
     motion = own_walk()
-    name = motion.skeleton.names[retarget.map_rig(motion.skeleton).joint_of[FEET[0]]]
+    name = foot_of(motion)
     lifted = replace(motion, root_position=motion.root_position + 0.2)
     done = blend(motion, lifted, Borrowed((name,), start=40, stop=60, at=40), None, settings=LINEAR)
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
