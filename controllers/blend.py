@@ -11,6 +11,7 @@ from torch import Tensor
 from controllers.filling import Infilled, InfillSettings, fill
 from controllers.keys import limb_end
 from mapctl import inverse_kinematics, rotations
+from mapctl.carry import Body, carry
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost, put_back
 from mapctl.gaps.targets import LIMBS
@@ -21,6 +22,7 @@ from mapctl.protocols import Inbetweener
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.rigs import Rig
 from mapctl.skeleton import CANONICAL
+from mapctl.stance import Stance
 
 _LEAST = 0.3  # seconds
 _JERKLESS = 5.77  # peak acceleration of the smoothest way, of least jerk, over distance and time squared (Flash 1985)
@@ -55,7 +57,8 @@ def blend(
     source = source if source.fps == motion.fps else source.resample(motion.fps)
     _check(motion, source, borrowed)
     own, rigmap = to_canonical(motion, rig)
-    other, _ = to_canonical(source)
+    carried = carry(source, Body(rigmap, Stance.of(own, rigmap)))
+    other = carried.motion
     limbs = [LIMBS[CANONICAL.names[limb_end(name, rigmap)]] for name in borrowed.limbs]
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
     posed = own
@@ -74,14 +77,14 @@ def blend(
     lost[free] = True
     lost[there] = False
     done = fill(lent, Lost(lost & moved, nothing), infiller, settings=settings, densities=densities, rig=rig)
-    notes = (*_haste(own, posed, borrowed, limbs, free, there),
+    notes = (*carried.notes, *_haste(own, posed, borrowed, limbs, free, there),
              f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new")  # fmt: skip
     return replace(done, lost=Lost((lost | new) & moved, nothing), notes=(*done.notes, *notes))
 
 
 def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: Borrowed) -> Motion:
-    """With one limb bent as the source's is, seen from the heading of the hips, and its end as far from its root as the
-    source's, in the length of its own bones.
+    """With one limb bent as the source's is, which is of the same bones, seen from the heading of the hips, and its end
+    as far from its root.
     """
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
     here = slice(borrowed.start, borrowed.stop)
@@ -96,9 +99,8 @@ def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: 
         above = wanted
     bent = replace(part, local_quat_xyzw=quats)
     goals = bent.joint_positions().clone()
-    size = _length(own, limb.upper, limb.end) / _length(other, limb.upper, limb.end)
     way = rotations.rotate(turn, places[:, limb.end] - places[:, limb.upper])
-    goals[:, limb.end] = goals[:, limb.upper] + size * way
+    goals[:, limb.end] = goals[:, limb.upper] + way
     free = torch.zeros(goals.shape[:2], dtype=torch.bool)
     free[:, [limb.upper, limb.lower]] = True
     solved = inverse_kinematics.solve(goals, quats, own.skeleton, free=free, limbs=(limb,),
@@ -142,13 +144,6 @@ def _haste(
                              f"{needed:.0f} m/s^2; {_HASTY:.0f} is the most that is common: a margin of "
                              f"{math.sqrt(_JERKLESS * far / _HASTY):.2f} s would do")  # fmt: skip
     return tuple(notes)
-
-
-def _length(motion: Motion, root: int, end: int) -> float:
-    """Of a limb's two bones, metres."""
-    middle = motion.skeleton.parents[end]
-    assert motion.skeleton.parents[middle] == root
-    return float(motion.skeleton.offsets[[middle, end]].norm(dim=-1).sum())
 
 
 def _check(motion: Motion, source: Motion, borrowed: Borrowed) -> None:

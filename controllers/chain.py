@@ -11,13 +11,12 @@ from controllers.filling import Infilled, InfillSettings
 from controllers.infill import infill
 from mapctl import rotations
 from mapctl.capture.masks import ALL, Mask
+from mapctl.carry import Body, carry
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
-from mapctl.retarget import from_canonical, to_canonical
-from mapctl.skeleton import leg_length
 
 _END = 5  # frames over which the way on at a piece's end is told
 
@@ -49,11 +48,12 @@ def chain(
     settings = settings or ChainSettings()
     if len(clips) < 2:
         raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
-    first, rigmap = to_canonical(clips[0])
+    body, notes = Body.of(clips[0])[1], []
     whole: Motion | None = None
     masks: list[Mask] = []
     for clip in clips:
-        piece = _piece(clip, first, settings.piece)
+        piece, missed = _piece(clip, body, settings.piece)
+        notes += missed
         if whole is None:
             whole = piece
             continue
@@ -65,18 +65,17 @@ def chain(
         whole = whole.join(replace(whole, root_position=whole.root_position[held],
                                    local_quat_xyzw=whole.local_quat_xyzw[held])).join(piece)  # fmt: skip
     assert whole is not None, "there are clips"
-    rigged = replace(from_canonical(whole, rigmap), source=clips[0].source)
-    return infill(rigged, infiller, masks, settings=filling, densities=densities, extending=extending)
+    done = infill(body.on_rig(whole), infiller, masks, settings=filling, densities=densities, extending=extending)
+    return replace(done, notes=(*done.notes, *notes))
 
 
-def _piece(clip: Motion, body: Motion, frames: int) -> Motion:
-    """Frames from a clip's middle, on the bones of the body, in its size."""
-    canonical = to_canonical(clip)[0].resample(PRIOR_FPS)
-    count = min(frames, canonical.num_frames)
-    start = (canonical.num_frames - count) // 2
-    size = leg_length(body.skeleton) / leg_length(canonical.skeleton)
-    return replace(canonical.slice(start, start + count), skeleton=body.skeleton, source=None,
-                   root_position=size * canonical.root_position[start : start + count])  # fmt: skip
+def _piece(clip: Motion, body: Body, frames: int) -> tuple[Motion, tuple[str, ...]]:
+    """Frames from a clip's middle, on the bones of the body and on its floor, and what of them could not be kept."""
+    carried = carry(clip, body)
+    motion = carried.motion.resample(PRIOR_FPS)
+    count = min(frames, motion.num_frames)
+    start = (motion.num_frames - count) // 2
+    return replace(motion.slice(start, start + count), source=None), carried.notes
 
 
 def _led_on(before: Motion, piece: Motion, gap: int) -> Motion:

@@ -13,14 +13,14 @@ import torch
 
 from controllers.keys import Key, Keys, limb_end
 from mapctl import formats, rotations
+from mapctl.carry import Body, carry
 from mapctl.errors import MapctlError, RequestError
 from mapctl.gaps.lost import Lost, straight
 from mapctl.key_files import KeyRequest, PlacedKey
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, from_canonical, settled, to_canonical
+from mapctl.retarget import RigMap, from_canonical, settled
 from mapctl.rigs import Rig
-from mapctl.skeleton import leg_length
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +60,14 @@ class _Clip:
     clip: Motion
     """As it is."""
     canonical: Motion
-    """On canonical joints."""
-    rigmap: RigMap
-    """And the way back."""
+    """On canonical joints, with the bones of the body and on its floor."""
+    whose: Body
+    """The body."""
+
+    @property
+    def rigmap(self) -> RigMap:
+        """The way back to the body's rig."""
+        return self.whose.rigmap
 
 
 @dataclass(eq=False)
@@ -78,17 +83,14 @@ class _Reader:
         """The body's own file, by its rig where one is asked for."""
         unit = None if self.rig is None else self.rig.metres_per_unit
         clip = formats.load(Path(path), metres_per_unit=unit)
-        self.seen[path] = _Clip(clip, *to_canonical(clip, self.rig))
+        self.seen[path] = _Clip(clip, *Body.of(clip, self.rig))
         return self.seen[path]
 
     def pose(self, path: str, body: _Clip) -> _Clip:
-        """A clip; the body's rig is known, that of another skeleton must be recognised."""
+        """A clip, brought to the body; the rig of another skeleton must be recognised."""
         if path not in self.seen:
             clip = formats.load(Path(path))
-            if clip.skeleton.matches(body.clip.skeleton):
-                self.seen[path] = _Clip(clip, *to_canonical(clip, settled(body.rigmap)))
-            else:
-                self.seen[path] = _Clip(clip, *to_canonical(clip))
+            self.seen[path] = _Clip(clip, carry(clip, body.whose).motion, body.whose)
         return self.seen[path]
 
 
@@ -115,9 +117,7 @@ def _pose(key: PlacedKey, request: KeyRequest, reader: _Reader, body: _Clip, num
     same = clip.skeleton.matches(body.clip.skeleton)
     if same and key.place is None and key.height is None and key.facing_deg is None:
         return own
-    scale = 1.0 if same else leg_length(body.canonical.skeleton) / leg_length(canonical.skeleton)
-    placed = _placed(replace(canonical, skeleton=body.canonical.skeleton, source=None,
-                             root_position=scale * canonical.root_position), key)  # fmt: skip
+    placed = _placed(replace(canonical, source=None), key)
     return from_canonical(placed, body.rigmap, own if same else None)
 
 

@@ -18,6 +18,7 @@ from mapctl.errors import RequestError
 from mapctl.key_files import KeyRequest, PlacedKey
 from mapctl.kinematics import heading
 from mapctl.skeleton import Skeleton, leg_length
+from mapctl.stance import Stance
 
 RIGS = ("canonical", "bandai", "daz")
 
@@ -74,14 +75,20 @@ def test_hips_are_put_turned_and_lifted_and_the_pose_stays(poses, rig):
 @pytest.mark.parametrize(("body", "other"), [("bandai", "daz"), ("daz", "canonical"), ("canonical", "zup"),
                                              ("zup", "bandai")])  # fmt: skip
 def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
-    """Rotations stay, and the hips' way is in the scale of the legs."""
+    """Rotations stay but of the legs, the hips' way is in the scale of these, and toes are as high over their rest."""
     found = keyed(KeyRequest(first_and_last(poses[other]), body=poses[body]))
     whole = canonical_of(found)
     source = retarget.to_canonical(mapctl.load(poses[other]))[0]
     assert found.motion.skeleton.names == keyed(KeyRequest(first_and_last(poses[body]))).motion.skeleton.names
     legs = leg_length(whole.skeleton) / leg_length(source.skeleton)
-    assert torch.allclose(whole.root_position[30], legs * source.root_position[30], atol=1e-4)
-    known = [joint for joint, name in enumerate(whole.skeleton.names) if "Toes" not in name]
+    aside = whole.root_position[30] - legs * source.root_position[30]
+    assert aside[::2].norm() < 0.02
+    stance = Stance.of(*retarget.to_canonical(mapctl.load(poses[body])))
+    own = Stance.of(*retarget.to_canonical(mapctl.load(poses[other])))
+    high, theirs = (m.joint_positions()[30, [m.skeleton.index(n) for n in ("leftToes", "rightToes")], 1]
+                    for m in (whole, source))  # fmt: skip
+    torch.testing.assert_close(high - stance.toe_height, legs * (theirs - own.flat_height), atol=0.01, rtol=0)
+    known = [joint for joint, name in enumerate(whole.skeleton.names) if not name.endswith(("Leg", "Foot", "Toes"))]
     turned = apart_deg(whole.joint_rotations()[30], source.joint_rotations()[30])[known]
     assert turned.max() < 0.01
 

@@ -1,6 +1,6 @@
 """`mapctl convert`: any format to any format, other bones, another frame rate."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +11,7 @@ from mapctl.commands import options, outputs
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
+    from mapctl.carry import Carried
     from mapctl.motion import Motion
     from mapctl.rigs import Rig
 
@@ -25,7 +26,8 @@ class Convert:
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
     rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
-    """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted."""
+    """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted, on which the
+    character stands on its floor with planted feet, in the clip's layout."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     fps: Annotated[str | None, arg(metavar="F")] = None
@@ -42,14 +44,17 @@ class Convert:
         fps = None if self.fps is None else parse_fps(self.fps)
         source_rig = options.read_rig(self.source_rig)
         fps_in = None if self.fps_in is None else parse_fps(self.fps_in)
-        motion = options.read_motion(self.source, source_rig, fps=fps_in)
+        motion, notes = options.read_motion(self.source, source_rig, fps=fps_in), ()
         if self.rig is not None:
-            motion = on_rig(motion, self.rig, source_rig)
+            carried = on_rig(motion, self.rig, source_rig)
+            motion, notes = carried.motion, carried.notes
         if fps is not None:
             motion = motion.resample(fps)
         formats.save(motion, self.out)
         rate = f"{float(motion.fps):.6g} frames a second"
         print(f"{self.out}: {motion.num_frames} frames, {motion.num_joints} joints, {rate}")
+        for note in notes:
+            print(f"note: {note}")
         return 0
 
 
@@ -64,20 +69,19 @@ def parse_fps(text: str) -> Fraction:
     return fps
 
 
-def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Motion":
-    """The motion on the canonical joints or on a clip's skeleton; RequestError for rigs that are not known.
+def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Carried":
+    """The motion on the canonical joints or on a clip's skeleton, in that clip's layout, and what could not be kept.
 
-    Rotations stay. On other bones the hips' way is scaled by the legs' length, so that feet reach the ground.
+    RequestError for rigs that are not known. A clip of the same skeleton stays as it is; others stand on their floor
+    (see mapctl.carry).
     """
     from mapctl import formats, retarget, rigs
-    from mapctl.skeleton import leg_length
+    from mapctl.carry import Body, Carried, carry
 
-    canonical, own = retarget.to_canonical(motion, source_rig)
     if rig == "canonical":
-        return canonical
+        return Carried(retarget.to_canonical(motion, source_rig)[0])
     if rig in {known.name for known in rigs.known()}:
         raise RequestError(f"the bones of {rig} differ from performer to performer: name a clip of that rig")
-    wanted = retarget.to_canonical(formats.load(rig))[1]
-    scale = leg_length(wanted.skeleton) / leg_length(own.skeleton)
-    canonical = replace(canonical, skeleton=wanted.skeleton, root_position=canonical.root_position * scale)
-    return retarget.from_canonical(canonical, wanted)
+    body = Body.of(formats.load(rig))[1]
+    carried = carry(motion, body, source_rig)
+    return Carried(body.on_rig(carried.motion), carried.notes)

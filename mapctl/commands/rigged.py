@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 OutRig = Annotated[str, arg(metavar="canonical|CLIP")]
 """Type of the option."""
-_HIGHEST_TOES = 0.15  # of the leg: a clip whose planted toes are higher does not have its floor at 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +48,8 @@ def read(text: str) -> Wearer:
         return Wearer(CANONICAL, TOE_REST_HEIGHT)
     if text in {rig.name for rig in rigs.known()} or Path(text).suffix.lower() == ".toml":
         raise RequestError(f"the bones of {text} differ from performer to performer: name a clip of that rig")
-    from mapctl import contacts, formats, retarget
+    from mapctl import formats
+    from mapctl.carry import Body
 
-    clip = formats.load(text)
-    canonical, rigmap = retarget.to_canonical(clip)
-    toes = canonical.joint_positions()[:, [CANONICAL.index(name) for name in ("leftToes", "rightToes")]]
-    planted = contacts.planted(toes, canonical.fps)
-    heights = toes[..., 1][planted] if planted.any() else contacts.floor_heights(toes)
-    return Wearer(rigmap.skeleton, _rest_height(float(heights.median()), rigmap.skeleton), rigmap, clip.source)
-
-
-def _rest_height(seen: float, skeleton: "Skeleton") -> float:
-    """What a clip shows, if its floor is at 0; else the canonical toes' in scale."""
-    from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
-
-    leg = leg_length(skeleton)
-    return seen if 0 <= seen < _HIGHEST_TOES * leg else TOE_REST_HEIGHT * leg / leg_length(CANONICAL)
+    body = Body.of(formats.load(text))[1]
+    return Wearer(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)

@@ -1,0 +1,142 @@
+"""How somebody stands: how high the toe joints are over the floor, and how feet and toes are turned while flat on it.
+
+Both belong to the rig as much as bones do, and a T-pose alone does not tell them: a table may lay a foot along another
+performer's, and nobody's toe joints are on the floor. A clip tells them, where its feet stand; else the rest pose does.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import contacts, kinematics, rotations
+from mapctl.motion import Motion
+from mapctl.retarget import RigMap
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
+
+SIDES = ("left", "right")
+_PLAUSIBLE = 0.15  # of the leg: toes that rest further from 0 do not stand on a floor at 0
+_APART = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
+_FLAT = 0.01  # metres over its lowest that the ankle of a flat foot is
+_LOWEST = 0.05  # quantile that is an ankle's lowest
+_SUNK = 0.03  # metres that toes go through the floor at most, of which a clip is believed
+_LONG = 0.25  # seconds of a flat foot that tell how it is turned
+_DOWN, _UP = math.radians(-12), math.radians(35)  # tilts that are the T-pose's; a foot further down is on tip-toe
+
+
+@dataclass(frozen=True, eq=False)
+class Stance:
+    """How one performer stands on a flat floor, in canonical joint frames; feet in the order left, right."""
+
+    toe_height: Float[Tensor, "2"]
+    """Of the toe joints over the floor while they rest on it, metres: what one sees of a clip, its lowest."""
+    flat_height: Float[Tensor, "2"]
+    """Of the toe joints over the floor while feet lie flat, metres: higher where toes go through the floor at times."""
+    tilt: Float[Tensor, "2 2"]
+    """By side, how far foot and toes point up while they lie flat, against the T-pose; radians."""
+    floor: float = 0.0
+    """Height of the clip's floor, metres: 0, but where all of it is above or below, as on a platform."""
+
+    @staticmethod
+    def at_rest(skeleton: Skeleton) -> "Stance":
+        """Of bones alone (canonical names): feet as they are in the T-pose, toes as high as the canonical in scale."""
+        scale = leg_length(skeleton) / leg_length(CANONICAL)
+        height = torch.full((2,), TOE_REST_HEIGHT * scale, dtype=torch.float64)
+        return Stance(height, height, torch.zeros(2, 2).double())
+
+    @staticmethod
+    def of(clip: Motion, rigmap: RigMap) -> "Stance":
+        """As a clip (canonical joints, from `to_canonical` with this map) shows it.
+
+        Toes rest at a low percentile of their own height. A foot is flat where the toe is planted and the ankle at its
+        lowest, and what it is turned by then is the T-pose's error: a T-pose whose feet point down is common. One that
+        points down against the T-pose is more likely on tip-toe, and is believed for a little only.
+        """
+        rest = Stance.at_rest(rigmap.skeleton)
+        toes = clip.joint_positions()[:, _joints("Toes")]
+        seen, leg = contacts.floor_heights(toes), leg_length(rigmap.skeleton)
+        if float((seen[0] - seen[1]).abs()) > _APART * leg:
+            seen = seen.min().expand(2)
+        flat = _flat(clip, contacts.planted(toes, clip.fps))
+        tilt = _tilt(clip, flat)
+        laid = torch.stack([toes[flat[:, k], k, 1].median() if flat[:, k].any() else seen[k] for k in range(2)])
+        laid = laid.clamp(seen, seen + _SUNK)
+        if float(seen.abs().max()) > _PLAUSIBLE * leg:
+            floor = float((seen - rest.toe_height).mean())
+            return Stance(rest.toe_height, rest.toe_height + laid - seen, tilt, floor)
+        return Stance(seen, laid, tilt)
+
+    def leveled(self, motion: Motion) -> Motion:
+        """The same movement of bones whose T-pose has its feet flat: no joint moves, joint frames of feet turn."""
+        return _turned_feet(motion, rotations.from_rotation_vector(_about_x(-self.tilt)))
+
+    def unleveled(self, motion: Motion) -> Motion:
+        """What `leveled` does, undone."""
+        return _turned_feet(motion, rotations.from_rotation_vector(_about_x(self.tilt)))
+
+    def leveled_map(self, rigmap: RigMap) -> RigMap:
+        """The way between the rig and canonical joints whose T-pose has its feet flat."""
+        turns = _by_joint(rotations.from_rotation_vector(_about_x(-self.tilt)))
+        tpose = rotations.multiply(turns, rigmap.tpose_quat_xyzw)
+        return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_turned_bones(rigmap.skeleton, turns))
+
+
+def _joints(part: str) -> list[int]:
+    return [CANONICAL.index(side + part) for side in SIDES]
+
+
+def _about_x(angle: Float[Tensor, "2 2"]) -> Float[Tensor, "2 2 3"]:
+    return torch.stack([angle, torch.zeros_like(angle), torch.zeros_like(angle)], dim=-1)
+
+
+def _by_joint(turns: Float[Tensor, "2 2 4"]) -> Float[Tensor, "joints 4"]:
+    """Turns of feet and toes among those of all joints, which have none."""
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(CANONICAL.num_joints, 1)
+    still[_joints("Foot")], still[_joints("Toes")] = turns[:, 0], turns[:, 1]
+    return still
+
+
+def _turned_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skeleton:
+    """The bones that begin at each joint, turned."""
+    parents = list(skeleton.parents)
+    offsets = skeleton.offsets.clone()
+    offsets[1:] = rotations.rotate(turns[parents[1:]], offsets[1:])
+    ends = {}
+    for name, site in skeleton.end_offsets.items():
+        x, y, z = rotations.rotate(turns[skeleton.index(name)], torch.tensor(site, dtype=torch.float64)).tolist()
+        ends[name] = (x, y, z)
+    return replace(skeleton, offsets=offsets, end_offsets=ends)
+
+
+def _turned_feet(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion:
+    """Other joint frames for feet and toes: what is in them turns, and they turn back."""
+    by_joint = _by_joint(turns)
+    world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint).expand_as(motion.local_quat_xyzw))
+    local = rotations.sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
+    return replace(motion, skeleton=_turned_bones(motion.skeleton, by_joint), local_quat_xyzw=local)
+
+
+def _flat(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
+    """Where feet lie flat; nowhere for a side that hardly ever does."""
+    ankles = clip.joint_positions()[:, _joints("Foot"), 1]
+    flat = torch.zeros_like(planted)
+    for k in range(2):
+        if bool(planted[:, k].any()):
+            lowest = torch.quantile(ankles[planted[:, k], k], _LOWEST)
+            flat[:, k] = planted[:, k] & (ankles[:, k] < lowest + _FLAT)
+    return flat & (flat.sum(0) >= max(3.0, _LONG * float(clip.fps)))
+
+
+def _tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor, "2 2"]:
+    """Of foot and toes by side, median over the frames in which the foot is flat; of a side that has none, the other's;
+    0 where it is too much to be true."""
+    forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    turns = clip.joint_rotations()[:, [*_joints("Foot"), *_joints("Toes")]].reshape(-1, 2, 2, 4)
+    up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))
+    found = [up[flat[:, k], :, k].median(dim=0).values for k in range(2) if flat[:, k].any()]
+    if not found:
+        return torch.zeros(2, 2, dtype=torch.float64)
+    tilt = torch.stack(found if len(found) == 2 else found * 2)
+    return torch.where((tilt > _DOWN) & (tilt < _UP), tilt, 0.0)

@@ -1,0 +1,62 @@
+"""The jobs that bring motion of one rig to another all stand it on the other's floor."""
+
+from dataclasses import replace
+
+import torch
+from helpers import bandai_skeleton, generator
+from performers import FEET, TOES, Performer
+from rig_maker import Make, make, names_of
+
+from controllers.blend import Borrowed, blend
+from controllers.chain import ChainSettings, chain
+from controllers.filling import InfillSettings
+from mapctl import retarget
+from mapctl.motion import Motion
+from mapctl.skeleton import TOE_REST_HEIGHT
+
+LINEAR = InfillSettings(method="linear")
+OTHER = Performer(size=1.2, toe_height=-0.06)
+
+
+def own_walk() -> Motion:
+    """On the Bandai Namco rig."""
+    return retarget.from_canonical(Performer().walks(), retarget.map_rig(bandai_skeleton()))
+
+
+def others_walk() -> Motion:
+    """On another rig, of somebody tall whose toes are below the floor."""
+    return make(Make(names_of("mixamo"), size=1.2, extras=False)).motion(OTHER.walks())
+
+
+def foot_of(motion: Motion) -> str:
+    """The rig's name of the left foot."""
+    joint = retarget.map_rig(motion.skeleton).joint_of[FEET[0]]
+    assert joint is not None
+    return motion.skeleton.names[joint]
+
+
+def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
+    settings = ChainSettings(piece=40, gap=(10, 10))
+    done = chain([own_walk(), others_walk()], None, settings=settings, filling=LINEAR, generator=generator())
+    toes = retarget.to_canonical(done.motion)[0].joint_positions()[:, TOES, 1]
+    for piece in (slice(0, 40), slice(50, 90)):
+        torch.testing.assert_close(toes[piece].amin(0), torch.full((2,), TOE_REST_HEIGHT).double(), atol=0.01, rtol=0)
+
+
+def test_a_borrowed_foot_is_as_high_as_it_was():
+    """The same step of somebody else comes at the same height of the foot over the floor, in scale."""
+    motion, source = own_walk(), others_walk()
+    name = foot_of(motion)
+    borrowed = Borrowed((name,), start=40, stop=60, at=40)
+    done = blend(motion, source, borrowed, None, settings=LINEAR)
+    before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
+    torch.testing.assert_close(after, before, atol=0.015, rtol=0)
+
+
+def test_a_clip_of_the_same_rig_is_blended_as_it_is():
+    motion = own_walk()
+    name = foot_of(motion)
+    lifted = replace(motion, root_position=motion.root_position + 0.2)
+    done = blend(motion, lifted, Borrowed((name,), start=40, stop=60, at=40), None, settings=LINEAR)
+    before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
+    torch.testing.assert_close(after, before, atol=1e-4, rtol=0)

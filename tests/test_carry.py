@@ -1,0 +1,311 @@
+"""Motion on another body: it stands on its floor, planted feet stay, feet are flat, and nothing jumps."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import bandai_skeleton, generator, quat_xyzw, run
+from performers import FEET, HIPJOINTS, KNEES, TOES, Performer, stance_of, tip_toed
+from rig_maker import Make, make, names_of
+
+import mapctl
+from mapctl import contacts, retarget, rotations
+from mapctl.carry import Body, _give_in, carry
+from mapctl.commands import rigged
+from mapctl.formats.bvh_layout import BvhLayout
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
+
+USUAL = Performer()
+PEOPLE = {
+    "tall": Performer(size=1.25, toe_height=0.02),
+    "short legs": Performer(leg=0.85, toe_height=0.05),
+    "long flat foot": Performer(size=1.1, foot=(-0.06, 0.15), toe_height=0.015),
+    "drooping T-pose": Performer(size=0.9, droop_deg=20, foot=(-0.05, 0.12), toe_height=0.03),
+    "below the floor": Performer(size=1.03, toe_height=-0.03),
+}
+PAIRS = [("usual", name) for name in PEOPLE] + [(name, "usual") for name in PEOPLE] + [("tall", "drooping T-pose")]
+
+
+FLAT = Performer(leg=1.1, foot=(-0.06, 0.15), toe_height=0.02)
+
+
+def performer(name: str) -> Performer:
+    return USUAL if name == "usual" else PEOPLE[name]
+
+
+def low_toes(motion: Motion) -> torch.Tensor:
+    return motion.joint_positions()[:, TOES, 1].quantile(0.05, dim=0)
+
+
+def planted_speed(motion: Motion) -> float:
+    """Of toes over the ground, m/s."""
+    toes = motion.joint_positions()[:, TOES]
+    stands = contacts.planted(toes, motion.fps)[1:]
+    return float((toes.diff(dim=0)[..., ::2].norm(dim=-1) * float(motion.fps))[stands].mean())
+
+
+def foot_pitch_deg(motion: Motion) -> torch.Tensor:
+    """Of the bones from ankles to toe joints, while these stand and the ankles are at their lowest."""
+    ankles, toes = motion.joint_positions()[:, FEET], motion.joint_positions()[:, TOES]
+    way = toes - ankles
+    flat = contacts.planted(toes, motion.fps) & (ankles[..., 1] < ankles[..., 1].quantile(0.1, dim=0) + 0.005)
+    pitch = torch.rad2deg(torch.asin(way[..., 1] / way.norm(dim=-1)))
+    return torch.stack([pitch[flat[:, k], k].median() for k in range(2)])
+
+
+@pytest.mark.parametrize(("giver", "body", "fps"), [(*pair, 30) for pair in PAIRS] + [(*PAIRS[2], 120)])
+def test_who_carries_a_walk_stands_as_in_its_own(giver, body, fps):
+    clip, own = performer(giver).walks(90 * fps // 30, fps), performer(body).walks()
+    done = carry(clip, Body.of(own)[1])
+    assert done.notes == ()
+    torch.testing.assert_close(low_toes(done.motion), low_toes(own), atol=0.008, rtol=0)
+    torch.testing.assert_close(foot_pitch_deg(done.motion), foot_pitch_deg(own), atol=1.5, rtol=0)
+    assert planted_speed(done.motion) < 1.15 * planted_speed(clip) + 0.01
+    scale = leg_length(own.skeleton) / leg_length(clip.skeleton)
+    way = scale * (clip.root_position[-1] - clip.root_position[0])[::2]
+    torch.testing.assert_close(
+        (done.motion.root_position[-1] - done.motion.root_position[0])[::2], way, atol=0.02, rtol=0
+    )
+
+
+@pytest.mark.parametrize(("giver", "body"), PAIRS)
+def test_nothing_moves_or_turns_faster_than_it_did(giver, body):
+    """The worst frame of every joint of the legs, in scale."""
+    clip, own = performer(giver).walks(), performer(body).walks()
+    done = carry(clip, Body.of(own)[1]).motion
+    scale = leg_length(own.skeleton) / leg_length(clip.skeleton)
+    legs = [j for j, name in enumerate(CANONICAL.names) if name.endswith(("hips", "Leg", "Foot", "Toes"))]
+    for order, most in ((1, 1.15), (2, 1.35)):
+        before, after = (m.joint_positions()[:, legs].diff(n=order, dim=0).norm(dim=-1).amax(0) for m in (clip, done))
+        assert (after <= most * scale * before.clamp_min(float(before.median()))).all()
+
+
+@pytest.mark.parametrize("name", PEOPLE)
+def test_what_is_not_leg_turns_as_it_did(name):
+    clip = USUAL.walks()
+    done = carry(clip, PEOPLE[name].body()).motion
+    rest = [j for j, n in enumerate(CANONICAL.names) if not n.endswith(("Leg", "Foot", "Toes"))]
+    dots = (done.local_quat_xyzw[:, rest] * clip.local_quat_xyzw[:, rest]).sum(-1).abs()
+    torch.testing.assert_close(dots, torch.ones_like(dots), atol=1e-9, rtol=0)
+    torch.testing.assert_close(done.joint_positions()[:, 1:].diff(dim=0).isfinite().all(), torch.tensor(True))
+
+
+def test_a_clip_of_the_bodys_own_skeleton_stays_to_the_bit():
+    clip, body = PEOPLE["drooping T-pose"].walks(), PEOPLE["drooping T-pose"].body()
+    lifted = replace(clip, root_position=clip.root_position + 0.5)
+    done = carry(lifted, body).motion
+    assert torch.equal(done.root_position, lifted.root_position)
+    torch.testing.assert_close(done.local_quat_xyzw, lifted.local_quat_xyzw, atol=1e-12, rtol=0)
+
+
+def test_there_and_back_is_where_one_was():
+    clip, other = USUAL.walks(), PEOPLE["drooping T-pose"].body()
+    there = carry(clip, other).motion
+    back = carry(there, Body.of(clip)[1]).motion
+    ends = [0, *FEET, *TOES]
+    torch.testing.assert_close(back.joint_positions()[:, ends], clip.joint_positions()[:, ends], atol=0.01, rtol=0)
+
+
+def test_toes_that_go_through_the_floor_do_so_no_more():
+    clip = USUAL.walks()
+    sunk = replace(clip, root_position=clip.root_position.clone())
+    sunk.root_position[40:43, 1] -= 0.06
+    done = carry(sunk, PEOPLE["tall"].body()).motion
+    assert float(done.joint_positions()[:, TOES, 1].min()) > 0.02 - 0.01
+
+
+def test_toes_that_sink_at_times_are_not_the_floor():
+    """Rigid feet go through the floor as they push off; while they are flat, they stand on it."""
+    clip = replace(USUAL, sinks=0.02).walks()
+    done = carry(clip, PEOPLE["tall"].body()).motion
+    flat = (clip.joint_positions()[:, TOES, 1] - TOE_REST_HEIGHT).abs() < 1e-6
+    off = done.joint_positions()[:, TOES, 1][flat] - 0.02
+    assert float(off.abs().max()) < 0.004
+    assert float(done.joint_positions()[:, TOES, 1].min()) > 0.011
+
+
+def test_a_kick_is_the_same_pose():
+    """The leg points where it did, however long it is and however far the foot is from its place in scale."""
+    up = torch.sin(torch.linspace(0, math.pi, 60, dtype=torch.float64)) ** 2
+    clip = USUAL.stands(turned={HIPJOINTS[0]: -1.6 * up})
+    for body in (PEOPLE["short legs"], replace(PEOPLE["long flat foot"], thighs_drop=0.12)):
+        done = carry(clip, Body.of(body.walks())[1])
+        assert done.notes == ()
+        ways = [m.joint_positions()[30, FEET[0]] - m.joint_positions()[30, HIPJOINTS[0]] for m in (clip, done.motion)]
+        assert float(torch.nn.functional.cosine_similarity(*ways, dim=0)) > math.cos(math.radians(1))
+
+
+def test_who_taps_a_foot_keeps_the_heel_down():
+    """Toes that are raised turn the foot about its heel: the ankle stays, however long the foot is."""
+    up = torch.sin(torch.linspace(0, math.pi, 60, dtype=torch.float64)) ** 2
+    clip = USUAL.stands(turned={FEET[0]: -0.5 * up})
+    done = carry(clip, PEOPLE["long flat foot"].body()).motion
+    ankle = done.joint_positions()[:, FEET[0]]
+    assert float((ankle - ankle[0]).norm(dim=-1).max()) < 0.012
+
+
+def test_nearly_straight_legs_reach_and_do_not_snap():
+    """Who walks on legs that are almost straight, over long feet, is lowered where short feet cannot reach."""
+    short = Performer(size=1.02, foot=(-0.03, 0.06), toe_height=0.02)
+    clip = Performer(foot=(-0.06, 0.15), upright=0.99).walks(frames=180, fps=60)
+    done = carry(clip, short.body())
+    assert done.notes == ()
+    stands = clip.joint_positions()[:, TOES, 1] < TOE_REST_HEIGHT + 1e-4
+    assert float((done.motion.joint_positions()[:, TOES, 1] - 0.02)[stands].abs().max()) < 0.004
+    turns = [rotations.to_rotation_vector(m.local_quat_xyzw[:, KNEES])[..., 0] for m in (clip, done.motion)]
+    before, after = (float(angle.diff(n=2, dim=0).abs().max()) for angle in turns)
+    assert after < 1.1 * before
+
+
+def test_a_leg_gives_in_before_it_is_straight():
+    """Never beyond the most, untouched well before it, and no faster than what it follows."""
+    far, most = torch.linspace(0.5, 1.2, 701, dtype=torch.float64)[:, None].expand(-1, 2), torch.ones(2).double()
+    given = _give_in(far, most)
+    assert float(given.max()) <= 1.0
+    torch.testing.assert_close(given[far < 0.99], far[far < 0.99], atol=0, rtol=0)
+    steps = given.diff(dim=0) / far.diff(dim=0)
+    assert float(steps.max()) < 1 + 1e-9
+    assert float(steps.min()) >= 0
+
+
+@pytest.mark.parametrize("drop", [0.15, 0.0])
+def test_legs_are_as_straight_as_they_were(drop):
+    """Wherever the hips are over the hip joints."""
+    clip = USUAL.walks()
+    done = carry(clip, replace(USUAL, thighs_drop=drop).body()).motion
+    far = [(m.joint_positions()[:, FEET] - m.joint_positions()[:, HIPJOINTS]).norm(dim=-1) for m in (clip, done)]
+    torch.testing.assert_close(far[1], far[0], atol=0.01, rtol=0)
+
+
+def test_hips_that_shake_do_not_shake_others_more():
+    """Who has hip joints elsewhere does not get the noise of the hips' turns as noise of their place."""
+    clip = USUAL.walks(fps=120, frames=240)
+    local = clip.local_quat_xyzw.clone()
+    noise = 0.01 * torch.randn(240, generator=generator(), dtype=torch.float64)
+    local[:, 0] = quat_xyzw(torch.stack([noise, 0 * noise, 0 * noise], dim=-1))
+    done = carry(replace(clip, local_quat_xyzw=local), replace(USUAL, thighs_drop=0.15).body()).motion
+    assert float(done.root_position.diff(n=2, dim=0).norm(dim=-1).max()) < 2e-4
+
+
+def test_a_clip_on_a_platform_stays_there():
+    clip = USUAL.walks()
+    high = replace(clip, root_position=clip.root_position + torch.tensor([0.0, 1.0, 0.0]).double())
+    torch.testing.assert_close(low_toes(carry(high, PEOPLE["tall"].body()).motion), torch.full((2,), 1.02).double(),
+                               atol=0.012, rtol=0)  # fmt: skip
+
+
+def test_legs_that_cannot_reach_are_named_with_numbers():
+    """Somebody in the splits whose hips are narrow: no lower hips help a leg that points sideways."""
+    clip = USUAL.walks(30)
+    sideways = quat_xyzw(torch.tensor([0.0, 0.0, 1.5], dtype=torch.float64))
+    local = clip.local_quat_xyzw.clone()
+    local[:, [CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")]] = torch.stack(
+        [sideways, sideways * torch.tensor([1, 1, -1, 1.0])]
+    )
+    local[:, [CANONICAL.index(side + "LowerLeg") for side in ("left", "right")]] = torch.tensor([0, 0, 0, 1.0]).double()
+    wide = replace(clip.skeleton, offsets=clip.skeleton.offsets.clone())
+    wide.offsets[[CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")], 0] *= 4
+    done = carry(replace(clip, skeleton=wide, local_quat_xyzw=local), PEOPLE["tall"].body())
+    assert done.motion.local_quat_xyzw.isfinite().all()
+    assert all("cm off (frame" in note for note in done.notes)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_a_pose_is_enough(frames):
+    done = carry(USUAL.walks().slice(0, frames), PEOPLE["long flat foot"].body()).motion
+    assert done.num_frames == frames
+    assert float(done.joint_positions()[:, TOES, 1].min()) == pytest.approx(0.015, abs=0.02)
+
+
+def test_a_table_that_lays_feet_as_anothers_is_put_right():
+    """A LaFAN-like rig whose foot is flatter than the table has it: no tip-toe (its own pitch, not the canonical)."""
+    clip = _lafan_like()
+    own, body = Body.of(clip)
+    assert body.rigmap.rig.name == "lafan1"
+    assert float(torch.rad2deg(body.stance.tilt[:, 0]).min()) > 8
+    done = carry(retarget.from_canonical(USUAL.walks(), retarget.map_rig(bandai_skeleton())), body).motion
+    torch.testing.assert_close(foot_pitch_deg(done), foot_pitch_deg(own), atol=1.5, rtol=0)
+
+
+def test_a_person_of_a_rig_has_flat_feet_and_the_clips_floor(tmp_path):
+    """What `follow`, `generate`, `steer` and `run` take from a clip: also where its toes lie below zero."""
+    clip = replace(_lafan_like(), source=None)
+    clip = replace(clip, root_position=clip.root_position - torch.tensor([0.0, 0.04, 0.0]).double())
+    clip.save(tmp_path / "rig.bvh")
+    person = rigged.read(str(tmp_path / "rig.bvh"))
+    own = retarget.to_canonical(mapctl.load(tmp_path / "rig.bvh"))[0]
+    assert person.toe_rest_height == pytest.approx(float(low_toes(own).mean()), abs=1e-6)
+    assert person.toe_rest_height < -0.005
+    way = person.skeleton.offsets[TOES]
+    slope = torch.rad2deg(torch.atan2(way[:, 1], way[:, 2]))
+    torch.testing.assert_close(slope, foot_pitch_deg(own), atol=1.5, rtol=0)
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)
+    flat = Motion(person.skeleton, own.fps, torch.zeros(1, 3, dtype=torch.float64), still)
+    places = retarget.to_canonical(person.on_rig(flat))[0].joint_positions()[0]
+    down = places[TOES] - places[FEET]
+    slope = torch.rad2deg(torch.atan2(down[:, 1], down[:, 2]))
+    torch.testing.assert_close(slope, foot_pitch_deg(own), atol=1.5, rtol=0)
+
+
+def test_a_floor_that_is_elsewhere_leaves_the_toes_to_the_bones():
+    high = replace(USUAL.walks(), root_position=USUAL.walks().root_position + 2.0)
+    stance = stance_of(high)
+    torch.testing.assert_close(stance.toe_height, torch.full((2,), TOE_REST_HEIGHT).double(), atol=1e-3, rtol=0)
+    assert stance.floor == pytest.approx(2.0, abs=0.01)
+
+
+def test_tip_toe_is_a_manner_and_no_rig():
+    assert float(stance_of(tip_toed(USUAL.walks(), 0.5)).tilt[:, 0].abs().max()) == 0.0
+
+
+def test_the_target_files_layout_is_kept(tmp_path, capsys):
+    rig = _lafan_like()
+    rig.save(tmp_path / "plain.bvh")
+    text = (tmp_path / "plain.bvh").read_text("utf-8")
+    (tmp_path / "rig.bvh").write_text(text.replace("Zrotation Xrotation Yrotation", "Yrotation Zrotation Xrotation"))
+    USUAL.walks(40).save(tmp_path / "in.npz")
+    assert run("convert", tmp_path / "in.npz", tmp_path / "out.bvh", "--rig", tmp_path / "rig.bvh") == 0
+    made, wanted = (_layout(tmp_path / name) for name in ("out.bvh", "rig.bvh"))
+    assert made.hierarchy.names == wanted.hierarchy.names
+    assert made.hierarchy.channels == wanted.hierarchy.channels
+    assert made.hierarchy.channels[1] == ("Yrotation", "Zrotation", "Xrotation")
+    assert made.metres_per_unit == wanted.metres_per_unit
+
+
+def test_another_take_of_a_rig_is_written_as_it_was(tmp_path):
+    """The rig's own clips are not touched: to 1e-9 m, whatever floor they have."""
+    first, second = _lafan_like(), _lafan_like(60)
+    first.save(tmp_path / "rig.npz")
+    second = replace(second, root_position=second.root_position + 0.3)
+    second.save(tmp_path / "in.npz")
+    assert run("convert", tmp_path / "in.npz", tmp_path / "out.npz", "--rig", tmp_path / "rig.npz") == 0
+    made = mapctl.load(tmp_path / "out.npz")
+    torch.testing.assert_close(made.joint_positions(), second.joint_positions(), atol=1e-9, rtol=0)
+
+
+def _layout(path: Path) -> BvhLayout:
+    layout = mapctl.load(path).source
+    assert isinstance(layout, BvhLayout)
+    return layout
+
+
+def _lafan_like(frames: int = 90) -> Motion:
+    """LaFAN1's names and zero pose, every bone along x, on a performer whose feet are flatter than in its table."""
+    made = make(Make(names_of("lafan1"), bones_along_x=True, extras=False))
+    canonical = FLAT.walks(frames)
+    motion = made.motion(canonical)
+    slope = math.atan2(0.0749, 0.0906) - math.atan2(-FLAT.foot[0], FLAT.foot[1])
+    up = quat_xyzw(torch.tensor([0.0, 0.0, slope], dtype=torch.float64)).expand(frames, 4)  # across the foot
+    local, offsets = motion.local_quat_xyzw.clone(), made.skeleton.offsets.clone()
+    for k, side in enumerate(("Left", "Right")):
+        foot, toe = (made.skeleton.index(side + part) for part in ("Foot", "Toe"))
+        local[:, foot] = rotations.multiply(local[:, foot], up)
+        local[:, toe] = rotations.multiply(rotations.inverse(up), local[:, toe])
+        for part, joint in (("Leg", KNEES[k]), ("Foot", FEET[k]), ("Toe", TOES[k])):
+            own = made.skeleton.index(side + part)
+            offsets[own] = offsets[own] / offsets[own].norm() * canonical.skeleton.offsets[joint].norm()
+    hips = canonical.root_position
+    return replace(motion, skeleton=replace(made.skeleton, offsets=offsets), root_position=hips, local_quat_xyzw=local)
