@@ -24,8 +24,9 @@ class Convert:
     named as in subject.asf+take.amc."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
-    rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
-    """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted."""
+    rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None
+    """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted; or a rig by
+    name or TOML file, whose joints get the bones of the canonical body."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     fps: Annotated[str | None, arg(metavar="F")] = None
@@ -65,19 +66,18 @@ def parse_fps(text: str) -> Fraction:
 
 
 def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Motion":
-    """The motion on the canonical joints or on a clip's skeleton; RequestError for rigs that are not known.
+    """The motion on the canonical joints, on a clip's skeleton or on a rig that is told; RequestError for others.
 
     Rotations stay. On other bones the hips' way is scaled by the legs' length, so that feet reach the ground.
     """
-    from mapctl import formats, retarget, rigs
+    from mapctl import retarget
     from mapctl.skeleton import leg_length
 
     canonical, own = retarget.to_canonical(motion, source_rig)
     if rig == "canonical":
         return canonical
-    if rig in {known.name for known in rigs.known()}:
-        raise RequestError(f"the bones of {rig} differ from performer to performer: name a clip of that rig")
-    wanted = retarget.to_canonical(formats.load(rig))[1]
+    clip, known = options.read_figure(rig)
+    wanted = retarget.to_canonical(clip, known)[1]
     scale = leg_length(wanted.skeleton) / leg_length(own.skeleton)
     canonical = replace(canonical, skeleton=wanted.skeleton, root_position=canonical.root_position * scale)
-    return retarget.from_canonical(canonical, wanted)
+    return replace(retarget.from_canonical(canonical, wanted), source=clip.source)

@@ -89,7 +89,7 @@ def read(name_or_path: str | PathLike[str]) -> Rig:
     """A preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
     text, path = str(name_or_path), Path(name_or_path)
     for rig in known():
-        if rig.name == text:
+        if rig.name == text.lower():
             return rig
     if path.suffix.lower() == ".toml":
         return _read_toml(path)
