@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import torch
@@ -36,7 +37,7 @@ class Borrowed:
     limbs: tuple[str, ...]
     """Hands and feet, by the names of the rig that gets them."""
     start: int
-    """First frame of the source that is taken."""
+    """First frame of the source that is taken, of its own frames."""
     stop: int
     """One past the last."""
     at: int
@@ -52,13 +53,15 @@ def blend(
     """The motion with its limbs where the source's are, seen from shoulder or hip, in size, and bent as those are; all
     else stays to the bit. In the margins before and after, the limbs go there and come back.
 
-    RequestError for frames that either motion has not, and for joints that are no hand or foot.
+    What is taken lasts as long as it does in the source, whatever the two frame rates. RequestError for frames that
+    either motion has not, and for joints that are no hand or foot.
     """
-    source = source if source.fps == motion.fps else source.resample(motion.fps)
-    _check(motion, source, borrowed)
+    _check(source, borrowed)
     own, rigmap = to_canonical(motion, rig)
     carried = carry(source, Body(rigmap, Stance.of(own, rigmap)))
-    other = carried.motion
+    other = _taken(carried.motion, borrowed, motion.fps)
+    borrowed = replace(borrowed, start=0, stop=other.num_frames)
+    _check_place(motion, borrowed)
     limbs = [LIMBS[CANONICAL.names[limb_end(name, rigmap)]] for name in borrowed.limbs]
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
     posed = own
@@ -80,6 +83,14 @@ def blend(
     notes = (*carried.notes, *_haste(own, posed, borrowed, limbs, free, there),
              f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new")  # fmt: skip
     return replace(done, lost=Lost((lost | new) & moved, nothing), notes=(*done.notes, *notes))
+
+
+def _taken(source: Motion, borrowed: Borrowed, fps: Fraction) -> Motion:
+    """The frames that are borrowed, at another rate."""
+    wanted = max(1, round((borrowed.stop - borrowed.start) * fps / source.fps))
+    # To the frame after the last, where there is one: at a higher rate some frames lie between the two.
+    taken = source.slice(borrowed.start, min(borrowed.stop + 1, source.num_frames)).resample(fps)
+    return taken.slice(0, min(wanted, taken.num_frames))
 
 
 def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: Borrowed) -> Motion:
@@ -146,13 +157,16 @@ def _haste(
     return tuple(notes)
 
 
-def _check(motion: Motion, source: Motion, borrowed: Borrowed) -> None:
+def _check(source: Motion, borrowed: Borrowed) -> None:
     if not borrowed.limbs:
         raise RequestError("blending needs a hand or a foot")
     if not 0 <= borrowed.start < borrowed.stop <= source.num_frames:
         raise RequestError(f"frames {borrowed.start}:{borrowed.stop} are not within the source's 0:{source.num_frames}")
+    if borrowed.margin is not None and not 0 <= borrowed.margin <= 10:
+        raise RequestError(f"the margin must lie between 0 and 10 seconds, got {borrowed.margin:g}")
+
+
+def _check_place(motion: Motion, borrowed: Borrowed) -> None:
     last = borrowed.at + borrowed.stop - borrowed.start
     if not 0 <= borrowed.at < last <= motion.num_frames:
         raise RequestError(f"frames {borrowed.at}:{last} are not within the motion's 0:{motion.num_frames}")
-    if borrowed.margin is not None and not 0 <= borrowed.margin <= 10:
-        raise RequestError(f"the margin must lie between 0 and 10 seconds, got {borrowed.margin:g}")

@@ -19,7 +19,7 @@ from controllers.denoise_piece import DenoiseSettings, Piece
 from controllers.denoised import Denoised, joined
 from mapctl import rotations
 from mapctl.capture.examine import examine
-from mapctl.capture.masks import Mask, after, masked, part_of, written_back
+from mapctl.capture.masks import Mask, after, by_own_names, masked, part_of, written_back
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
 from mapctl.retarget import RigMap, from_canonical, settled, to_canonical
@@ -49,6 +49,7 @@ def denoise(
     done and all frames.
     """
     settings = settings or DenoiseSettings()
+    masks = by_own_names(motion, masks, rig)
     masked(motion, masks)  # whole: of a piece they are cut to its frames
     # Told once: a piece may lack what shows the rig's T-pose.
     beginning, rigmap = to_canonical(_beginning(motion), rig)

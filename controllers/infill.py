@@ -12,7 +12,7 @@ from controllers.canonical_gap import CanonicalGap
 from controllers.choosing_proposals import choose_proposals
 from controllers.filling import Infilled, InfillSettings, Method, end_notes, fill
 from controllers.steered import extended
-from mapctl.capture.masks import Mask, hidden
+from mapctl.capture.masks import Mask, by_own_names, hidden
 from mapctl.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost, straight
@@ -36,6 +36,7 @@ def infill(
     the densities `extending`, if what is known is like their data. On a `course` the hips go along it while they are
     lost.
     """
+    masks = by_own_names(motion, masks, rig)
     # What rig it is must not be told from what stands in a gap.
     shown = straight(motion, Lost(*hidden(motion, masks)))
     lost = Lost.of_masks(motion, masks, to_canonical(shown, rig)[1])

@@ -3,15 +3,16 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any, Literal
 
 import torch
 
 from mapctl import rotations
+from mapctl.body.parts import role
 from mapctl.errors import RequestError
 from mapctl.gaps.lost import Lost
 from mapctl.gaps.targets import LIMBS, Targets
+from mapctl.joint_names import find_joint, nearest
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, places_on_rig, to_canonical
 from mapctl.rigs import Rig
@@ -157,15 +158,16 @@ def check_limbs(names: Sequence[str], motion: Motion, rig: Rig | None = None) ->
 
 
 def limb_end(name: str, rigmap: RigMap) -> int:
-    """The canonical joint of a limb's end; RequestError, with the nearest name, for anything else."""
+    """The canonical joint of a limb's end, by its canonical name or the rig's own in any case; RequestError, with the
+    nearest name, for anything else."""
     names = rigmap.rig_skeleton.names
-    ends = {names[joint]: canonical for canonical, joint in enumerate(rigmap.joint_of)
-            if joint is not None and CANONICAL.names[canonical] in LIMBS}  # fmt: skip
-    if name in ends:
-        return ends[name]
-    lower = {end.lower(): end for end in ends}
-    near = get_close_matches(name.lower(), list(lower), n=1, cutoff=0)
-    raise RequestError(f"no hand or foot {name!r}; the nearest is {lower[near[0]] if near else 'none'}")
+    known = {c: joint for c, joint in zip(CANONICAL.names, rigmap.joint_of, strict=True) if joint is not None}
+    ends = {known[end]: CANONICAL.index(end) for end in LIMBS if end in known}
+    joint = find_joint(name, names, lambda: known)
+    if joint in ends:
+        return ends[joint]
+    told = [role(CANONICAL.names[end]) for end in ends.values()]
+    raise RequestError(f"no hand or foot {name!r}; {nearest(name, [names[end] for end in ends], told)}")
 
 
 def _carries_hips(joint: int, rigmap: RigMap) -> bool:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from mapctl import curve_tracking
 from mapctl.curve_points import TANGENT_BASE
 from mapctl.rotations import unwrap_angle
 
@@ -204,19 +205,17 @@ class Curve:
     def track(
         self, points_world: Float[Tensor, "frames axes"], *, start: float | None = None, reach: float = 0.5
     ) -> Float[Tensor, "frames"]:
-        """Arcs of a walk: each frame's nearest place within `reach` metres of the frame before, not wrapped.
+        """Arcs of a walk, not wrapped: along the curve without a jump, and forward unless the walk goes back.
 
-        `start` is where to look first; by default the curve's start if the walk begins within `reach` of it
-        (where a figure-8 crosses, arcs are ambiguous), else the nearest place.
+        So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are told apart, and
+        laps of a closed one counted (see `mapctl.curve_tracking`). `start` is where to look first, within `reach`
+        metres; by default the curve's start if the walk begins within `reach` of it (where a figure-8 crosses, arcs
+        are ambiguous), else wherever the whole walk fits best.
         """
         points = self._of_curve(points_world).detach().double()
-        if start is None:
-            near_start = bool((points[0] - self.start).norm() <= reach)
-            start = 0.0 if near_start else float(self.nearest(points[0]))
-        arcs = [torch.tensor(start, dtype=torch.float64)]
-        for point in points:
-            arcs.append(self.nearest(point, around=arcs[-1], reach=reach))
-        return torch.stack(arcs[1:])
+        if start is None and bool((points[0] - self.start).norm() <= reach):
+            start = 0.0
+        return curve_tracking.track(self, points, start=start, reach=reach)
 
 
 def _tensor(arc: Arc) -> Tensor:

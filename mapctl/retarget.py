@@ -229,14 +229,14 @@ def _tpose(rig: Rig, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Te
     quats = []
     for index, name in enumerate(CANONICAL.names):
         axes = rig.tpose.get(name)
-        matrix = _frame(axes["x"], axes["y"]) if axes else torch.eye(3, dtype=torch.float64)
+        matrix = frame_of(axes["x"], axes["y"]) if axes else torch.eye(3, dtype=torch.float64)
         if name in rig.straighten:
             matrix = _straightened(index, skeleton, joint_of)
         quats.append(rotations.from_matrix(matrix))
     return torch.stack(quats)
 
 
-def _frame(x: list[float], y: list[float]) -> Tensor:
+def frame_of(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
     """Rotation whose first two columns point along x and (as nearly as they are square) y."""
     first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
     second = torch.tensor(y, dtype=torch.float64)

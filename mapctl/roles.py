@@ -81,5 +81,6 @@ def _plain_names(skeleton: Skeleton) -> list[str]:
 
 
 def _missing(skeleton: Skeleton, role: str) -> RequestError:
-    known = ", ".join(skeleton.names[:60])
-    return RequestError(f"cannot tell the {role} of this rig by name; its joints are {known}")
+    from mapctl.joint_names import shorten  # late: it knows rigs' names by this module
+
+    return RequestError(f"cannot tell the {role} of this rig by name; its joints are {shorten(skeleton.names)}")

@@ -38,11 +38,13 @@ class Skeleton:
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """The joint's index; MapctlError names the known joints if there is none."""
+        """The joint's index; MapctlError names the nearest joints if there is none."""
         try:
             return self.names.index(name)
         except ValueError:
-            raise MapctlError(f"no joint {name!r}; the skeleton has {', '.join(self.names)}") from None
+            from mapctl.joint_names import nearest  # late: it knows skeletons
+
+            raise MapctlError(f"no joint {name!r}; {nearest(name, self.names)}") from None
 
     def matches(self, other: "Skeleton", tolerance: float = 1e-6) -> bool:
         """Same joints, tree and bone offsets (within `tolerance` metres)."""

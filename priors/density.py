@@ -107,8 +107,11 @@ class LstmGmmDensity:
         for label in known:
             if name in (label, label.split("=", 1)[-1]):
                 return label
-        values = ", ".join(label.split("=", 1)[-1] for label in known) or "none"
-        raise RequestError(f"the prior {self.name!r} knows no style {name!r}, only {values}")
+        group, told, value = name.partition("=")
+        if not told or group not in self.labels:
+            group, value = " or ".join(self.labels) or "label", name
+        values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items()) or "none"
+        raise RequestError(f"the prior {self.name!r} knows no {group} {value!r}, only {values}")
 
     def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
         """A state with empty memory after one frame."""

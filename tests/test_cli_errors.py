@@ -115,7 +115,7 @@ def test_broken_curves(fails, prior, kind):
         (["generate", "-o", "gen", "--seconds", "inf"], "seconds must be at most"),
         (["generate", "-o", "gen", "--seconds", "1", "--count", "0"], "count"),
         (["generate", "-o", "gen", "--seconds", "1", "--temperature", "-1"], "temperature"),
-        (["generate", "-o", "gen", "--seconds", "1", "--style", "swim"], "knows no style 'swim', only run"),
+        (["generate", "-o", "gen", "--seconds", "1", "--style", "swim"], "knows no gait or style 'swim'"),
         (["generate", "-o", "gen", "--seconds", "1", "--refiner", "gone"], "no prior 'gone'"),
         (["generate", "-o", "gen", "--seconds", "1", "--refiner", "locomotion"], "a lstm-gmm is no refiner"),
         (["generate", "-o", "gen", "--seconds", "1", "--refiner", "r", "--no-refine"], "exclude each other"),

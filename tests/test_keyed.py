@@ -127,7 +127,7 @@ def test_of_a_key_that_only_reaches_a_pose_would_not_count_and_is_refused(poses,
     (PlacedKey(frame=9, pose_frame=45), r"key\[2\]\.pose_frame: the frame 45 is not one of the pose's 0:45"),
     (PlacedKey(frame=9, pose_seconds=1.6), r"key\[2\]\.pose_seconds: the frame 48 is not one of the pose's 0:45"),
     (PlacedKey(frame=9, joints=("Hnad_L",)), r"key\[2\]\.joints: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (PlacedKey(frame=9, reach={"foot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'foot_r'; .* Foot_R"),
+    (PlacedKey(frame=9, reach={"fot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'fot_r'; .* Foot_R"),
 ])  # fmt: skip
 def test_what_is_not_there_is_named_with_its_key(poses, key, said):
     with pytest.raises(RequestError, match=said):

@@ -121,6 +121,6 @@ def test_trees_that_are_none_are_refused(names, parents, rows):
 
 
 def test_an_unknown_joint_is_answered_with_the_known_ones():
-    with pytest.raises(MapctlError, match="no joint 'tail'; the skeleton has a, b, c, d, e"):
+    with pytest.raises(MapctlError, match="no joint 'tail'; the nearest is a, then "):
         BRANCHED.index("tail")
     assert BRANCHED.children(0) == [1, 2]

@@ -101,8 +101,18 @@ def test_a_told_density_begins_where_the_labels_hold():
     plan = density.plan(state, noise)
     told, untold = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
     assert not torch.allclose(told, untold)
-    with pytest.raises(RequestError, match="prior 'named' knows no style 'swim', only run, old"):
-        density.told(["swim"])
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("swim", "prior 'named' knows no gait or style 'swim', only gait: run; style: old"),
+    ("gait=swim", "prior 'named' knows no gait 'swim', only gait: run; style: old"),
+    ("style=run", "prior 'named' knows no style 'run', only gait: run"),
+    ("mood=sad", "prior 'named' knows no gait or style 'mood=sad', only gait: run"),
+])  # fmt: skip
+def test_what_is_not_known_is_called_what_it_may_be(name, said):
+    with pytest.raises(RequestError) as refused:
+        labelled_density().told([name])
+    assert said in str(refused.value)
 
 
 def test_the_fast_path_is_told_too():

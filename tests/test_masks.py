@@ -76,7 +76,7 @@ def test_no_masks_hide_nothing(motion):
 
 
 @pytest.mark.parametrize(("masks", "message"), [
-    ([Mask("lhand", 0, 3)], "no joint 'lhand' to mask; the nearest is lHand"),
+    ([Mask("lhnad", 0, 3)], "no joint 'lhnad' to mask; the nearest is lHand"),
     ([Mask("rTigh", 0, 3)], "nearest is rThigh"),
     ([Mask("lHand", 30, 41)], "the mask of lHand ends at 41, the recording at 40"),
     ([Mask("lHand", 0, 20), Mask("lHand", 20, 40)], "the masks leave nothing of lHand"),

@@ -110,20 +110,49 @@ def test_an_empty_folder_is_refused(tmp_path, capsys):
     assert f"{tmp_path}: no " in refused(capsys, tmp_path)
 
 
-def test_an_unreadable_clip_is_named(made, tmp_path, capsys):
+def bad_clips(folder):
+    """One that is no BVH, one of a single frame, one too short for a window; and why each is left out of what."""
+    (folder / "b.bvh").write_text("HIERARCHY\nnonsense")
+    walk(40).slice(0, 1).save(folder / "one.bvh")
+    walk(19).save(folder / "short.bvh")
+    return {str(folder / "b.bvh"): "b.bvh, line 2", str(folder / "one.bvh"): "one.bvh: measures need"}
+
+
+def test_clips_that_cannot_be_measured_are_left_out_and_listed(tmp_path, capsys):
+    why = bad_clips(tmp_path)
     walk(40).save(tmp_path / "a.bvh")
-    (tmp_path / "b.bvh").write_text("HIERARCHY\nnonsense")
+    values = told(capsys, tmp_path)
+    assert values["clips"] == 2  # for means 19 frames will do
+    assert values["skipped"].keys() == why.keys()
+    for path, reason in values["skipped"].items():
+        assert why[path] in reason
+        assert reason.count(path) == 1
+    assert run(tmp_path) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("left out ")]
+    assert len(lines) == 2
+
+
+def test_a_clip_too_short_for_a_window_does_not_end_the_comparison(mocap, tmp_path, capsys):
+    for k in range(8):
+        walk(95, cadence=0.8 + 0.05 * k, seed=k).save(tmp_path / f"{k}.bvh")
+    bad_clips(tmp_path)
+    values = told(capsys, tmp_path, "--reference", mocap)
+    assert (values["clips"], len(values["skipped"])) == (8, 3)
+    assert "19 frames at 30 fps; a window needs at least 31" in values["skipped"][str(tmp_path / "short.bvh")]
+    assert values["realism"]["made_windows"] == 8 * 7
+
+
+def test_a_folder_of_which_nothing_can_be_measured_is_refused(tmp_path, capsys):
+    walk(40).slice(0, 1).save(tmp_path / "one.bvh")
     line = refused(capsys, tmp_path)
-    assert str(tmp_path / "b.bvh") in line
-    assert line.count("b.bvh") == 1
+    assert f"{tmp_path}: no clip can be measured; {tmp_path / 'one.bvh'}: measures need" in line
 
 
-def test_a_clip_too_short_for_a_window_is_named(made, tmp_path, capsys):
-    walk(20).save(tmp_path / "short.bvh")
-    assert run(tmp_path) == 0  # for means it will do
-    capsys.readouterr()
-    line = refused(capsys, made, "--reference", tmp_path)
-    assert f"{tmp_path / 'short.bvh'}: 20 frames at 30 fps" in line
+def test_a_refusal_for_too_few_clips_says_what_was_left_out(made, tmp_path, capsys):
+    bad_clips(tmp_path)
+    walk(40).save(tmp_path / "a.bvh")
+    line = refused(capsys, tmp_path, "--reference", made)
+    assert "1 clips; a comparison needs at least 8 in each folder, and 3 cannot be measured: " in line
 
 
 def test_a_folder_and_a_clip_are_not_compared(made, capsys):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import bandai_skeleton, generator, run, tiny_density
+from helpers import bandai_skeleton, generator, run, tiny_density, turn_between
 from rig_maker import Make, make, names_of, person
 
 import controllers
@@ -14,8 +14,10 @@ from controllers import steer
 from controllers.follow import FollowSettings
 from controllers.generate import GenerateSettings, generate
 from controllers.stature import Stature
-from mapctl import curves, retarget
+from mapctl import curves, retarget, rigs
 from mapctl.errors import RequestError
+from mapctl.rigs import figure
+from mapctl.rigs.tpose import vector
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.methods import LatentMethod
@@ -80,11 +82,76 @@ def test_rigs_that_do_not_fit_are_refused(clip, words, said, capsys):
     assert told.count("\n") == 1
 
 
-def test_a_rig_without_a_clip_has_no_bones(prior, tmp_path, capsys):
-    assert run("info", "--rig", "mixamo") == 2
-    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", "--rig", "mixamo", "--prior", prior) == 2
-    assert "name a clip of that rig" in capsys.readouterr().err
+@pytest.fixture
+def told_rig(request, tmp_path):
+    """A rig by the name of a preset, in any case, or by a TOML file: Z up, metres, names of its own."""
+    if request.param != "TOML":
+        return request.param
+    joints = "\n".join(f'{name} = "b_{name}"' for name in CANONICAL.names if name != "neck")
+    (tmp_path / "ours.toml").write_text(f'up = "z"\nunit = "m"\n[joints]\n{joints}\n')
+    return tmp_path / "ours.toml"
+
+
+@pytest.mark.parametrize(("job", "told_rig"), [
+    *(("convert", rig) for rig in ("mixamo", "Bandai-Namco", "cmu-daz", "iclone", "TOML")),
+    ("follow", "TOML"), ("steer", "mixamo"), ("generate", "TOML"), ("run", "iclone"),
+], indirect=["told_rig"])  # fmt: skip
+def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_path):
+    jobs = words_of(tmp_path, prior)
+    person(1.0).save(tmp_path / "in.bvh")
+    jobs["convert"] = (tmp_path / "in.bvh", tmp_path / "a.bvh")
+    quiet = () if job == "convert" else ("--quiet",)
+    assert run(job, *jobs[job], "--rig", told_rig, *quiet) == 0
+    rig = rigs.read(told_rig)
+    made = mapctl.load(tmp_path / ("generated_000.bvh" if job == "generate" else "a.bvh"))
+    assert set(made.skeleton.names) == set(rig.joints.values())
+    canonical, rigmap = retarget.to_canonical(made, rig)
+    own = [joint for joint in range(1, CANONICAL.num_joints) if CANONICAL.names[joint] in rig.joints]
+    lengths = CANONICAL.offsets.norm(dim=-1)
+    lower = [CANONICAL.index(side + "LowerLeg") for side in ("left", "right")]
+    torch.testing.assert_close(rigmap.skeleton.offsets[lower].norm(dim=-1), lengths[lower], atol=1e-4, rtol=0)
+    assert len(own) >= 18
+    heights = canonical.joint_positions()[..., 1]
+    assert 0.6 < float(heights[:, 0].mean()) < 1.0  # upright in its world, in its unit
+    assert float(heights[:, CANONICAL.index("head")].min()) > float(heights[:, 0].max())
+
+
+def test_a_rig_that_names_too_little_is_refused_for_a_body(prior, tmp_path, capsys):
+    (tmp_path / "part.toml").write_text('[joints]\nhips = "Hips"\n')
+    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", "--rig", tmp_path / "part.toml", "--prior", prior) == 2
+    assert "rig part names no joint for spine, " in capsys.readouterr().err
+    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", "--rig", "nobody", "--prior", prior) == 2
+    assert "no rig 'nobody'; known rigs: " in capsys.readouterr().err
     assert not (tmp_path / "a.bvh").exists()
+    assert run("info", "--rig", "mixamo") == 2
+
+
+@pytest.mark.parametrize("preset", [rig.name for rig in rigs.known()])
+def test_who_stands_on_a_preset_is_the_canonical_body_in_its_t_pose(preset):
+    rig = rigs.read(preset)
+    standing = figure.stand(rig)
+    canonical, rigmap = retarget.to_canonical(standing)
+    assert rigmap.rig.name == preset  # told by its names alone
+    toes = [CANONICAL.index(side + "Toes") for side in ("left", "right")]
+    heights = canonical.joint_positions()[:, toes, 1]
+    torch.testing.assert_close(heights, torch.full_like(heights, TOE_REST_HEIGHT), atol=1e-4, rtol=0)
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(canonical.local_quat_xyzw.shape)
+    assert turn_between(canonical.local_quat_xyzw, still) < 1e-3
+    torch.testing.assert_close(rigmap.skeleton.offsets[1:], CANONICAL.offsets[1:], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("up", "facing"), [("z", "-y"), ("z", "x"), ("-y", "x"), ("x", "auto"), ("y", "-z")])
+def test_a_rigs_axes_are_the_files(up, facing):
+    rig = replace(rigs.read("mixamo"), up=up, facing=facing)
+    standing = figure.stand(rig)
+    canonical, rigmap = retarget.to_canonical(standing, rig)
+    assert (rigmap.up, rigmap.rest) == (up, "T")
+    height = standing.joint_positions()[0] @ vector(up)
+    assert float(height.max() - height.min()) > 1.2
+    assert float(canonical.joint_positions()[0, CANONICAL.index("head"), 1]) > 1.2
+    if facing != "auto":
+        ahead = standing.skeleton.offsets[standing.skeleton.index("mixamorig:LeftToeBase")]  # with all rotations zero
+        assert float(ahead @ vector(facing)) == pytest.approx(0.0906, abs=1e-6)
 
 
 def test_convert_to_a_z_up_rig_stands_in_its_world(clip, tmp_path):
@@ -97,18 +164,22 @@ def test_convert_to_a_z_up_rig_stands_in_its_world(clip, tmp_path):
     torch.testing.assert_close(hips, person(1.0).root_position[:, 1], atol=0.01, rtol=0)
 
 
+def words_of(folder, prior):
+    """By job, what asks for 0.7 s of motion in the file a.bvh or generated_000.bvh of a folder."""
+    (folder / "c.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.7,1.0,40\n")
+    scene = f'prior = "{prior}"\noutputs = ["a.bvh"]\n[[actors]]\ncurve = "line:2"\nseconds = 0.7\n'
+    (folder / "s.toml").write_text(scene)
+    return {
+        "follow": ("line:2", "-o", folder / "a.bvh", "--seconds", 0.7, "--prior", prior),
+        "steer": (folder / "c.csv", "-o", folder / "a.bvh", "--prior", prior),
+        "generate": ("-o", folder, "--seconds", 0.7, "--prior", prior, "--no-refine"),
+        "run": (folder / "s.toml", "-o", folder),
+    }
+
+
 @pytest.mark.parametrize("job", ["follow", "steer", "generate", "run"])
 def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
-    out = tmp_path / "a.bvh"
-    (tmp_path / "c.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.7,1.0,40\n")
-    scene = f'prior = "{prior}"\noutputs = ["a.bvh"]\n[[actors]]\ncurve = "line:2"\nseconds = 0.7\n'
-    (tmp_path / "s.toml").write_text(scene)
-    words = {
-        "follow": ("line:2", "-o", out, "--seconds", 0.7, "--prior", prior),
-        "steer": (tmp_path / "c.csv", "-o", out, "--prior", prior),
-        "generate": ("-o", tmp_path, "--seconds", 0.7, "--prior", prior, "--no-refine"),
-        "run": (tmp_path / "s.toml", "-o", tmp_path),
-    }[job]
+    out, words = tmp_path / "a.bvh", words_of(tmp_path, prior)[job]
     assert run(job, *words, "--rig", clip, "--quiet") == 0
     made = mapctl.load(tmp_path / "generated_000.bvh" if job == "generate" else out)
     rig = mapctl.load(clip)

@@ -190,7 +190,7 @@ def test_the_same_comes_twice():
     (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
     (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
     (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (Keys.of((0, 20, 44), limbs=("Foot_R", "foot_l")), "no hand or foot 'foot_l'; the nearest is Foot_L"),
+    (Keys.of((0, 20, 44), limbs=("Foot_R", "foott_l")), "no hand or foot 'foott_l'; the nearest is Foot_L"),
     (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
     (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
     (Keys((Key(0, root_only=True), 20, 44)), "first and the last key are whole poses; that at frame 0 tells the root"),

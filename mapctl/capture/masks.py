@@ -1,19 +1,22 @@
 """Masks: what of a recording its user says not to believe. CSV with the columns joint, start, stop."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
+from functools import cache
 from os import PathLike
 
 import torch
 from torch import Tensor
 
+from mapctl.body.parts import roles
 from mapctl.capture.faults import runs
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.missing import Missing
 from mapctl.formats.reading import read_table, shorten
+from mapctl.joint_names import canonical_joints, find_joint, nearest
 from mapctl.motion import Motion
+from mapctl.rigs import Rig
 
 _COLUMNS = ("joint", "start", "stop")
 _FRAME = re.compile(r"[+-]?[0-9]{1,12}")
@@ -26,7 +29,7 @@ class Mask:
     """Frames in which a joint is not to be believed."""
 
     joint: str
-    """Of the recording's own rig; `*` for all of it, `root position` for where it is."""
+    """Of the recording's own rig or canonical, in any case; `*` for all of it, `root position` for where it is."""
     start: int
     """First frame, from 0."""
     stop: int
@@ -95,6 +98,7 @@ def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
 def hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     """Masked joints (frames, joints) and root places (frames,)."""
     names = motion.skeleton.names
+    masks = by_own_names(motion, masks)
     joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
     root = torch.zeros(motion.num_frames, dtype=torch.bool)
     for mask in masks:
@@ -103,8 +107,18 @@ def hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
         if mask.joint == ALL:
             joints[mask.start : mask.stop] = True
         elif mask.joint != ROOT:
-            joints[mask.start : mask.stop, _index(names, mask.joint)] = True
+            joints[mask.start : mask.stop, names.index(mask.joint)] = True
     return joints, root
+
+
+def by_own_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None = None) -> tuple[Mask, ...]:
+    """The masks with every joint by the name that the motion's own rig has for it.
+
+    `rig` wins over what would be recognised. RequestError, with the nearest names, for joints that it has not.
+    """
+    known = cache(lambda: canonical_joints(motion, rig))
+    own = {name: _own_name(motion, name, known) for name in {mask.joint for mask in masks} - {ALL, ROOT}}
+    return tuple(replace(mask, joint=own.get(mask.joint, mask.joint)) for mask in masks)
 
 
 def part_of(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
@@ -139,8 +153,9 @@ def written_back(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion
     return replace(motion, local_quat_xyzw=quats, root_position=place, moving_offsets=moving)
 
 
-def _index(names: Sequence[str], wanted: str) -> int:
-    if wanted in names:
-        return names.index(wanted)
-    near = get_close_matches(wanted, names, n=1, cutoff=0)
-    raise RequestError(f"no joint {wanted!r} to mask; the nearest is {near[0] if near else 'none'}")
+def _own_name(motion: Motion, wanted: str, known: Callable[[], Mapping[str, int]]) -> str:
+    names = motion.skeleton.names
+    joint = find_joint(wanted, names, known)
+    if joint is None:
+        raise RequestError(f"no joint {wanted!r} to mask; {nearest(wanted, names, roles(motion.skeleton))}")
+    return names[joint]

@@ -46,10 +46,11 @@ def film(before: "Motion", after: "Motion", video: Path | None, *, rig: "Rig | N
 
 
 def report(name: str, command: Any, motion: "Motion", found: dict[str, Any]) -> dict[str, Any]:
-    """The request, versions, what was found, and the motion's measures."""
+    """The request, versions, what was found, and the motion's measures, as `mapctl measure` takes them."""
     from mapctl import __version__, metrics
     from mapctl import report as reports
+    from mapctl.metrics.comparing import make_comparable
 
     request = {key: value for key, value in options.as_request(name, command).items() if value is not None}
     return {"mapctl": __version__, "request": request, "versions": reports.versions(), **found,
-            "measures": metrics.measure(motion)}  # fmt: skip
+            "measures": metrics.measure(make_comparable(motion, options.read_rig(command.rig))[0])}  # fmt: skip

@@ -20,9 +20,9 @@ class Blend:
     other: Annotated[Path, arg(name="from", metavar="CLIP")]
     """The clip that it is taken from, of any known rig; brought to IN's frame rate."""
     joints: Annotated[str, arg(metavar="NAME,NAME")]
-    """Hands and feet, by the names of IN's rig."""
+    """Hands and feet, by the names of IN's rig or the canonical ones."""
     frames: Annotated[str, arg(metavar="A:B")]
-    """Of the other clip, or seconds as in 2s:2.5s."""
+    """Of the other clip, in its own frames whatever its rate, or seconds as in 2s:2.5s."""
     at: Annotated[str, arg(metavar="FRAME")]
     """Where they go in IN, or seconds as in 1.5s."""
     out: options.OutFile
@@ -53,11 +53,9 @@ class Blend:
         from controllers.blend import Borrowed, blend
         from controllers.filling import InfillSettings
 
-        other = other.resample(motion.fps)
-        fps = float(motion.fps)
-        start, stop = parse_range(self.frames, fps=fps, frames=other.num_frames)
+        start, stop = parse_range(self.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
         names = tuple(name.strip() for name in self.joints.split(","))
-        borrowed = Borrowed(names, start, stop, parse_frame(self.at, fps=fps), margin=self.margin)
+        borrowed = Borrowed(names, start, stop, parse_frame(self.at, fps=float(motion.fps)), margin=self.margin)
         settings = InfillSettings(method=self.method)
         done = blend(motion, other, borrowed, priors.load_infiller(self.infiller), settings=settings, rig=rig)
         formats.save(done.motion, self.out)

@@ -1,18 +1,17 @@
-"""Folders of clips as sets to compare: read whole, with the offending file named where one will not do."""
+"""Folders of clips as sets to compare: read whole, with the files named that will not do."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from mapctl import formats, metrics, retarget
+from mapctl import formats, metrics
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics import realism
+from mapctl.metrics.comparing import make_comparable
 from mapctl.metrics.realism.diversity import diversity_of_positions, from_own_start
 from mapctl.metrics.realism.gait import PIECE_SECONDS
 from mapctl.motion import Motion
@@ -23,39 +22,73 @@ SETTINGS = realism.RealismSettings()
 
 
 @dataclass(frozen=True, eq=False)
+class _Clip:
+    """One file of a folder."""
+
+    motion: Motion
+    """Comparable."""
+    measures: dict[str, float]
+    """By name."""
+    positions: Tensor
+    """Canonical joints, (frames, joints, 3); nothing unless read with windows."""
+    windows: Tensor
+    """(windows, frames, channels); likewise."""
+    notes: list[str]
+    """What could not be made comparable."""
+
+    @staticmethod
+    def read(path: Path, *, with_windows: bool) -> "_Clip":
+        """MapctlError for what cannot be read, measured or cut."""
+        motion, notes = make_comparable(formats.load(path))
+        measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
+        if with_windows:
+            positions = realism.canonical_positions(motion)
+            windows = realism.clip_windows(positions, SETTINGS.windows)
+        return _Clip(motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
+
+
+@dataclass(frozen=True, eq=False)
 class ClipSet:
     """Every clip below a folder, in the order of their paths."""
 
     folder: Path
     """Where they lie."""
     motions: list[Motion]
-    """On canonical joints, so that sets on different rigs compare; as in the files where the rig is not known."""
+    """On canonical joints and at 30 frames a second at most, so that sets on different rigs compare (see
+    `metrics.comparing`)."""
     means: dict[str, float]
     """Mean of each measure over the clips that can give it."""
     positions: list[Tensor]
     """Canonical joints of each clip, (frames, joints, 3); none unless read with windows."""
     windows: list[Tensor]
     """Windows of each clip, (windows, frames, channels); none unless read with windows."""
+    skipped: dict[str, str]
+    """Files that were left out, and why, each a sentence that begins with the file."""
+    notes: tuple[str, ...] = ()
+    """What could not be made comparable, each a sentence."""
 
     @staticmethod
     def read(folder: Path, *, with_windows: bool) -> "ClipSet":
-        """Read and measure; MapctlError names the file that cannot be read, measured or cut into windows."""
+        """Read and measure. A file that cannot be read, measured or cut into windows is left out; RequestError if none
+        can."""
         paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
         if not paths:
             raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
-        motions, rows, positions, windows = [], [], [], []
+        clips: list[_Clip] = []
+        skipped: dict[str, str] = {}
         with bar(f"reading {folder}") as progress:
             for number, path in enumerate(paths, start=1):
-                loaded = formats.load(path)
-                with _named(path):
-                    motions.append(_canonical(loaded))
-                    rows.append(metrics.measure(motions[-1]))
-                    if with_windows:
-                        positions.append(realism.canonical_positions(motions[-1]))
-                        windows.append(realism.clip_windows(positions[-1], SETTINGS.windows))
+                try:
+                    clips.append(_Clip.read(path, with_windows=with_windows))
+                except MapctlError as error:
+                    skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
                 if progress is not None:
                     progress(number, len(paths))
-        return ClipSet(folder, motions, _means(rows), positions, windows)
+        if not clips:
+            raise RequestError(f"{folder}: no clip can be measured; {next(iter(skipped.values()))}")
+        positions, windows = [c.positions for c in clips if with_windows], [c.windows for c in clips if with_windows]
+        return ClipSet(folder, [clip.motion for clip in clips], _means([clip.measures for clip in clips]), positions,
+                       windows, skipped, tuple(note for clip in clips for note in clip.notes))  # fmt: skip
 
     def diversity(self) -> realism.Diversity:
         """Of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
@@ -75,7 +108,8 @@ def compared_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
             raise RequestError(f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in "
-                               "each folder (without --reference a folder of any size is measured)")  # fmt: skip
+                               f"each folder{_left_out(clips)} (without --reference a folder of any size is "
+                               "measured)")  # fmt: skip
     draws = torch.Generator().manual_seed(seed)
     with bar("telling apart") as progress:
         return realism.realism_of_windows(
@@ -97,20 +131,9 @@ def compared_spread(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, fl
     }
 
 
-def _canonical(motion: Motion) -> Motion:
-    try:
-        return retarget.to_canonical(motion)[0]
-    except RequestError:
-        return motion
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Errors within name the file."""
-    try:
-        yield
-    except MapctlError as error:
-        raise RequestError(f"{path}: {error}") from error
+def _left_out(clips: ClipSet) -> str:
+    first = next(iter(clips.skipped.values()), None)
+    return "" if first is None else f", and {len(clips.skipped)} cannot be measured: {first}"
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, float]:

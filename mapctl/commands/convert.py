@@ -25,9 +25,10 @@ class Convert:
     named as in subject.asf+take.amc."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
-    rig: Annotated[str | None, arg(metavar="canonical|CLIP")] = None
+    rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted, on which the
-    character stands on its floor with planted feet, in the clip's layout."""
+    character stands on its floor with planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
+    get the bones of the canonical body."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     fps: Annotated[str | None, arg(metavar="F")] = None
@@ -70,18 +71,18 @@ def parse_fps(text: str) -> Fraction:
 
 
 def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Carried":
-    """The motion on the canonical joints or on a clip's skeleton, in that clip's layout, and what could not be kept.
+    """The motion on the canonical joints, on a clip's skeleton in that clip's layout, or on a rig that is told; and
+    what could not be kept.
+
 
     RequestError for rigs that are not known. A clip of the same skeleton stays as it is; others stand on their floor
     (see mapctl.carry).
     """
-    from mapctl import formats, retarget, rigs
+    from mapctl import retarget
     from mapctl.carry import Body, Carried, carry
 
     if rig == "canonical":
         return Carried(retarget.to_canonical(motion, source_rig)[0])
-    if rig in {known.name for known in rigs.known()}:
-        raise RequestError(f"the bones of {rig} differ from performer to performer: name a clip of that rig")
-    body = Body.of(formats.load(rig))[1]
+    body = Body.of(*options.read_figure(rig))[1]
     carried = carry(motion, body, source_rig)
     return Carried(body.on_rig(carried.motion), carried.notes)

@@ -33,7 +33,8 @@ class FollowCurve:
     seed: options.Count = 0
     """Of everything random: the same seed gives the same file."""
     rig: rigged.OutRig = "canonical"
-    """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
+    """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
     camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None

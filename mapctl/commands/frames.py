@@ -17,14 +17,14 @@ def parse_frame(text: str, *, fps: float) -> int:
     return int(found[1]) if found[1] is not None else round(float(found[2]) * fps)
 
 
-def parse_range(text: str, *, fps: float, frames: int) -> tuple[int, int]:
+def parse_range(text: str, *, fps: float, frames: int, what: str = "gap") -> tuple[int, int]:
     """`60:120` or `2s:4s` as first frame and one past the last; RequestError unless they lie within the motion."""
     start, colon, stop = text.partition(":")
     if not colon:
-        raise RequestError(f"a gap is A:B, frames or seconds as in 60:120 or 2s:4s; got {text!r}")
+        raise RequestError(f"a {what} is A:B, frames or seconds as in 60:120 or 2s:4s; got {text!r}")
     first, last = parse_frame(start, fps=fps), parse_frame(stop, fps=fps)
     if not first < last <= frames:
-        raise RequestError(f"the gap {text} must begin before it ends, within the motion's frames 0:{frames}")
+        raise RequestError(f"the {what} {text} must begin before it ends, within the motion's frames 0:{frames}")
     return first, last
 
 

@@ -51,7 +51,8 @@ class Generate:
     no_refine: bool = False
     """Leave the draws as they are: no refiner, and no pass that makes planted feet stand."""
     rig: rigged.OutRig = "canonical"
-    """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
+    """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
     quiet: bool = False
     """No lines on the clips and no progress bar."""
 

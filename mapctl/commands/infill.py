@@ -31,7 +31,7 @@ class Infill:
     not matter. What is nan in IN is lost as well; where it is nothing, and there are no gaps and joints, frozen and
     leaping frames are looked for."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """Only these joints of the rig are lost: in the gaps, or throughout if there are none."""
+    """Only these joints are lost, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
     """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
     curve: options.MaybeCurve = None

@@ -1,6 +1,6 @@
 """`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,13 +15,18 @@ from mapctl.errors import CheckpointError, RequestError
 if TYPE_CHECKING:
     from mapctl.commands.clip_sets import ClipSet
     from mapctl.curve import Curve
+    from mapctl.motion import Motion
+
+_MOST_LINES = 12  # of notes and clips that are left out
 
 
 @dataclass(frozen=True)
 class Measure:
     """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
-    Of a folder the means over its clips; beside a folder of mocap also whether the two can be told apart.
+    All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
+    a folder the means over its clips; beside a folder of mocap also whether the two can be told apart. Clips of a
+    folder that cannot be measured are left out and listed.
     """
 
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
@@ -57,12 +62,17 @@ class Measure:
         return 0
 
     def _clips(self) -> dict[str, Any]:
-        from mapctl import formats, metrics
+        from mapctl import metrics
 
         curve = self._curve()
-        ours = metrics.measure(formats.load(self.clip), curve, speed=self.speed)
-        reference = {} if self.reference is None else metrics.measure(formats.load(self.reference))
-        return {"clip": str(self.clip), "measures": ours, "reference": reference, "mocap": _mocap(self.prior)}
+        clip, notes = _comparable(self.clip)
+        ours = metrics.measure(clip, curve, speed=self.speed)
+        reference = {}
+        if self.reference is not None:
+            other, more = _comparable(self.reference)
+            reference, notes = metrics.measure(other), notes + more
+        return {"clip": str(self.clip), "measures": ours, "reference": reference, "mocap": _mocap(self.prior),
+                "notes": notes}  # fmt: skip
 
     def _curve(self) -> "Curve | None":
         if self.speed is not None and not 0 < self.speed < float("inf"):
@@ -90,6 +100,8 @@ class Measure:
             "measures": ours.means,
             "reference": {} if reference is None else reference.means,
             "mocap": _mocap(self.prior),
+            "notes": ours.notes + (() if reference is None else reference.notes),
+            "skipped": ours.skipped | ({} if reference is None else reference.skipped),
         }
         return values if reference is None else values | self._compared(ours, reference)
 
@@ -118,6 +130,23 @@ def _print_tables(values: Mapping[str, Any]) -> None:
         print_table(
             ["spread", "ours", "reference", "ratio"], rows, title="how widely the clips spread (in pieces of 3 s)"
         )
+    for line in _short([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
+        print(line)
+
+
+def _short(lines: Sequence[str]) -> list[str]:
+    """The first of them, and how many more there are."""
+    more = len(lines) - _MOST_LINES
+    return [*lines[:_MOST_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
+
+
+def _comparable(path: Path) -> "tuple[Motion, list[str]]":
+    """A clip as mocap's values were measured, and what could not be made so."""
+    from mapctl import formats
+    from mapctl.metrics.comparing import make_comparable
+
+    motion, notes = make_comparable(formats.load(path))
+    return motion, [f"{path}: {note}" for note in notes]
 
 
 def _print_realism(realism: Mapping[str, Any]) -> None:

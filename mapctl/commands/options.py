@@ -82,6 +82,18 @@ def read_rig(text: str | None) -> "Rig | None":
     return None if text is None else rigs.read(text)
 
 
+def read_figure(text: str) -> "tuple[Motion, Rig | None]":
+    """Whose skeleton a --rig option asks for: a clip; or somebody who stands on the joints of a preset or a TOML file,
+    and its rig."""
+    from mapctl import formats, rigs
+    from mapctl.rigs import figure
+
+    if Path(text).suffix.lower() in formats.READERS:
+        return formats.load(text), None
+    rig = rigs.read(text)
+    return figure.stand(rig), rig
+
+
 def read_motion(path: Path, rig: "Rig | None", *, fps: "Fraction | None" = None) -> "Motion":
     """A motion in metres, in the rig's unit where it tells one; `fps` is that of an .amc."""
     from mapctl import formats

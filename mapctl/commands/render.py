@@ -11,7 +11,7 @@ from mapctl.progress import bar
 
 @dataclass(frozen=True)
 class Render:
-    """Film a motion: MP4, GIF, or a PNG contact sheet."""
+    """Film a motion: MP4, GIF, or a PNG contact sheet. Files of known rigs that have Z up are put upright."""
 
     source: options.InFile
     """.bvh, .npz, or .amc with its .asf beside it."""
@@ -34,13 +34,14 @@ class Render:
         outputs.check_film(self.out, size)
         curve = None if self.curve is None else options.read_curve(self.curve, self.metres_per_unit)
         from mapctl import formats
+        from mapctl.upright import put_upright
         from scenes.cameras import CameraSettings
         from scenes.film import film
 
-        motion = formats.load(self.source)
+        motion, notes = put_upright(formats.load(self.source))
         with bar("filming", quiet=self.quiet) as progress:
             camera = CameraSettings(self.camera)
             film([(motion, curve)], self.out, camera=camera, size=size, progress=progress)
         if not self.quiet:
-            print(f"{self.out}: {motion.seconds:.1f} s of {size[0]}x{size[1]}")
+            print("\n".join((f"{self.out}: {motion.seconds:.1f} s of {size[0]}x{size[1]}", *notes)))
         return 0

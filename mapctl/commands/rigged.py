@@ -1,19 +1,18 @@
 """Motion on the user's own rig: whose bones the solver uses, and the way from canonical joints to the rig."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from mapctl.errors import RequestError
+from mapctl.commands import options
 
 if TYPE_CHECKING:
     from mapctl.motion import Motion
     from mapctl.retarget import RigMap
     from mapctl.skeleton import Skeleton
 
-OutRig = Annotated[str, arg(metavar="canonical|CLIP")]
+OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
 """Type of the option."""
 
 
@@ -40,16 +39,12 @@ class Wearer:
 
 
 def read(text: str) -> Wearer:
-    """The person of a --rig option: canonical, or of a clip's skeleton. RequestError for a rig without bones."""
-    from mapctl import rigs
+    """The person of a --rig option: canonical, of a clip's skeleton, or with canonical bones on a preset's joints."""
     from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 
     if text == "canonical":
         return Wearer(CANONICAL, TOE_REST_HEIGHT)
-    if text in {rig.name for rig in rigs.known()} or Path(text).suffix.lower() == ".toml":
-        raise RequestError(f"the bones of {text} differ from performer to performer: name a clip of that rig")
-    from mapctl import formats
     from mapctl.carry import Body
 
-    body = Body.of(formats.load(text))[1]
+    body = Body.of(*options.read_figure(text))[1]
     return Wearer(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)

@@ -28,7 +28,8 @@ class RunScene:
     out: options.OutFolder = Path()
     """Folder for the scene's outputs; made if it is not there."""
     rig: rigged.OutRig = "canonical"
-    """Whose body the actors have: the canonical one, or that of a clip (.bvh, .npz), on whose rig they are written."""
+    """Whose body the actors have: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
     quiet: bool = False
     """No summary and no progress bar."""
 

@@ -39,7 +39,8 @@ class Steer:
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     rig: rigged.OutRig = "canonical"
-    """Whose body moves: the canonical one, or that of a clip (.bvh, .npz), on whose rig the motion is then written."""
+    """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
     seed: options.Count = 0
     """Of the pose that it begins with."""
     acceleration: options.Number = Limits.acceleration

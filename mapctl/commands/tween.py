@@ -35,7 +35,7 @@ class Tween:
     keyframes: Annotated[str | None, arg(metavar="F,F,...")] = None
     """Of a motion file, frames that stay, or seconds as in 1.5s; the first and the last one are whole poses."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """Keys between the first and the last only tell where these hands or feet are."""
+    """Keys between the first and the last only tell where these hands or feet are: canonical names or the rig's own."""
     root_only: bool = False
     """Keys between the first and the last only tell where the hips are and which way they face."""
     suggest_timing: bool = False

@@ -70,7 +70,7 @@ def _body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float)
 def _path(places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float) -> dict[str, float]:
     arcs = curve.track(places)
     travelled = float(arcs[-1] - arcs[0])
-    measures = _spread("path_error_{}_cm", path.path_error(places, curve))
+    measures = _spread("path_error_{}_cm", path.path_error(places, curve, arcs))
     measures |= _spread("path_error_low_passed_{}_cm", path.low_passed_error(places, curve, arcs, fps))
     measures |= {"sway_cm": path.sway(curve.signed_offset(places, arcs), fps) * _CM, "travelled_m": travelled}
     if speed is not None:

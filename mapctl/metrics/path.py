@@ -16,9 +16,14 @@ SWAY_SECONDS = 0.35
 """Standard deviation of the Gaussian whose slow part is not sway."""
 
 
-def path_error(places: Float[Tensor, "frames axes"], curve: Curve) -> Float[Tensor, "frames"]:
-    """Distance of each place to the curve, between its ends, metres; without height for a ground curve."""
-    apart = curve.point(curve.nearest(places)) - (places[:, ::2] if places.shape[1] > curve.dims else places)
+def path_error(
+    places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
+) -> Float[Tensor, "frames"]:
+    """Distance of each place to where the walk is on the curve, between its ends, metres; without height for a ground
+    curve. `arcs` come from `track`: the nearest place of all may belong to another branch.
+    """
+    on_it = arcs if curve.closed else arcs.clamp(0, curve.length)
+    apart = curve.point(on_it) - (places[:, ::2] if places.shape[1] > curve.dims else places)
     return apart.norm(dim=-1)
 
 

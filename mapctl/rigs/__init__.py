@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.joint_names import nearest
 from mapctl.skeleton import CANONICAL, Skeleton
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -55,8 +56,8 @@ class Rig:
                 raise RequestError(f"rig {self.name}: {key} is one of auto, {', '.join(allowed)}, got {value!r}")
         strange = [name for name in (*self.joints, *self.tpose, *self.straighten) if name not in CANONICAL.names]
         if strange:
-            known_ones = ", ".join(CANONICAL.names)
-            raise RequestError(f"rig {self.name}: no canonical joint {strange[0]!r}; there are {known_ones}")
+            near = nearest(strange[0], CANONICAL.names)
+            raise RequestError(f"rig {self.name}: no canonical joint {strange[0]!r}; {near}")
 
     @property
     def has_tpose(self) -> bool:
@@ -88,7 +89,7 @@ def read(name_or_path: str | PathLike[str]) -> Rig:
     """A preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
     text, path = str(name_or_path), Path(name_or_path)
     for rig in known():
-        if rig.name == text:
+        if rig.name == text.lower():
             return rig
     if path.suffix.lower() == ".toml":
         return _read_toml(path)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from mapctl.body.parts import Part, Role, Side, roles
 from mapctl.errors import RequestError
+from mapctl.joint_names import nearest, shorten
 from mapctl.motion import Motion
 from mapctl.rigs import Rig, chains, known
 from mapctl.rigs.pose import Poses, swapped
@@ -222,8 +223,8 @@ def _unmapped(skeleton: Skeleton, found: Mapping[str, int]) -> tuple[str, ...]:
 def _check_given(rig: Rig, found: Mapping[str, int], skeleton: Skeleton) -> None:
     for canonical in REQUIRED:
         if canonical in rig.joints and canonical not in found:
-            raise RequestError(f"rig {rig.name}: no joint {rig.joints[canonical]!r} for {canonical}; the skeleton has "
-                               f"{', '.join(skeleton.names[:60])}")  # fmt: skip
+            near = nearest(rig.joints[canonical], skeleton.names, roles(skeleton))
+            raise RequestError(f"rig {rig.name}: no joint {rig.joints[canonical]!r} for {canonical}; {near}")
 
 
 def _check(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
@@ -231,6 +232,6 @@ def _check(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
     if not missing and score >= ACCEPTED:
         return
     what = f"no joint for {', '.join(missing)}" if missing else "too few joints are known by name"
-    names, rigs = ", ".join(skeleton.names[:60]), ", ".join(rig.name for rig in known())
+    names, rigs = shorten(skeleton.names), ", ".join(rig.name for rig in known())
     raise RequestError(f"cannot tell this rig: {what} (score {score:.2f}, {ACCEPTED} is needed); "
                        f"its joints are {names}; known rigs: {rigs}; a TOML file can name its joints")  # fmt: skip

@@ -1,0 +1,88 @@
+"""Blending counts in the other clip's own frames, whatever the two frame rates."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import pytest
+import torch
+from helpers import run, walk
+
+from controllers import blend as blending
+from controllers.blend import Borrowed, blend
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
+
+HAND, ARM = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
+
+
+def waving(fps: int, seconds: float = 4.0) -> Motion:
+    """Somebody who stands and lowers the left arm evenly by a radian a second from the T-pose: its angle tells when."""
+    frames = round(fps * seconds)
+    angle = -torch.arange(frames, dtype=torch.float64) / fps
+    quats = torch.zeros(frames, CANONICAL.num_joints, 4, dtype=torch.float64)
+    quats[..., 3] = 1
+    quats[:, ARM] = rotations.from_rotation_vector(angle[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
+    root = torch.tensor([0.0, 0.87, 0.0]).double().expand(frames, 3).clone()
+    return Motion(CANONICAL, Fraction(fps), root, quats)
+
+
+class Asked(Exception):
+    """Ends a blend once it is known what was asked for."""
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Where the hand was asked to be, frame by frame, as seconds of the source; nothing is solved."""
+    seen = {}
+
+    def catch(lent, lost, *_, **__):
+        at = (lent.local_quat_xyzw[:, ARM] - lent.local_quat_xyzw[:1, ARM]).norm(dim=-1).gt(1e-6).nonzero()[:, 0]
+        places = lent.joint_positions()[at]
+        way = places[:, HAND] - places[:, ARM]
+        seen["frames"], seen["seconds"] = at, torch.atan2(-way[:, 1], way[:, 0])
+        raise Asked
+
+    monkeypatch.setattr(blending, "fill", catch)
+    return seen
+
+
+@pytest.mark.parametrize("own", [24, 30, 60])
+@pytest.mark.parametrize("other", [24, 30, 60, 120])
+def test_frames_are_the_other_clips_own(own, other, asked):
+    start, stop = round(0.5 * other), round(1.0 * other)
+    still = replace(waving(own), local_quat_xyzw=waving(own).local_quat_xyzw[:1].expand(4 * own, -1, -1))
+    with pytest.raises(Asked):
+        blend(still, waving(other), Borrowed(("lefthand",), start, stop, 2 * own), None)
+    assert asked["frames"].tolist() == list(range(2 * own, 2 * own + round(0.5 * own)))
+    wanted = 0.5 + torch.arange(len(asked["frames"]), dtype=torch.float64) / own
+    torch.testing.assert_close(asked["seconds"], wanted, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (("--frames", "60:120", "--at", "10"), (60, 120, 10)), (("--frames", "0.5s:1s", "--at", "1s"), (60, 120, 30)),
+])  # fmt: skip
+def test_the_command_counts_so_too(words, said, tmp_path, monkeypatch):
+    waving(30).save(tmp_path / "in.bvh")
+    waving(120).save(tmp_path / "other.bvh")
+    seen = []
+
+    def catch(motion, source, borrowed, *_, **__):
+        seen.append((source.fps, borrowed.start, borrowed.stop, borrowed.at))
+        raise RequestError("caught")
+
+    monkeypatch.setattr(blending, "blend", catch)
+    paths = (tmp_path / "in.bvh", "--from", tmp_path / "other.bvh", "-o", tmp_path / "out.bvh", "--joints", "leftHand")
+    assert run("blend", *paths, *words) == 2
+    assert seen == [(120, *said)]
+
+
+def test_ranges_beyond_the_other_clip_are_refused_in_its_frames(tmp_path, capsys):
+    walk(40).save(tmp_path / "in.bvh")
+    waving(120, 1.0).save(tmp_path / "other.bvh")
+    paths = (tmp_path / "in.bvh", "--from", tmp_path / "other.bvh", "-o", tmp_path / "out.bvh", "--joints", "leftHand")
+    assert run("blend", *paths, "--frames", "100:121", "--at", "3") == 2
+    assert "the range of --frames 100:121 must begin before it ends" in capsys.readouterr().err
+    assert run("blend", *paths, "--frames", "20:120", "--at", "30") == 2  # 25 frames of IN from its 30th of 40
+    assert "frames 30:55 are not within the motion's 0:40" in capsys.readouterr().err

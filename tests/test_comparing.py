@@ -1,0 +1,116 @@
+"""Measures that mean the same whatever the frame rate, the axis that points up and the rig of the file."""
+
+import json
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from captures import trembling
+from helpers import random_motion, run, walk
+from rig_maker import Make, make, names_of, person
+
+from mapctl import metrics
+from mapctl.metrics.comparing import make_comparable
+from mapctl.motion import Motion
+from mapctl.skeleton import Skeleton
+from mapctl.upright import UNKNOWN, put_upright
+
+TREMOR = math.radians(0.3)
+
+
+def told(capsys, *words: object) -> dict:
+    assert run("measure", *words, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def trembling_walk(fps: int) -> Motion:
+    """Ten seconds with noise that is as large in every frame at any rate."""
+    return trembling(walk(10 * fps + 1, fps=fps), TREMOR, seed=fps)
+
+
+def thinned(motion: Motion, step: int) -> Motion:
+    """Every so manieth frame."""
+    return Motion(motion.skeleton, motion.fps / step, motion.root_position[::step], motion.local_quat_xyzw[::step])
+
+
+@pytest.mark.parametrize("fps", [60, 120, 240])
+@pytest.mark.parametrize("folder", [False, True])
+def test_faster_files_are_measured_at_the_rate_of_mocaps_values(fps, folder, tmp_path, capsys):
+    trembling_walk(fps).save(tmp_path / "fast.bvh")
+    values = told(capsys, tmp_path if folder else tmp_path / "fast.bvh")
+    usual = metrics.measure(thinned(trembling_walk(fps), fps // 30))
+    assert values["measures"] == pytest.approx(usual, rel=0.02, abs=0.01)
+    assert metrics.measure(trembling_walk(fps))["jitter_m_s3"] > 3 * usual["jitter_m_s3"]
+    assert values["notes"] == []
+
+
+def test_a_reference_clip_is_brought_to_the_same_rate(tmp_path, capsys):
+    trembling_walk(30).save(tmp_path / "a.bvh")
+    trembling_walk(120).save(tmp_path / "b.bvh")
+    values = told(capsys, tmp_path / "a.bvh", "--reference", tmp_path / "b.bvh")
+    assert values["reference"]["jitter_m_s3"] == pytest.approx(values["measures"]["jitter_m_s3"], rel=0.1)
+
+
+@pytest.mark.parametrize(("fps", "said"), [(Fraction(30000, 1001), False), (Fraction(24), True), (Fraction(15), True)])
+def test_slower_files_stay_as_they_are_and_that_is_said(fps, said):
+    motion = replace(walk(60), fps=fps)
+    comparable, notes = make_comparable(motion)
+    assert comparable.num_frames == 60
+    assert bool(notes) == said
+    assert all("frames a second" in note for note in notes)
+
+
+@pytest.mark.parametrize("options", [{"arms_down_deg": 40.0, "root": "Reference"}, {}, {"bones_along_x": True}])
+def test_a_file_with_z_up_has_the_measures_of_the_same_with_y_up(options, tmp_path, capsys):
+    found = []
+    for zup in (False, True):
+        make(Make(names_of("mixamo"), zup=zup, **options)).motion(person(frames=95)).save(tmp_path / f"{zup}.bvh")
+        found.append(told(capsys, tmp_path / f"{zup}.bvh", "--curve", "line:2")["measures"])
+    assert found[1]["hips_height_m"] > 0.8
+    assert found[0] == pytest.approx(found[1], rel=1e-3, abs=1e-3, nan_ok=True)
+
+
+def unknown() -> Motion:
+    """A skeleton that is no body but has hips, feet and thighs by name."""
+    names = ("Hips", "LeftUpLeg", "LeftFoot", "RightUpLeg", "RightFoot")
+    offsets = torch.tensor([[0, 0, 0], [0.1, 0, 0], [0, -0.8, 0], [-0.1, 0, 0], [0, -0.8, 0]], dtype=torch.float64)
+    return random_motion(Skeleton(names, (-1, 0, 1, 0, 3), offsets), 40)
+
+
+def test_what_is_not_known_of_a_rig_is_said_in_one_line(tmp_path, capsys):
+    unknown().save(tmp_path / "a.bvh")
+    values = told(capsys, tmp_path / "a.bvh")
+    assert values["notes"] == [f"{tmp_path / 'a.bvh'}: {UNKNOWN}"]
+    assert values["measures"]["jitter_m_s3"] == pytest.approx(metrics.measure(unknown())["jitter_m_s3"], rel=1e-3)
+    assert run("measure", tmp_path / "a.bvh") == 0
+    assert UNKNOWN in capsys.readouterr().out
+    assert put_upright(unknown())[1] == (UNKNOWN,)
+
+
+@pytest.mark.parametrize("root", [None, "Reference"])
+def test_upright_motions_keep_their_rig_and_every_distance(root):
+    motion = make(Make(names_of("mixamo"), zup=True, root=root)).motion(person(frames=20))
+    upright, notes = put_upright(motion)
+    assert notes == ()
+    assert upright.skeleton is motion.skeleton
+    was, now = motion.joint_positions(), upright.joint_positions()
+    head = motion.skeleton.names.index("mixamorig:Head")
+    assert float(was[:, head, 2].min()) > 1.3  # along Z
+    assert float(now[:, head, 1].min()) > 1.3  # along Y
+    # Rotated about x by a quarter turn: y was -z, z was y.
+    np.testing.assert_allclose(now, torch.stack([was[..., 0], was[..., 2], -was[..., 1]], -1), atol=1e-9)
+    again, _ = put_upright(upright)
+    np.testing.assert_allclose(again.joint_positions(), now, atol=1e-12)
+
+
+def test_render_films_the_upright_motion(tmp_path, monkeypatch):
+    make(Make(names_of("mixamo"), zup=True)).motion(person(frames=20)).save(tmp_path / "z.bvh")
+    shown = []
+    monkeypatch.setattr("scenes.film.film", lambda actors, *_, **__: shown.extend(actors))
+    assert run("render", tmp_path / "z.bvh", "-o", tmp_path / "z.png") == 0
+    places = shown[0][0].joint_positions()
+    assert float(places[..., 1].max()) > 1.2
+    assert float((places[..., 2].amax(1) - places[..., 2].amin(1)).max()) < 1.2

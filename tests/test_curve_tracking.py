@@ -1,0 +1,121 @@
+"""Where a walk is on its curve, on walks whose arcs are known because they were made from them."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_metrics import walk
+
+from mapctl import curves
+from mapctl.metrics import measure, path
+
+FPS = 30
+
+
+def hairpin(*, apart: float, leg: float = 4.0) -> curves.Curve:
+    """Out and back beside the way out; `apart` 0 is back on the very same line."""
+    turn = np.linspace(0, math.pi, 40)
+    bend = np.stack([apart / 2 * (1 - np.cos(turn)), leg + apart / 2 * np.sin(turn)], axis=1)
+    return curves.from_points(np.concatenate([[[0.0, 0.0]], bend, [[apart, 0.0]]]))
+
+
+CURVES = {
+    "hairpin": hairpin(apart=0.3),
+    "narrow hairpin": hairpin(apart=0.1),
+    "back on itself": hairpin(apart=0.0),
+    "figure8": curves.figure8(radius=1.0),
+    "circle": curves.circle(radius=1.5),
+    "two laps drawn": curves.from_points(np.stack([f(np.linspace(0, 4 * math.pi, 800)) for f in (np.sin, np.cos)], 1)),
+}
+LAPS = {"circle": 2.4, "figure8": 2.4}
+
+
+def made(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
+    """Arcs that go on evenly, and places beside them: hips that sway."""
+    length = laps * curve.length
+    arcs = torch.linspace(0, length, round(length / speed * fps), dtype=torch.float64)
+    phase = 2 * math.pi * torch.rand(1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    offset = sway * torch.sin(2 * math.pi * torch.arange(len(arcs)) / fps + phase)
+    return arcs, offset, curve.point(arcs) + offset[:, None] * curve.left(arcs)
+
+
+@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("fps", [30, 120])
+def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
+    curve = CURVES[name]
+    arcs, _, places = made(curve, laps=LAPS.get(name, 1.0), fps=fps)
+    found = curve.track(places)
+    assert float((found - arcs).abs().max()) < 0.12  # near a tip the other leg is as near
+    assert float((found - arcs).abs().median()) < 0.005
+    assert float(found[-1] - found[0]) == pytest.approx(float(arcs[-1]), abs=0.12)
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_progress_and_path_error_are_the_walks_own(name):
+    curve = CURVES[name]
+    arcs, offset, places = made(curve, laps=LAPS.get(name, 1.0))
+    got = measure(walk(places, fps=FPS), curve, speed=1.3)
+    assert got["travelled_m"] == pytest.approx(float(arcs[-1]), rel=0.02)
+    assert got["progress_ratio"] == pytest.approx(1, abs=0.03)
+    own = 100 * offset.abs()
+    assert got["path_error_mean_cm"] == pytest.approx(float(own.mean()), abs=0.1)
+    assert got["path_error_max_cm"] == pytest.approx(float(own.max()), abs=0.3)
+    for kind in ("mean", "max"):
+        assert got[f"path_error_low_passed_{kind}_cm"] < got[f"path_error_{kind}_cm"]
+
+
+def test_the_way_back_counts_even_nearer_to_the_way_out():
+    """Legs 20 cm apart; on the way back the walker is 15 cm off, so 5 cm from the way out."""
+    curve = hairpin(apart=0.2)
+    arcs = torch.linspace(0, curve.length, 200, dtype=torch.float64)
+    inward = torch.where(arcs > curve.length / 2 + 0.5, 0.15, 0.0)
+    places = curve.point(arcs) - inward[:, None] * torch.tensor([1.0, 0.0])
+    got = measure(walk(places), curve, speed=1.0)
+    assert got["travelled_m"] == pytest.approx(curve.length, rel=0.02)
+    assert got["path_error_max_cm"] == pytest.approx(15, abs=0.5)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_a_walk_that_ends_early_has_gone_so_far(share):
+    for name in ("hairpin", "back on itself", "figure8"):
+        arcs, _, places = made(CURVES[name], laps=share)
+        assert float(CURVES[name].track(places)[-1]) == pytest.approx(float(arcs[-1]), abs=0.13)
+
+
+def test_what_was_left_out_of_a_curve_is_missed():
+    """The walker turns 1 m before the tip: no arc is skipped in a jump, and the tip counts as missed."""
+    curve = hairpin(apart=0.3)
+    out = np.stack([np.zeros(100), np.linspace(0, 3, 100)], axis=1)
+    across = np.stack([np.linspace(0, 0.3, 10), np.full(10, 3.0)], axis=1)
+    places = np.concatenate([out, across, out[::-1] + np.array([0.3, 0.0])])
+    got = measure(walk(places), curve, speed=1.0)
+    assert got["travelled_m"] == pytest.approx(curve.length, abs=0.1)
+    assert 50 < got["path_error_max_cm"] < 115
+    assert float(curve.track(torch.tensor(places)).diff().max()) < 1.5  # the nearest place goes on by 2.4 m at once
+
+
+def test_steps_back_and_standing_are_followed():
+    """To and fro by 0.4 m on a line: the nearest place is the truth there."""
+    z = 2 + np.concatenate([np.linspace(0, 1, 30), np.linspace(1, 0.6, 20), np.full(40, 0.6), np.linspace(0.6, 2, 40)])
+    line = curves.line(length=10.0)
+    found = line.track(torch.tensor(np.stack([0.02 * np.sin(z), z], axis=1)))
+    np.testing.assert_allclose(found.numpy(), z, atol=1e-6)
+
+
+def test_one_place_is_the_nearest():
+    circle = curves.circle(radius=2.0)
+    still = circle.point(torch.full((5,), 3.0).double())
+    torch.testing.assert_close(circle.track(still), torch.full((5,), 3.0).double(), rtol=0, atol=1e-6)
+
+
+def test_long_walks_stay_exact():
+    circle = curves.circle(radius=3.0)
+    arcs = torch.linspace(0, 30 * circle.length, 6000, dtype=torch.float64)
+    torch.testing.assert_close(circle.track(circle.point(arcs)), arcs, rtol=0, atol=1e-4)
+
+
+def test_path_error_is_to_the_branch_that_is_walked():
+    curve = hairpin(apart=0.1)
+    places, arcs = curve.point(1.0)[None], torch.tensor([curve.length - 1.0]).double()
+    assert float(path.path_error(places, curve, arcs)) == pytest.approx(0.1, abs=1e-3)
