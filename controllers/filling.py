@@ -66,7 +66,9 @@ class Infilled:
     notes: tuple[str, ...] = ()
     """What the user should know."""
     sources: tuple[GapSource, ...] = ()
-    """Who proposed what in gaps that were not the infiller's alone."""
+    """Who proposed what in gaps in which nothing was known."""
+    gap_notes: tuple[str, ...] = ()
+    """A line on each of these: who, how sure, and what nobody knows."""
 
     def summary(self) -> dict[str, Any]:
         """For a report, in plain numbers."""
@@ -79,6 +81,7 @@ class Infilled:
             "ledger": self.ledger.summary(), "seconds": self.seconds,
             "frame_ms": 1000 * self.seconds / max(1, filled),
             "contacts": [[bool(bit) for bit in row] for row in self.contacts.tolist()], "notes": list(self.notes),
+            "gap_notes": list(self.gap_notes),
         }  # fmt: skip
 
 
@@ -112,8 +115,8 @@ def fill(
     filled = from_canonical(_at_rate_of(canonical, made, gap.seconds), rigmap, base)
     done = _closed(put_back(filled, base, lost), lost, motion)
     done, notes = _on_target(done, targets, lost, motion, rig)
-    notes = (*notes, *notes_of(gap, made, answer.sources, fps=float(motion.fps)))
-    return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes, answer.sources)
+    gaps = notes_of(gap, made, answer.sources, fps=float(motion.fps))
+    return Infilled(done, lost, stands, ledger, time.perf_counter() - began, notes, answer.sources, gaps)
 
 
 def end_notes(lost: Lost, first: str, by: str) -> tuple[str, ...]:

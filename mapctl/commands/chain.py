@@ -67,7 +67,7 @@ class Chain:
             filled = int(done.lost.frames.sum())
             print(f"{self.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(self.clips)}"
                   f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame")  # fmt: skip
-            for note in done.notes:
+            for note in (*done.notes, *done.gap_notes):
                 print(note)
         return 0
 

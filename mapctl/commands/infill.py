@@ -115,5 +115,5 @@ class Infill:
         gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in summary["gaps"])
         print(f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
               f" {summary['frame_ms']:.1f} ms a filled frame")  # fmt: skip
-        for note in done.notes:
+        for note in (*done.notes, *done.gap_notes):
             print(note)

@@ -77,7 +77,8 @@ def run(command: "Tween", asked: "Keyed") -> None:
                   f" frame; {ms:.1f} ms a frame")  # fmt: skip
         print(f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
               f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips")  # fmt: skip
-        for note in found.each[0].infilled.notes:
+        first = found.each[0].infilled
+        for note in (*first.notes, *first.gap_notes):
             print(note)
 
 
