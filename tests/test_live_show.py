@@ -18,7 +18,7 @@ from mapctl.steering import Command
 from mapctl.streaming import Delivered, LiveCharacter
 from scenes.live import ground
 from scenes.live.gauges import Gauges
-from scenes.live.panel import Orders
+from scenes.live.orders import Orders
 from scenes.live.recording import Recording, as_file
 from scenes.live.show import Show
 

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
@@ -37,7 +38,7 @@ class Live:
         compute_on_one()
         self._check()
         import priors
-        from scenes.live.panel import Orders
+        from scenes.live.orders import Orders
         from scenes.live.show import Show
 
         prior = priors.load(self.prior)
@@ -56,6 +57,8 @@ class Live:
             show.run()
         except KeyboardInterrupt:
             print()
+            for path in show.keep_recordings(Path.cwd()):
+                print(f"the recording that was going on is in {path.name}")
         finally:
             show.close()
         return 0
