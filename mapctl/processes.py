@@ -1,11 +1,13 @@
-"""Processes beside this one."""
+"""Processes beside this one, and Ctrl-C, which comes to all of them."""
 
 import multiprocessing
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnProcess
+from types import FrameType
 from typing import Any
 
 
@@ -22,14 +24,49 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
 
 
 @contextmanager
+def insist_on_ctrl_c() -> Iterator[None]:
+    """A Ctrl-C that somebody in here swallows is raised at the end.
+
+    Some packages catch everything while they are imported, and Python itself while it collects garbage.
+    """
+    handler, heard = signal.getsignal(signal.SIGINT), list[int]()
+    if not callable(handler) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+        handler(number, frame)
+
+    signal.signal(signal.SIGINT, hear)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    if heard:
+        raise KeyboardInterrupt
+
+
+@contextmanager
 def _ctrl_c_waits() -> Iterator[None]:
-    """A Ctrl-C that comes now arrives at the end; whoever is started now never hears of one."""
+    """A Ctrl-C that comes now is heard at the end; whoever is started now never hears of one.
+
+    The signal's mask is inherited by who is started. It does not keep Python from interrupting the main thread where
+    another thread gets the signal, which would leave somebody half started, so the handler waits too.
+    """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
     resource_tracker.ensure_running()  # starting this helper of multiprocessing's would end the blocking
+    heard, handler, is_main = [], signal.getsignal(signal.SIGINT), threading.current_thread() is threading.main_thread()
+    if is_main:
+        signal.signal(signal.SIGINT, lambda *_: heard.append(True))
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+        if heard:
+            signal.raise_signal(signal.SIGINT)

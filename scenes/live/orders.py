@@ -92,14 +92,15 @@ class Bounds:
     def _why(self, name: str, asked: Any, held: Any) -> str | None:
         """The sentence, None where it holds as it was asked."""
         if name == "told":
-            return next((f"{label!r} is not a {group} that this prior knows" for group, label in dict(asked).items()
+            return next((f"{label!r} is not a {group} that this prior knows." for group, label in dict(asked).items()
                          if held.get(group, AS_IT_LIKES) != label), None)  # fmt: skip
         if asked == held:
             return None
         if not _is_number(asked):
-            return f"{name.replace('_', ' ')}: {str(asked)[:20]!r} is no number; {held} holds"
+            held = "none" if held is None else f"{held:g}"
+            return f"{name.replace('_', ' ').capitalize()}: {str(asked)[:20]!r} is no number; {held} holds."
         if name not in _SHOWN:
-            return f"a {name} of {asked:g} degrees is the same as {held:g}"
+            return f"A {name} of {asked:g} degrees is the same as {held:g}."
         words, unit = _SHOWN[name]
         low, high = self._range(name)
         way = "raised" if held > asked else "lowered"

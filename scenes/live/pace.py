@@ -42,6 +42,8 @@ class Pace:
         else:
             changed = silent or quick >= _HALF or (long >= _FIFTH and now - self._rows[0][0] > _LONG - _SOON)
         self.slow ^= changed
+        while changed and not self.slow and self._rows[0][0] <= now - _OVER:
+            self._rows.popleft()  # what is over is not judged again
         return changed
 
     def text(self, now: float) -> str:

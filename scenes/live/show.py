@@ -61,7 +61,7 @@ class Show:
         self._panel = Panel(gui, self, characters=len(characters), bounds=self._bounds, below=self._notices.below)
         self._panel.show(self._members[0].orders)
         self._gauges = Gauges(gui)
-        scene.on_click()(self._clicked)
+        scene.on_click()(lambda event: self._draw_at(event.ray_origin, event.ray_direction))
 
     @property
     def url(self) -> str:
@@ -267,9 +267,11 @@ class Show:
         if changed:
             self._notices.console(said or f"{member.name} keeps up again")
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
+    def _draw_at(self, ray_origin: Any, ray_direction: Any) -> None:
+        """A point of the path where somebody clicked, a ray of two times three numbers if the browser is well."""
+
         def added() -> None:
-            origin, direction = np.array(event.ray_origin, float), np.array(event.ray_direction, float)
+            origin, direction = np.array(ray_origin, float), np.array(ray_direction, float)
             shift = np.asarray(self._world.position)
             if self._panel.draw.value and (place := ground.on_the_ground(origin - shift, direction)) is not None:
                 self._path.add(*place)
