@@ -18,6 +18,7 @@ import viser
 import mapctl
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+COUNTED = re.compile(r"\d+ of \d+ frames late")  # in the page once characters move
 SIZE = {"width": 760, "height": 620}  # small: these machines draw without a graphics card
 SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
             "--disable-background-networking", "--disable-component-update", "--disable-sync"]  # fmt: skip
@@ -84,7 +85,7 @@ def page(browser, live):
     faults: list[str] = []
     opened.on("pageerror", lambda error: faults.append(str(error)))
     opened.goto(live.url)
-    opened.get_by_text("late").wait_for(timeout=60_000)
+    opened.get_by_text(COUNTED).wait_for(timeout=60_000)
     yield opened
     opened.close()
     assert faults == []
@@ -168,7 +169,7 @@ TYPED = ("", "-", "-5", "abc", "1e9", "0.8", "99", "-0", "00.30", "1,5", "٣", "
 def type_into(page, label: str, text: str) -> None:
     """Key by key, as people do, and then on to the next field or not."""
     field = number(page, label)
-    field.click()
+    field.focus()
     field.press("Control+a")
     field.press("Delete")
     for key in text:
@@ -178,17 +179,20 @@ def type_into(page, label: str, text: str) -> None:
         field.press("Tab")
 
 
-def pester(pages, until: float) -> int:
-    """Everything into every field, from all pages in turn; how often."""
-    for count, (text, label) in enumerate(itertools.cycle(itertools.product(TYPED, FIELDS))):
-        if time.monotonic() > until:
+def check(page, label: str) -> None:
+    """Set a box, or leave it set."""
+    page.get_by_text(label).locator("xpath=following::input[@type='checkbox'][1]").check(force=True)
+
+
+def pester(pages, until: float, least: int) -> int:
+    """Everything into every field, from all pages in turn, until then and so many at least; how many."""
+    for box in ("Measured steps", "Face a fixed way"):
+        check(pages[0], box)
+    everything = itertools.cycle(itertools.product(TYPED, FIELDS))
+    for count, (text, label) in enumerate(everything):
+        if time.monotonic() > until and count >= least:
             return count
-        page = pages[count % len(pages)]
-        if count % 7 == 0:
-            page.get_by_text("Measured steps").locator("xpath=following::input[@type='checkbox'][1]").click()
-            page.get_by_text("Face a fixed way").locator("xpath=following::input[@type='checkbox'][1]").click()
-        if number(page, label).is_enabled():
-            type_into(page, label, text)
+        type_into(pages[count % 3 % len(pages)], label, text)
     return 0
 
 
@@ -196,9 +200,9 @@ FOREIGN = """async port => {
     const outcome = socket => new Promise(done => {
         socket.onopen = () => done("open"); socket.onerror = () => done("refused");
     });
-    const sockets = ["127.0.0.1", "localhost"].map(name => new WebSocket(`ws://${name}:${port}`, "viser-v" + "%s"));
-    const fetched = await fetch(`http://127.0.0.1:${port}/`).then(() => "read", () => "refused");
-    return [...await Promise.all(sockets.map(outcome)), fetched];
+    const opened = name => outcome(new WebSocket(`ws://${name}:${port}`, "viser-v%s"));
+    const fetched = fetch(`http://127.0.0.1:${port}/`).then(() => "read", () => "refused");
+    return await Promise.all([opened("127.0.0.1"), opened("localhost"), fetched]);
 }"""
 
 
@@ -214,30 +218,32 @@ def attempts_of_a_foreign_page(browser, port: int) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("seconds", [15, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("seconds", [5, pytest.param(300, marks=pytest.mark.slow)])
 def test_whatever_is_typed_by_two_people_the_show_goes_on_and_the_recording_is_whole(
     page, browser, live, tmp_path, seconds
 ):
     other = browser.new_page(viewport=SIZE)
     other.goto(live.url)
-    other.get_by_text("late").wait_for(timeout=60_000)
+    other.get_by_text(COUNTED).wait_for(timeout=60_000)
     page.get_by_role("button", name="Reset").click()
     typed, foreign = [], []
 
     def during() -> None:
         until = time.monotonic() + seconds
         while time.monotonic() < until:
-            typed.append(pester([page, other], min(until, time.monotonic() + 30)))
+            typed.append(pester([page, other], min(until, time.monotonic() + 60), least=8))
             foreign.append(attempts_of_a_foreign_page(browser, live.port))
 
     began = shown(page)
     motion = recorded(page, tmp_path, 1.0, during=during)
     count = shown(page) - began
-    assert sum(typed) >= seconds / 2
+    print(f"{sum(typed)} entries, {len(foreign)} foreign pages, {motion.num_frames} frames recorded of {count}")
+    assert foreign
     assert foreign == [["refused"] * 3] * len(foreign)
     assert live.process.poll() is None
     assert not any("Traceback" in line or "went wrong" in line or "no more" in line for line in live.lines), live.lines
-    assert count - 120 < motion.num_frames <= count, "every frame from the button's first press to its second"
+    assert count - 150 < motion.num_frames <= count, "every frame from the button's first press to its second"
     assert float(motion.root_position.diff(dim=0).norm(dim=-1).max()) < 0.5, "none is missing in between"
     put(page, "Speed, m/s", 0.7)
     assert shows(other, "Speed, m/s", 0.7), "it still obeys"
@@ -246,7 +252,7 @@ def test_whatever_is_typed_by_two_people_the_show_goes_on_and_the_recording_is_w
 
 def test_a_number_typed_digit_by_digit_arrives_and_one_that_cannot_be_is_said(page):
     page.get_by_role("button", name="Reset").click()
-    page.get_by_text("Measured steps").locator("xpath=following::input[@type='checkbox'][1]").check()
+    check(page, "Measured steps")
     type_into(page, "Step length, m", "0.8")
     time.sleep(1.5)
     assert shows(page, "Step length, m", 0.8)
@@ -260,13 +266,13 @@ def test_a_number_typed_digit_by_digit_arrives_and_one_that_cannot_be_is_said(pa
 def test_two_browsers_see_the_same_and_one_may_go_and_come_back(page, browser, live):
     other = browser.new_page(viewport=SIZE)
     other.goto(live.url)
-    other.get_by_text("late").wait_for(timeout=60_000)
+    other.get_by_text(COUNTED).wait_for(timeout=60_000)
     put(page, "Speed, m/s", 0.7)
     assert shows(other, "Speed, m/s", 0.7)
     other.close()
     again = browser.new_page(viewport=SIZE)
     again.goto(live.url)
-    again.get_by_text("late").wait_for(timeout=60_000)
+    again.get_by_text(COUNTED).wait_for(timeout=60_000)
     assert shows(again, "Speed, m/s", 0.7)
     again.close()
 

@@ -1,6 +1,8 @@
 """What lies on the ground of the live viewer: grid, drawn path, planted feet, and the forecast of the next second."""
 
 from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import viser
@@ -90,10 +92,18 @@ class DrawnPath:
                                                              thickness=0.025))  # fmt: skip
 
 
+def as_ray(origin: Any, direction: Any) -> Array:
+    """(2, 3) of what a browser says; RequestError where that is no ray near the stage."""
+    with suppress(TypeError, ValueError):
+        ray = np.array([origin, direction], dtype=np.float64)
+        if ray.shape == (2, 3) and np.isfinite(ray).all() and np.abs(ray).max() <= _FAR:
+            return ray
+    raise RequestError("a click that is nowhere")
+
+
 def on_the_ground(origin: Array, direction: Array) -> tuple[float, float] | None:
-    """x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m, or where it is no ray."""
-    ray = np.array([origin, direction], dtype=np.float64)
-    if ray.shape != (2, 3) or not np.isfinite(ray).all() or np.abs(ray).max() > _FAR or direction[1] > -1e-3:
+    """x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m."""
+    if direction[1] > -1e-3:
         return None
     far = -origin[1] / direction[1]
     return (float(origin[0] + far * direction[0]), float(origin[2] + far * direction[2])) if 0 < far < 100 else None

@@ -271,9 +271,9 @@ class Show:
         """A point of the path where somebody clicked, a ray of two times three numbers if the browser is well."""
 
         def added() -> None:
-            origin, direction = np.array(ray_origin, float), np.array(ray_direction, float)
+            ray = ground.as_ray(ray_origin, ray_direction)
             shift = np.asarray(self._world.position)
-            if self._panel.draw.value and (place := ground.on_the_ground(origin - shift, direction)) is not None:
+            if self._panel.draw.value and (place := ground.on_the_ground(ray[0] - shift, ray[1])) is not None:
                 self._path.add(*place)
 
         self._soon(added)
