@@ -1,4 +1,4 @@
-"""What goes wrong in one place of the live viewer ends nothing elsewhere, and is said; what cannot be is clamped and said."""
+"""What goes wrong in one place of the live viewer ends nothing elsewhere, and is said; so is what cannot be."""
 
 import itertools
 import math
@@ -212,6 +212,12 @@ VALUES = (
 )
 
 
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 0.0), "fov": 1.0, "near": 0.1,
+    "far": 9.0, "image_height": 9, "image_width": 9, "look_at": (0.0, 0.0, 1.0), "up_direction": (0.0, 1.0, 0.0),
+}  # fmt: skip
+
+
 def controls(show):
     """All that a browser can set a value of."""
     return [handle for handle in vars(show._panel).values() if isinstance(handle, viser.GuiInputHandle)] + [
@@ -223,11 +229,12 @@ def test_whatever_two_browsers_send_every_command_can_be_obeyed_and_the_recordin
     """As pages send it, past what their fields let through."""
     show.toggle_recording(None)
     own = f"http://127.0.0.1:{show.server.get_port()}"
-    opened = [
-        connect(own.replace("http", "ws"), origin=own, subprotocols=[f"viser-v{viser.__version__}"]) for _ in "ab"
-    ]
-    sent = itertools.product(range(2), VALUES, controls(show))
-    for number, (_, value, handle) in enumerate(sent):
+    how = {"origin": own, "subprotocols": [f"viser-v{viser.__version__}"], "max_queue": None}
+    opened = [connect(own.replace("http", "ws"), **how) for _ in range(2)]
+    for browser in opened:
+        browser.send(msgspec.msgpack.encode(CAMERA))  # before that a page is none to viser
+    sent = itertools.product(VALUES, controls(show))
+    for number, (value, handle) in enumerate(sent):
         message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
         opened[number % 2].send(msgspec.msgpack.encode(message))
         if number % 10 == 0:
@@ -243,6 +250,6 @@ def test_whatever_two_browsers_send_every_command_can_be_obeyed_and_the_recordin
     assert "Traceback" not in console
     assert "went wrong" not in console
     frames = sum(len(piece.root) for piece in show._members[0].recording.pieces)
-    assert frames == min(actors[0].frames, 81)
+    assert frames == actors[0].frames
     panel, orders = show._panel, show._members[show._chosen].orders
     assert (panel.speed.value, panel.heading.value) == (orders.speed, round(orders.heading))
