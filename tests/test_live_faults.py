@@ -249,7 +249,7 @@ def test_whatever_two_browsers_send_every_command_can_be_obeyed_and_the_recordin
     _, console = said()
     assert "Traceback" not in console
     assert "went wrong" not in console
-    frames = sum(len(piece.root) for piece in show._members[0].recording.pieces)
+    frames = show._members[0].recording.motion().num_frames
     assert frames == actors[0].frames
     panel, orders = show._panel, show._members[show._chosen].orders
     assert (panel.speed.value, panel.heading.value) == (orders.speed, round(orders.heading))

@@ -69,8 +69,10 @@ class Notices:
 
     def fault(self, error: BaseException) -> None:
         """An error of the project's own, or of an input that nobody thought of; everything goes on."""
-        said = str(error) if isinstance(error, MapctlError) else one_line(error)
-        self.event("Something went wrong", said)
+        if isinstance(error, MapctlError):
+            self.event("Not done", str(error))  # what was asked cannot be
+        else:
+            self.event("Something went wrong", one_line(error))
 
     def console(self, text: str) -> None:
         """A line on standard error; the same once in a while only."""

@@ -110,9 +110,10 @@ class Panel:
 
     def _steering(self, gui: viser.GuiApi, bounds: Bounds) -> None:
         self.speed = gui.add_slider("Speed, m/s", 0.0, bounds.fastest, 0.1, min(1.2, bounds.fastest))
-        self.heading = gui.add_slider("Heading, degrees", -180, 180, 1, 0, hint="0 is +Z, 90 is +X")
+        # Floats throughout: a browser's 1e300 as an int could not be sent on, and would end everybody's connection.
+        self.heading = gui.add_slider("Heading, degrees", -180.0, 180.0, 1.0, 0.0, hint="0 is +Z, 90 is +X")
         self.strafe = gui.add_checkbox("Face a fixed way", False)
-        self.facing = gui.add_slider("Facing, degrees", -180, 180, 1, 0, disabled=True)
+        self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0, disabled=True)
         self.measured = gui.add_checkbox("Measured steps", False)
         self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, _STEP, disabled=True)
         self.told = {group: gui.add_dropdown(group.capitalize(), [AS_IT_LIKES, *names])
