@@ -2,6 +2,11 @@
 
 The frames of a step are due when the ones before them have been shown. A step begins when those before it begin to be
 shown, so a command waits for two steps at most: 0.2 s at three frames a step.
+
+Where the machine is too slow, this is the rule. A step that begins late searches less, but never less than
+`SteerSettings.least_evaluations`, so commands are obeyed. If its frames are later than `LoopSettings.slack` all the
+same, the stream's time stands still for as long: motion plays slower than real time, and no frame and no command is
+left out.
 """
 
 import time
@@ -55,9 +60,13 @@ class Clock(Protocol):
         """Return at that time, or at once if it has passed."""
         ...
 
+    def hold(self, seconds: float) -> None:
+        """Let so many seconds of real time not have counted."""
+        ...
+
 
 class WallClock:
-    """Real time, from the making on."""
+    """Real time, from the making on, less what it was held for."""
 
     real = True
 
@@ -72,6 +81,10 @@ class WallClock:
         """See Clock."""
         if (left := seconds - self.now()) > 0:
             time.sleep(left)
+
+    def hold(self, seconds: float) -> None:
+        """See Clock."""
+        self._began += seconds
 
 
 class StreamClock:
@@ -90,6 +103,9 @@ class StreamClock:
         """See Clock."""
         self._now = max(self._now, seconds)
 
+    def hold(self, seconds: float) -> None:
+        """See Clock; nothing is late, so nobody asks."""
+
 
 @dataclass(frozen=True)
 class LoopSettings:
@@ -97,6 +113,8 @@ class LoopSettings:
 
     margin: float = 0.026
     """Seconds before frames are due at which the search for them ends: what is left to do then takes that long."""
+    slack: float = 0.1
+    """Seconds by which frames may be late before time stands still for them; less is made up for by searching less."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +135,8 @@ class StepRecord:
     """Of energy and gradient."""
     note: str
     """Why less was searched than could have been, if so."""
+    held: float = 0.0
+    """Seconds for which time then stood still."""
 
     @property
     def late_frames(self) -> int:
@@ -174,10 +194,14 @@ def steps(
         asked = clock.now() - begun
         left = due - asked - settings.margin if clock.real else None
         state, new = step(state, source.at(asked), seconds=None if left is None else max(0.0, left))
+        delivered = clock.now() - begun
+        held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
+        if held:
+            clock.hold(held)  # before they are shown: they are due now
         for display in displays:
             display.show(new, due)
-        delivered = clock.now() - begun
-        yield state, StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, new.note)
+        yield state, StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, new.note,
+                                held)  # fmt: skip
 
 
 def drive(
@@ -212,6 +236,7 @@ def timing(records: Sequence[StepRecord], arrivals: Sequence[float] = ()) -> dic
         "late_frames": sum(record.late_frames for record in records),
         "evaluations_per_frame": sum(record.evaluations for record in records) / max(1, count),
         "steps_cut_short": sum(bool(record.note) for record in records),
+        "held_s": sum(record.held for record in records),
         "command_latency_s": max(latencies, default=_worst_latency(records)),
         "threads": torch.get_num_threads(),
     }

@@ -48,6 +48,8 @@ class SteerSettings:
     """Frames that a step delivers."""
     evaluations: int = 14
     """Of energy and gradient in a step, at most: what one core does in the time that three frames last."""
+    least_evaluations: int = 6
+    """In a step, however late it is: with fewer wishes are missed (docs/results.md). Never more than `evaluations`."""
     limits: Limits = field(default_factory=Limits)
     """How fast a wish may change."""
     sigma_speed: float = Travel.sigma_speed
@@ -68,8 +70,10 @@ class SteerSettings:
     """The prior, as in following a curve."""
 
     def __post_init__(self):
-        if not 1 <= self.commit < self.horizon or self.evaluations < 1:
-            raise RequestError(f"steering needs 1 <= commit < horizon and evaluations >= 1, got {self}")
+        if not 1 <= self.commit < self.horizon or self.evaluations < 1 or self.least_evaluations < 0:
+            raise RequestError(
+                f"steering needs 1 <= commit < horizon, evaluations >= 1 and least_evaluations >= 0, got {self}"
+            )
 
     def seen_by(self, person: Stature) -> "SteerSettings":
         """The same for somebody of this size, in metres of the prior's size."""
@@ -150,10 +154,21 @@ def begin(
     return SteerState(prior, settings, person, start.committed, wish, torch.tensor([wish.velocity])), frames
 
 
+def accept(prior: Any, command: Command) -> tuple[Command, list[str]]:
+    """The nearest command that the prior can hold, and a sentence for each number that was changed (Command.within).
+
+    RequestError where it tells the prior what it does not know.
+    """
+    if command.told:
+        _told(prior, command.told)
+    return command.within(prior.abilities.fastest_asked)
+
+
 def step(
     state: SteerState, command: Command, *, seconds: float | None = None
 ) -> tuple[SteerState, SteerFrames]:  # fmt: skip
-    """The next frames under a command. With `seconds`, the best found by then, and a note that says so.
+    """The next frames under a command. With `seconds`, the best found by then but for the least that the settings ask
+    for, and a note that says so.
 
     RequestError where the command tells the prior what it does not know. The first step under new labels takes longer.
     """
@@ -168,7 +183,9 @@ def step(
     terms = _terms(state, wishes, command.step_length)
     done, outcome = _solve(told, terms, seconds, free=stuck)
     if outcome is not Outcome.DONE:
-        afresh = replace(told, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))
+        unsearched = replace(settings, least_evaluations=0)
+        afresh = replace(told, settings=unsearched,
+                         committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))  # fmt: skip
         done, _ = _solve(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
     motion = person.motion(decode(new, state.committed.place, skeleton=person.small))
@@ -198,25 +215,32 @@ def _told(prior: Any, labels: tuple[str, ...]) -> Any:
 
 def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool) -> tuple[Committed, Outcome]:
     settings = state.settings
-    budget = Budget(evaluations=settings.evaluations, seconds=seconds)
-    method: Method = LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=settings.evaluations), budget=budget)
+    method: Method = _bounded(settings.evaluations, settings.least_evaluations, seconds)
     if free:
-        half = replace(method, budget=Budget(max(1, settings.evaluations // 2), seconds and seconds / 2))
-        draws = BestOf(settings.draws, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _SPREAD))
-        few = LbfgsSettings(max_iterations=max(1, settings.evaluations // 2))
-        bold = replace(
-            half,
-            proposal=draws,
-            lbfgs=few,
-            budget=replace(half.budget, evaluations=settings.draws + few.max_iterations),
-        )
-        method = _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
+        method = _step_first(state, terms, seconds)
     window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = WindowSolver(state.prior, window, state.person.small, method=method)
     frames = len(state.committed.features) + settings.commit
     return solver.solve(
         state.committed, lambda first, count: terms, frames, generator=torch.Generator().manual_seed(state.frames)
     )
+
+
+def _bounded(evaluations: int, least: int, seconds: float | None) -> LatentMethod:
+    """One round of so many evaluations at most, fewer by then, but the least in any case."""
+    most = max(1, evaluations)
+    budget = Budget(most, seconds, min(least, most))
+    return LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
+
+
+def _step_first(state: SteerState, terms: Sequence[Term], seconds: float | None) -> "_StepFirst":
+    """The search for who is stuck: the draws are looked at in any case, the evaluations are halved."""
+    settings, soon = state.settings, seconds and seconds / 2
+    half = _bounded(settings.evaluations // 2, max(1, settings.least_evaluations // 2), soon)
+    few, least = half.budget.evaluations or 1, half.budget.least
+    draws = BestOf(settings.draws, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _SPREAD))
+    bold = replace(half, proposal=draws, budget=Budget(settings.draws + few, soon, settings.draws + least))
+    return _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
 
 
 @dataclass(frozen=True)

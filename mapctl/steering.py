@@ -7,6 +7,10 @@ from itertools import pairwise
 
 from mapctl.errors import RequestError
 
+STEP_LENGTHS = (0.3, 1.2)
+"""Metres between which steps can be asked for. Beyond them feet slide to meet the wish and speed is lost: at 1.2 m/s,
+planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 99 m the whole body slides at 9 m/s."""
+
 
 @dataclass(frozen=True)
 class Command:
@@ -36,6 +40,24 @@ class Command:
             if value is not None and not math.isfinite(value):
                 raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
 
+    def within(self, fastest: float, *, when: str = "") -> tuple["Command", list[str]]:
+        """The nearest command that can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.
+
+        With a sentence for each number that changed; `when` (` at 3 s`) follows its name. An angle of more than a turn
+        is the same direction, so nothing is said of it.
+        """
+        said, (shortest, longest) = [], STEP_LENGTHS
+        speed, step = min(self.speed, fastest), self.step_length
+        if speed < self.speed:
+            said.append(f"the speed of {self.speed:g} m/s{when} was lowered to {speed:.2f} m/s, the prior's fastest")
+        if step is not None and (held := min(longest, max(shortest, step))) != step:
+            way = "raised" if held > step else "lowered"
+            said.append(f"the step length of {step:g} m{when} was {way} to {held:g} m; "
+                        f"steps can be {shortest:g} to {longest:g} m long")  # fmt: skip
+            step = held
+        turned = {name: _wrapped(getattr(self, name)) for name in ("heading", "facing")}
+        return replace(self, speed=speed, step_length=step, **turned), said
+
 
 @dataclass(frozen=True)
 class CommandTrack:
@@ -62,14 +84,12 @@ class CommandTrack:
         return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
 
     def clamped(self, fastest: float) -> tuple["CommandTrack", list[str]]:
-        """The track with speeds of at most `fastest` m/s, and a sentence for each command that was lowered."""
-        said = []
-        for time, command in zip(self.times, self.commands, strict=True):
-            if command.speed > fastest:
-                said.append(f"the speed of {command.speed:g} m/s at {time:g} s was lowered to {fastest:.2f} m/s, "
-                            "the prior's fastest")  # fmt: skip
-        lowered = [replace(command, speed=min(command.speed, fastest)) for command in self.commands]
-        return CommandTrack(self.times, tuple(lowered)), said
+        """The track with every command within what can be held, and a sentence for each number that was changed."""
+        found = [command.within(fastest, when=f" at {time:g} s")
+                 for time, command in zip(self.times, self.commands, strict=True)]  # fmt: skip
+        return CommandTrack(self.times, tuple(command for command, _ in found)), [
+            one for _, said in found for one in said
+        ]
 
 
 @dataclass(frozen=True)
@@ -124,6 +144,11 @@ class Wish:
             wish = wish.toward(command, limits, 1 / fps)
             wishes.append(wish)
         return wishes
+
+
+def _wrapped(angle: float | None) -> float | None:
+    """Of a full turn or more what is left of it; other angles to the bit."""
+    return angle if angle is None or abs(angle) <= 2 * math.pi else math.remainder(angle, 2 * math.pi)
 
 
 def _toward(angle: float, wanted: float, most: float) -> float:

@@ -36,11 +36,19 @@ class Delivered:
     energies: Mapping[str, float]
     """Mean nats a frame by term, of the new frames."""
     spare: float
-    """Seconds between delivery and `due`; negative where the first frame came late."""
+    """Seconds between delivery and when the first frame had to be there; negative where it came late. Frames that came
+    very late are due anew, as soon as they are there."""
     compute: float
     """Seconds of the step."""
     evaluations: int
     """Of energy and gradient in the step."""
+    notes: tuple[str, ...] = ()
+    """What was ordered since the last step and could not be done, or not as it was asked; a sentence each."""
+
+    @property
+    def late_frames(self) -> int:
+        """Frames that came after they were due."""
+        return sum(self.spare + k / PRIOR_FPS < 0 for k in range(len(self.root)))
 
     def motion(self, skeleton: Skeleton) -> Motion:
         """The frames as a motion of that skeleton."""
@@ -55,7 +63,7 @@ class LiveCharacter(Protocol):
     """Its bones."""
 
     def command(self, command: Command) -> None:
-        """Obey this from now on, and follow no path."""
+        """Obey this from now on, and follow no path; as far as it can, which `Delivered.notes` tell."""
         ...
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
@@ -67,7 +75,7 @@ class LiveCharacter(Protocol):
         ...
 
     def reset(self) -> None:
-        """Begin anew where it first stood."""
+        """Begin anew where it first stood; also who is no more."""
         ...
 
     def poll(self) -> list[Delivered]:

@@ -58,6 +58,23 @@ def test_whichever_limit_comes_first_is_named():
     assert other.reason == "used its 1 s"
 
 
+def test_the_least_is_granted_after_the_deadline_and_no_more_than_all():
+    clock = Clock()
+    meter = Meter(Budget(evaluations=5, seconds=1.0, least=3), clock=clock)
+    clock.now += 2.0
+    assert (meter.remaining, meter.exhausted) == (3, False)
+    assert [meter.take() for _ in range(5)] == [True, True, True, False, False]
+    assert (meter.remaining, meter.reason) == (0, "used its 1 s")
+    small = Meter(Budget(evaluations=2, seconds=0.0, least=3), clock=clock)
+    assert [small.take() for _ in range(3)] == [True, True, False]
+
+
+def test_before_the_deadline_the_least_is_no_limit():
+    meter = Meter(Budget(evaluations=5, seconds=1.0, least=3), clock=Clock())
+    assert meter.remaining == 5
+    assert sum(meter.take() for _ in range(9)) == 5
+
+
 def test_no_limits_never_refuse():
     meter = Meter()
     assert meter.take(10**9)
@@ -69,6 +86,8 @@ def test_no_limits_never_refuse():
 def test_impossible_limits_are_refused():
     with pytest.raises(RequestError, match="evaluations must be 0 or more"):
         Budget(evaluations=-1)
+    with pytest.raises(RequestError, match="least must be 0 or more"):
+        Budget(least=-1)
     for seconds in (-0.1, math.nan):
         with pytest.raises(RequestError, match="seconds must be 0 or more"):
             Budget(seconds=seconds)

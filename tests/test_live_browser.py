@@ -1,19 +1,24 @@
 """The live viewer in a real browser: the page loads, controls move the character, a drawn path is walked, a recording
 comes down as a file that can be read; two browsers, one that goes and comes back, a port that is taken."""
 
+import http.server
+import itertools
 import re
 import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
+import viser
 
 import mapctl
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+COUNTED = re.compile(r"\d+ of \d+ frames late")  # in the page once characters move
 SIZE = {"width": 760, "height": 620}  # small: these machines draw without a graphics card
 SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
             "--disable-background-networking", "--disable-component-update", "--disable-sync"]  # fmt: skip
@@ -47,6 +52,7 @@ class Live:
             assert line, "".join(self.lines)
             self.lines.append(line)
         self.url = re.search(r"http://\S+", self.lines[-1]).group()
+        threading.Thread(target=lambda: self.lines.extend(self.process.stdout), daemon=True).start()
 
     def end(self) -> int:
         self.process.send_signal(signal.SIGINT)
@@ -79,7 +85,7 @@ def page(browser, live):
     faults: list[str] = []
     opened.on("pageerror", lambda error: faults.append(str(error)))
     opened.goto(live.url)
-    opened.get_by_text("late").wait_for(timeout=60_000)
+    opened.get_by_text(COUNTED).wait_for(timeout=60_000)
     yield opened
     opened.close()
     assert faults == []
@@ -156,34 +162,137 @@ def test_a_drawn_path_is_walked(page, tmp_path):
     page.get_by_role("button", name="Clear").click()
 
 
+FIELDS = ("Speed, m/s", "Heading, degrees", "Facing, degrees", "Step length, m")
+TYPED = ("", "-", "-5", "abc", "1e9", "0.8", "99", "-0", "00.30", "1,5", "٣", "9" * 40)
+
+
+def type_into(page, label: str, text: str) -> None:
+    """Key by key, as people do, and then on to the next field or not."""
+    field = number(page, label)
+    field.focus()
+    field.press("Control+a")
+    field.press("Delete")
+    for key in text:
+        field.press(key) if key.isascii() else field.type(key)
+        page.wait_for_timeout(40)
+    if len(text) % 2:
+        field.press("Tab")
+
+
+def check(page, label: str) -> None:
+    """Set a box, or leave it set."""
+    page.get_by_text(label).locator("xpath=following::input[@type='checkbox'][1]").check(force=True)
+
+
+def pester(pages, until: float, least: int) -> int:
+    """Everything into every field, from all pages in turn, until then and so many at least; how many."""
+    for box in ("Measured steps", "Face a fixed way"):
+        check(pages[0], box)
+    everything = itertools.cycle(itertools.product(TYPED, FIELDS))
+    for count, (text, label) in enumerate(everything):
+        if time.monotonic() > until and count >= least:
+            return count
+        type_into(pages[count % 3 % len(pages)], label, text)
+    return 0
+
+
+FOREIGN = """async port => {
+    const outcome = socket => new Promise(done => {
+        socket.onopen = () => done("open"); socket.onerror = () => done("refused");
+    });
+    const opened = name => outcome(new WebSocket(`ws://${name}:${port}`, "viser-v%s"));
+    const fetched = fetch(`http://127.0.0.1:${port}/`).then(() => "read", () => "refused");
+    return await Promise.all([opened("127.0.0.1"), opened("localhost"), fetched]);
+}"""
+
+
+def attempts_of_a_foreign_page(browser, port: int) -> list[str]:
+    """What a page of another server gets of this one."""
+    folder = http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler)
+    threading.Thread(target=folder.serve_forever, daemon=True).start()
+    page = browser.new_page()
+    page.goto(f"http://127.0.0.1:{folder.server_port}/no-such-page")
+    found = page.evaluate(FOREIGN % viser.__version__, port)
+    page.close()
+    folder.shutdown()
+    return found
+
+
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("seconds", [5, pytest.param(300, marks=pytest.mark.slow)])
+def test_whatever_is_typed_by_two_people_the_show_goes_on_and_the_recording_is_whole(
+    page, browser, live, tmp_path, seconds
+):
+    other = browser.new_page(viewport=SIZE)
+    other.goto(live.url)
+    other.get_by_text(COUNTED).wait_for(timeout=60_000)
+    page.get_by_role("button", name="Reset").click()
+    typed, foreign = [], []
+
+    def during() -> None:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            typed.append(pester([page, other], min(until, time.monotonic() + 60), least=8))
+            foreign.append(attempts_of_a_foreign_page(browser, live.port))
+
+    time.sleep(2)  # until the page counts anew
+    began = shown(page)
+    motion = recorded(page, tmp_path, 1.0, during=during)
+    count = shown(page) - began
+    print(f"{sum(typed)} entries, {len(foreign)} foreign pages, {motion.num_frames} frames recorded of {count}")
+    assert foreign
+    assert foreign == [["refused"] * 3] * len(foreign)
+    assert live.process.poll() is None
+    assert not any("Traceback" in line or "went wrong" in line or "no more" in line for line in live.lines), live.lines
+    assert abs(motion.num_frames - count) < 150, "all from the button's first press to its second, as the page counts"
+    assert float(motion.root_position.diff(dim=0).norm(dim=-1).max()) < 0.5, "none is missing in between"
+    put(page, "Speed, m/s", 0.7)
+    assert shows(other, "Speed, m/s", 0.7), "it still obeys"
+    other.close()
+
+
+def test_a_number_typed_digit_by_digit_arrives_and_one_that_cannot_be_is_said(page):
+    page.get_by_role("button", name="Reset").click()
+    check(page, "Measured steps")
+    type_into(page, "Step length, m", "0.8")
+    time.sleep(1.5)
+    assert shows(page, "Step length, m", 0.8)
+    type_into(page, "Speed, m/s", "-5")
+    page.get_by_text("A speed of -5 m/s was raised to 0: it can be 0 to ").wait_for(timeout=5_000)
+    assert shows(page, "Speed, m/s", 0.0)
+    page.get_by_role("button", name="Reset").click()
+
+
 @pytest.mark.slow
 def test_two_browsers_see_the_same_and_one_may_go_and_come_back(page, browser, live):
     other = browser.new_page(viewport=SIZE)
     other.goto(live.url)
-    other.get_by_text("late").wait_for(timeout=60_000)
+    other.get_by_text(COUNTED).wait_for(timeout=60_000)
     put(page, "Speed, m/s", 0.7)
     assert shows(other, "Speed, m/s", 0.7)
     other.close()
     again = browser.new_page(viewport=SIZE)
     again.goto(live.url)
-    again.get_by_text("late").wait_for(timeout=60_000)
+    again.get_by_text(COUNTED).wait_for(timeout=60_000)
     assert shows(again, "Speed, m/s", 0.7)
     again.close()
 
 
-def test_pause_holds_the_frames(page):
-    def shown() -> int:
-        return int(re.search(r"of (\d+) frames", page.inner_text("body")).group(1))
+def shown(page) -> int:
+    """Frames that were shown since the last reset, as the page says."""
+    return int(re.search(r"of (\d+) frames", page.inner_text("body")).group(1))
 
+
+def test_pause_holds_the_frames(page):
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Go on").wait_for()
     time.sleep(1)
-    before = shown()
+    before = shown(page)
     time.sleep(1)
-    assert shown() == before
+    assert shown(page) == before
     page.get_by_role("button", name="Go on").click()
     time.sleep(1.5)
-    assert shown() > before
+    assert shown(page) > before
 
 
 @pytest.mark.slow

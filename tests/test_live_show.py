@@ -2,65 +2,25 @@
 
 import math
 import socket
-import time
 
 import numpy as np
 import pytest
 import trimesh
 from helpers import run as run_command
 from helpers import walk
+from stage import Actor, delivered, run
 
 from mapctl import formats
 from mapctl.commands.live import Live
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
 from mapctl.steering import Command
-from mapctl.streaming import Delivered, LiveCharacter
+from mapctl.streaming import LiveCharacter
 from scenes.live import ground
 from scenes.live.gauges import Gauges
-from scenes.live.panel import Orders
+from scenes.live.orders import Orders
 from scenes.live.recording import Recording, as_file
 from scenes.live.show import Show
-
-
-def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> Delivered:
-    """Some frames of a walk, due now."""
-    motion = walk(90).slice(first, first + count)
-    joints = motion.joint_positions().numpy()
-    return Delivered(time.perf_counter(), first / 30, motion.root_position.numpy(), motion.local_quat_xyzw.numpy(),
-                     np.tile([1.0, 0.0], (count, 1)), joints, (0.0, 1.2), {"noise": 1.0, "travel": 0.5}, spare,
-                     0.05, 12)  # fmt: skip
-
-
-class Actor:
-    """A LiveCharacter that notes what it is told."""
-
-    skeleton = CANONICAL
-
-    def __init__(self):
-        self.heard: list[tuple] = []
-        self.frames = 0
-
-    def command(self, command):
-        self.heard.append(("command", command))
-
-    def walk(self, points, speed):
-        if len(points) < 2:
-            raise RequestError("a curve needs two points")
-        self.heard.append(("walk", points, speed))
-
-    def pause(self, paused):
-        self.heard.append(("pause", paused))
-
-    def reset(self):
-        self.heard.append(("reset",))
-
-    def poll(self):
-        self.frames += 3
-        return [delivered(self.frames - 3)] if self.frames < 80 else []
-
-    def close(self):
-        self.heard.append(("close",))
 
 
 @pytest.fixture
@@ -76,11 +36,6 @@ def show(actors):
     yield made
     made.close()
     assert all(actor.heard[-1] == ("close",) for actor in actors)
-
-
-def run(show, ticks: int = 20) -> None:
-    left = iter(range(ticks))
-    show.run(lambda: next(left, None) is None)
 
 
 def test_it_listens_on_this_machine_only(show):

@@ -1,6 +1,8 @@
 """A character in a process of its own: it moves, obeys, pauses, begins anew, and says why it cannot."""
 
 import functools
+import os
+import signal
 import time
 from itertools import pairwise
 
@@ -82,18 +84,87 @@ def test_reset_brings_it_back_to_where_it_stood(remote):
     np.testing.assert_allclose(first.root[0, ::2], [3.0, -1.0], atol=1e-5)
 
 
+def notes(remote, seconds=1.0):
+    return [note for piece in collected(remote, seconds) for note in piece.notes]
+
+
+def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
+    remote.reset()
+    remote.command(Command(99.0, 1e9, step_length=99.0))
+    said = notes(remote)
+    assert any("the speed of 99 m/s was lowered to 2.20 m/s" in note for note in said)
+    assert any("the step length of 99 m was lowered to 1.2 m" in note for note in said)
+    remote.command(Command(1.0, 0.0))
+    collected(remote, 2.5)
+    remote.command(Command(2.0, 0.0, told=("swim",)))
+    [note] = notes(remote)
+    assert "knows no" in note
+    assert np.hypot(*collected(remote, 0.5)[-1].wish) == pytest.approx(1.0, abs=0.05), "the order before it holds"
+
+
 def test_what_it_cannot_load_is_said():
     broken = Remote(RemoteRequest(functools.partial(priors.load, "nobody"), Command(1.0, 0.0)))
     with pytest.raises(RequestError, match="no prior 'nobody'"):
         broken.wait()
 
 
-def test_a_process_that_is_gone_is_said(load):
+def test_who_is_gone_is_said_after_all_that_came_until_then_and_comes_back_by_a_reset(load):
     lost = Remote(RemoteRequest(load, Command(1.0, 0.0)))
     lost.wait()
     assert lost.memory_mb() > 10
-    lost._process.terminate()
+    time.sleep(0.5)
+    lost._process.kill()
     lost._process.join()
+    time.sleep(0.2)
+    assert sum(len(piece.root) for piece in lost.poll()) >= 6
     with pytest.raises(MapctlError, match="ended by itself"):
-        collected(lost, 1.0)
+        lost.poll()
+    lost.reset()
+    lost.wait()
+    assert len(collected(lost, 0.5)) > 2
     lost.close()
+
+
+class Trap:
+    """A prior that ends all steps after the first few."""
+
+    def __init__(self, load):
+        self.prior, self.left = load(), 150
+
+    def __getattr__(self, name):
+        return getattr(self.prior, name)
+
+    def rollout(self, *given, **named):
+        self.left -= 1
+        return self.prior.rollout(*given, **named) if self.left else 1 / 0
+
+
+def trapped(load):
+    return Trap(load)
+
+
+def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
+    broken = Remote(RemoteRequest(functools.partial(trapped, load), Command(1.0, 0.0)))
+    broken.wait()
+    with pytest.raises(MapctlError, match=r"^a character's process ended: ZeroDivisionError: .*\(rollout, line \d+\)$"):
+        collected(broken, 5.0)
+    broken.close()
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
+    made = Remote(RemoteRequest(load, Command(1.0, 0.0)))
+    for _ in range(20):  # while it imports
+        os.kill(made._process.pid, signal.SIGINT)
+        time.sleep(0.05)
+    made.wait()
+    os.kill(made._process.pid, signal.SIGINT)
+    assert len(collected(made, 0.5)) > 2
+    os.kill(made._process.pid, signal.SIGSTOP)
+    began = time.perf_counter()
+    for number in range(5000):
+        made.command(Command(1.0, number / 5000, told=("x" * 100,)))
+    assert time.perf_counter() - began < 2.0
+    made.close()
+    assert time.perf_counter() - began < 6.0
+    assert "Traceback" not in "".join(capfd.readouterr())

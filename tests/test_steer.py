@@ -19,7 +19,7 @@ from mapctl.errors import RequestError
 from mapctl.steering import Command, CommandTrack
 
 DENSITY = tiny_density()
-QUICK = SteerSettings(horizon=8, commit=3, evaluations=4)
+QUICK = SteerSettings(horizon=8, commit=3, evaluations=4, least_evaluations=2)
 AHEAD = Command(1.2, 0.0)
 
 
@@ -78,13 +78,21 @@ def test_the_state_does_not_grow():
     assert size(early) == size(late)
 
 
-def test_without_time_it_still_delivers_and_says_so():
-    state, _ = begun()
+@pytest.mark.parametrize(("least", "made"), [(0, 0), (2, 2), (9, 4)])
+def test_without_time_it_still_delivers_searches_the_least_and_says_so(least, made):
+    state, _ = begun(settings=replace(QUICK, least_evaluations=least))
     _, piece = steer.step(state, AHEAD, seconds=0.0)
     assert piece.motion.num_frames == 3
-    assert piece.evaluations == 0
-    assert piece.note == "the deadline came after 0 of 4 evaluations"
+    assert piece.evaluations == made
+    assert piece.note == (f"the deadline came after {made} of 4 evaluations" if made < 4 else "")
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
+
+
+def test_who_is_stuck_without_time_gets_the_draws_and_half_of_the_least_twice():
+    state, _ = steered(8)
+    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, draws=5))
+    _, piece = steer.step(stuck, AHEAD, seconds=0.0)
+    assert piece.evaluations == 5 + 1 + 1
 
 
 def test_who_is_stuck_is_searched_without_footing_first():
@@ -116,7 +124,7 @@ def test_a_command_tells_the_prior_for_as_long_as_it_holds(tmp_path):
         steer.step(state, replace(AHEAD, told=("swim",)))
 
 
-@pytest.mark.parametrize("wrong", [{"commit": 0}, {"commit": 8}, {"evaluations": 0}])
+@pytest.mark.parametrize("wrong", [{"commit": 0}, {"commit": 8}, {"evaluations": 0}, {"least_evaluations": -1}])
 def test_settings_that_cannot_be_are_refused(wrong):
     with pytest.raises(RequestError, match="1 <= commit < horizon"):
         replace(QUICK, **wrong)
@@ -172,6 +180,58 @@ def test_what_comes_too_late_is_counted_and_the_search_is_given_up():
     cost = timing(records)
     assert cost["late_frames"] == 6
     assert cost["steps_cut_short"] == 2
+    assert cost["evaluations_per_frame"] == pytest.approx(2 / 3)
+
+
+class Labouring(StreamClock):
+    """Real time in which every step takes so many seconds, and all else none."""
+
+    real = True
+
+    def __init__(self, seconds):
+        super().__init__()
+        self.seconds, self.held, self._asked = seconds, 0.0, False
+
+    def now(self):
+        return self._now
+
+    def wait_until(self, seconds):
+        super().wait_until(seconds)
+        self._asked = True
+
+    def hold(self, seconds):
+        self.held += seconds
+        self._now -= seconds
+
+    def at(self, seconds):
+        self._now += self.seconds
+        return AHEAD
+
+
+@pytest.mark.parametrize(("seconds", "rate"), [(0.08, 1.0), (0.13, 0.1 / 0.13), (0.5, 0.1 / 0.5)])
+def test_time_stretches_where_steps_take_longer_than_their_frames_last_and_no_frame_is_lost(seconds, rate):
+    clock, shown = Labouring(seconds), Recorder()
+    _, records = drive(begun()[0], clock, [shown], frames=120, clock=clock)
+    assert shown.motion().num_frames == 120
+    streamed = records[-1].due - records[0].due
+    assert streamed / (streamed + timing(records)["held_s"]) == pytest.approx(rate, abs=0.03)
+    assert max(record.delivered - record.due for record in records[3:]) <= 0.1 + seconds, "the lag does not grow"
+    asked = [record.asked - record.due for record in records]
+    assert min(asked) >= -0.1 - 1e-9
+
+
+def test_a_hiccup_is_made_up_for_and_time_goes_on():
+    clock = Labouring(0.04)
+
+    class Source:
+        def at(self, seconds):
+            clock.seconds = 0.14 if 1.0 < seconds < 1.1 else 0.04
+            return clock.at(seconds)
+
+    _, records = drive(begun()[0], Source(), [], frames=90, clock=clock)
+    assert clock.held == 0.0
+    assert sum(record.late_frames > 0 for record in records) == 1
+    assert records[-1].asked == pytest.approx(records[-1].due - 0.1)
 
 
 def test_against_the_wall_clock_it_takes_as_long_as_it_shows():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mapctl.command_files import read_commands
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.steering import Command, CommandTrack, Limits, Wish
+from mapctl.steering import STEP_LENGTHS, Command, CommandTrack, Limits, Wish
 
 ANGLES = st.floats(-20, 20)
 SPEEDS = st.floats(0, 5)
@@ -55,6 +55,26 @@ def test_speeds_beyond_the_priors_are_lowered_and_said():
     track, said = CommandTrack((0.0, 1.0), (Command(50, 0), Command(1, 0))).clamped(3.0)
     assert [command.speed for command in track.commands] == [3.0, 1.0]
     assert said == ["the speed of 50 m/s at 0 s was lowered to 3.00 m/s, the prior's fastest"]
+
+
+def test_steps_that_nobody_takes_are_brought_near_and_said():
+    held, said = Command(1.0, 0, step_length=99.0).within(3.0)
+    assert held == Command(1.0, 0, step_length=STEP_LENGTHS[1])
+    assert said == ["the step length of 99 m was lowered to 1.2 m; steps can be 0.3 to 1.2 m long"]
+    held, said = Command(9.0, 0, step_length=0.01).within(3.0, when=" at 2 s")
+    assert (held.speed, held.step_length) == (3.0, STEP_LENGTHS[0])
+    assert [sentence[:36] for sentence in said] == [
+        "the speed of 9 m/s at 2 s was lowere",
+        "the step length of 0.01 m at 2 s was",
+    ]
+
+
+def test_angles_of_many_turns_are_the_same_direction_and_others_stay_to_the_bit():
+    held, said = Command(1.0, 1e9, 7.0).within(3.0)
+    assert said == []
+    assert math.cos(held.heading) == pytest.approx(math.cos(1e9), abs=1e-6)
+    assert held.facing == pytest.approx(7.0 - 2 * math.pi)
+    assert Command(1.0, 5.9, -6.1).within(3.0)[0] == Command(1.0, 5.9, -6.1)
 
 
 @pytest.mark.parametrize(("wrong", "message"), [

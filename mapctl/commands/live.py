@@ -4,6 +4,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
@@ -11,9 +12,11 @@ from tyro.conf import arg
 from mapctl.commands import options
 from mapctl.commands.threads import compute_on_one
 from mapctl.errors import RequestError
+from mapctl.processes import insist_on_ctrl_c
 
 if TYPE_CHECKING:
     from controllers.remote import Remote
+    from scenes.live.show import Show
 
 _MOST = 16
 _APART = 1.5  # metres between characters where they begin
@@ -36,19 +39,8 @@ class Live:
         """Check, open, serve until Ctrl-C."""
         compute_on_one()
         self._check()
-        import priors
-        from scenes.live.panel import Orders
-        from scenes.live.show import Show
-
-        prior = priors.load(self.prior)
-        orders = [Orders() for _ in range(self.characters)]
-        characters = self._characters()
-        try:
-            show = Show(characters, orders, port=self.port, fastest=prior.abilities.fastest_asked, labels=prior.labels)
-        except BaseException:
-            for character in characters:
-                character.close()
-            raise
+        with insist_on_ctrl_c():
+            show = self._opened()
         try:
             if not show.url.endswith(f":{self.port}"):
                 print(f"port {self.port} is in use")
@@ -56,9 +48,27 @@ class Live:
             show.run()
         except KeyboardInterrupt:
             print()
+            for path in show.keep_recordings(Path.cwd()):
+                print(f"the recording that was going on is in {path.name}")
         finally:
             show.close()
         return 0
+
+    def _opened(self) -> "Show":
+        import priors
+        from scenes.live.orders import Orders
+        from scenes.live.show import Show
+
+        prior = priors.load(self.prior)
+        orders = [Orders() for _ in range(self.characters)]
+        with insist_on_ctrl_c():
+            characters = self._characters()
+        try:
+            return Show(characters, orders, port=self.port, fastest=prior.abilities.fastest_asked, labels=prior.labels)
+        except BaseException:
+            for character in characters:
+                character.close()
+            raise
 
     def _check(self) -> None:
         options.check_seed(self.seed)
@@ -77,9 +87,10 @@ class Live:
 
         load = functools.partial(priors.load, self.prior)
         places = [(_APART * (number - (self.characters - 1) / 2), 0.0) for number in range(self.characters)]
-        found = [Remote(RemoteRequest(load, Command(1.2, 0.0), self.seed + number, at))
-                 for number, at in enumerate(places)]  # fmt: skip
+        found: list[Remote] = []
         try:
+            for number, at in enumerate(places):
+                found.append(Remote(RemoteRequest(load, Command(1.2, 0.0), self.seed + number, at)))
             for character in found:
                 character.wait()
         except BaseException:

@@ -35,7 +35,8 @@ class Steer:
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
-    """Play against the wall clock: every step has a deadline and brings the best found by then."""
+    """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
+    cannot keep up the script's time goes slower than the clock's, and the summary says so."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     rig: rigged.OutRig = "canonical"
@@ -171,10 +172,11 @@ def _summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
         lines.append(f"{row['time_s']:6.1f} s  {asked}: {reached}{steady}{turned}")
     cost, latency = report["timing"], report["timing"]["command_latency_s"]
     waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
+    slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""
     return [
         *lines,
         f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
-        f"{cost['late_frames']} late, {cost['evaluations_per_frame']:.1f} evaluations a frame{waited}",
+        f"{cost['late_frames']} late, {cost['evaluations_per_frame']:.1f} evaluations a frame{waited}{slow}",
         f"status    {report['status']['text']}",
         f"wrote     {', '.join(map(str, files))}",
     ]

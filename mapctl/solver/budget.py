@@ -16,9 +16,11 @@ class Budget:
     """Evaluations of the energy, with or without gradient; a batch counts every candidate in it."""
     seconds: float | None = None
     """Wall clock from the making of the meter, seconds."""
+    least: int = 0
+    """Evaluations that are allowed however late it is; of those that `evaluations` allows."""
 
     def __post_init__(self):
-        for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds)):
+        for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds), ("least", self.least)):
             if limit is not None and (math.isnan(limit) or limit < 0):
                 raise RequestError(f"a budget's {name} must be 0 or more (or None for no limit), got {limit}")
 
@@ -45,11 +47,13 @@ class Meter:
 
     @property
     def remaining(self) -> float:
-        """Evaluations that may still be made: a whole number, 0 after the deadline, or infinity."""
-        if self._late():
-            return 0
-        limit = self.budget.evaluations
-        return math.inf if limit is None else limit - self.evaluations
+        """Evaluations that may still be made: a whole number, at most what is left of `least` after the deadline, or
+        infinity.
+        """
+        limit = math.inf if self.budget.evaluations is None else self.budget.evaluations
+        if self._past_deadline():
+            limit = min(limit, self.budget.least)
+        return max(0, limit - self.evaluations)
 
     @property
     def exhausted(self) -> bool:
@@ -69,6 +73,9 @@ class Meter:
         return self._clock() - self._began
 
     def _late(self) -> bool:
+        return self._past_deadline() and self.evaluations >= self.budget.least
+
+    def _past_deadline(self) -> bool:
         return self.budget.seconds is not None and self.seconds >= self.budget.seconds
 
     def _affords(self, count: int) -> bool:

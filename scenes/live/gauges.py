@@ -41,7 +41,7 @@ class Gauges:
         """One more step."""
         count = len(delivered.root)
         self.frames += count
-        self.late += sum(delivered.spare + k / fps < 0 for k in range(count))
+        self.late += delivered.late_frames
         self._places.extend(delivered.root[:, ::2])
         self._last = delivered
         way = self._places[-1] - self._places[0]

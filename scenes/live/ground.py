@@ -1,6 +1,8 @@
 """What lies on the ground of the live viewer: grid, drawn path, planted feet, and the forecast of the next second."""
 
 from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import viser
@@ -13,7 +15,9 @@ from mapctl.skeleton import Skeleton
 
 _PATH_HEIGHT, _MARK_HEIGHT = 0.012, 0.008  # metres over the ground, so that neither flickers
 _FIGURES = (0.5, 1.0)  # shares of the forecast at which it is shown as a stick figure
-_SPACING = 0.05  # metres between the points of a path as it is shown
+_SPACING = 0.05  # metres between the points of a path as it is shown, or more where it is long
+_FAR = 1e5  # metres from the origin beyond which nobody looks
+_MOST_SHOWN, _MOST_DRAWN = 1500, 200  # points of a path as it is shown, and as it is drawn
 
 
 def add_grid(scene: viser.SceneApi, name: str) -> None:
@@ -64,7 +68,9 @@ class DrawnPath:
         self._shown: list[viser.SceneNodeHandle] = []
 
     def add(self, x: float, z: float) -> None:
-        """One more point, metres."""
+        """One more point, metres. RequestError where there are very many."""
+        if len(self.points) >= _MOST_DRAWN:
+            raise RequestError(f"a drawn path has at most {_MOST_DRAWN} points")
         self.points.append((x, z))
         self._show()
 
@@ -86,6 +92,15 @@ class DrawnPath:
                                                              thickness=0.025))  # fmt: skip
 
 
+def as_ray(origin: Any, direction: Any) -> Array:
+    """(2, 3) of what a browser says; RequestError where that is no ray near the stage."""
+    with suppress(TypeError, ValueError):
+        ray = np.array([origin, direction], dtype=np.float64)
+        if ray.shape == (2, 3) and np.isfinite(ray).all() and np.abs(ray).max() <= _FAR:
+            return ray
+    raise RequestError("a click that is nowhere")
+
+
 def on_the_ground(origin: Array, direction: Array) -> tuple[float, float] | None:
     """x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m."""
     if direction[1] > -1e-3:
@@ -99,7 +114,7 @@ def _smooth(points: Sequence[tuple[float, float]]) -> Array | None:
         curve = curves.through(np.array(points, dtype=np.float64).reshape(-1, 2))
     except RequestError:
         return None  # one point, or all in one place: no curve yet
-    arcs = np.linspace(0, curve.length, max(2, round(curve.length / _SPACING)))
+    arcs = np.linspace(0, curve.length, min(_MOST_SHOWN, max(2, round(curve.length / _SPACING))))
     places = np.array([curve.point(float(arc)).tolist() for arc in arcs])
     return np.insert(places, 1, _PATH_HEIGHT, axis=1)
 

@@ -1,7 +1,8 @@
 """What was shown, kept as a motion and given out as a file."""
 
-import multiprocessing
+import itertools
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from mapctl import formats
 from mapctl.errors import MapctlError, RequestError
 from mapctl.motion import Motion
+from mapctl.processes import spawn
 from mapctl.rotations import sign_continuous
 from mapctl.skeleton import Skeleton
 from mapctl.streaming import Delivered
@@ -37,6 +39,43 @@ class Recording:
         return Motion(self.skeleton, self.pieces[0].fps, root, quats)
 
 
+@dataclass(frozen=True)
+class Made:
+    """A recording as a file."""
+
+    ending: str
+    """Of FORMATS."""
+    content: bytes
+    """All of it."""
+    why: str = ""
+    """Why it is not of the ending that was asked for, if so."""
+
+    @property
+    def name(self) -> str:
+        """That it is given out under."""
+        return f"mapctl.{self.ending}"
+
+
+def as_some_file(motion: Motion, ending: str) -> Made:
+    """The content of a file of that ending, or of a BVH where none can be made, so that no recording is lost."""
+    try:
+        return Made(ending, as_file(motion, ending))
+    except Exception as error:
+        if ending == FORMATS[0]:
+            raise
+        return Made(FORMATS[0], as_file(motion, FORMATS[0]), str(error))
+
+
+def keep(made: Made, folder: Path) -> Path:
+    """Write it into a folder, under a name that nobody has: mapctl.bvh, mapctl-2.bvh, ..."""
+    for number in itertools.count(1):
+        path = folder / (made.name if number == 1 else f"mapctl-{number}.{made.ending}")
+        with suppress(FileExistsError), path.open("xb") as file:
+            file.write(made.content)
+            return path
+    raise AssertionError  # there is always another number
+
+
 def as_file(motion: Motion, ending: str) -> bytes:
     """The content of a file of one of FORMATS. A film is drawn in a process of its own, which takes a while."""
     with tempfile.TemporaryDirectory() as folder:
@@ -46,8 +85,7 @@ def as_file(motion: Motion, ending: str) -> bytes:
             return path.read_bytes()
         kept = Path(folder) / "motion.npz"
         formats.save(motion, kept)
-        painter = multiprocessing.get_context("spawn").Process(target=_film, args=(kept, path))
-        painter.start()
+        painter = spawn(_film, kept, path)
         painter.join()
         if not path.is_file():
             raise MapctlError("the film could not be drawn; `mapctl render` on a recorded BVH says why")

@@ -1,0 +1,72 @@
+"""Processes beside this one, and Ctrl-C, which comes to all of them."""
+
+import multiprocessing
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.context import SpawnProcess
+from types import FrameType
+from typing import Any
+
+
+def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
+    """A new process that runs `target`, and ends when this one does. Ctrl-C is for the one who started it, not for it.
+
+    A terminal sends Ctrl-C to all of its processes. One that is still importing would say so with a traceback, long
+    before `target` could look away; so it is born with the signal blocked, which no import undoes.
+    """
+    process = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
+    with _ctrl_c_waits():
+        process.start()
+    return process
+
+
+@contextmanager
+def insist_on_ctrl_c() -> Iterator[None]:
+    """A Ctrl-C that somebody in here swallows is raised at the end.
+
+    Some packages catch everything while they are imported, and Python itself while it collects garbage.
+    """
+    handler, heard = signal.getsignal(signal.SIGINT), list[int]()
+    if not callable(handler) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+        handler(number, frame)
+
+    signal.signal(signal.SIGINT, hear)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    if heard:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _ctrl_c_waits() -> Iterator[None]:
+    """A Ctrl-C that comes now is heard at the end; whoever is started now never hears of one.
+
+    The signal's mask is inherited by who is started. It does not keep Python from interrupting the main thread where
+    another thread gets the signal, which would leave somebody half started, so the handler waits too.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # starting this helper of multiprocessing's would end the blocking
+    heard, handler, is_main = [], signal.getsignal(signal.SIGINT), threading.current_thread() is threading.main_thread()
+    if is_main:
+        signal.signal(signal.SIGINT, lambda *_: heard.append(True))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+        if heard:
+            signal.raise_signal(signal.SIGINT)

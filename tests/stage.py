@@ -1,0 +1,55 @@
+"""A stage without a browser: characters that note what they are told, and the loop for a while."""
+
+import time
+
+import numpy as np
+from helpers import walk
+
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL
+from mapctl.streaming import Delivered
+
+
+def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> Delivered:
+    """Some frames of a walk, due now."""
+    motion = walk(90).slice(first, first + count)
+    joints = motion.joint_positions().numpy()
+    return Delivered(time.perf_counter(), first / 30, motion.root_position.numpy(), motion.local_quat_xyzw.numpy(),
+                     np.tile([1.0, 0.0], (count, 1)), joints, (0.0, 1.2), {"noise": 1.0, "travel": 0.5}, spare,
+                     0.05, 12)  # fmt: skip
+
+
+class Actor:
+    """A LiveCharacter that notes what it is told."""
+
+    skeleton = CANONICAL
+
+    def __init__(self):
+        self.heard: list[tuple] = []
+        self.frames = 0
+
+    def command(self, command):
+        self.heard.append(("command", command))
+
+    def walk(self, points, speed):
+        if len(points) < 2:
+            raise RequestError("a curve needs two points")
+        self.heard.append(("walk", points, speed))
+
+    def pause(self, paused):
+        self.heard.append(("pause", paused))
+
+    def reset(self):
+        self.heard.append(("reset",))
+
+    def poll(self):
+        self.frames += 3
+        return [delivered((self.frames - 3) % 75)]
+
+    def close(self):
+        self.heard.append(("close",))
+
+
+def run(show, ticks: int = 20) -> None:
+    left = iter(range(ticks))
+    show.run(lambda: next(left, None) is None)
