@@ -47,7 +47,7 @@ class ChoiceSettings:
     """Known frames on both sides of a gap from which on the infiller knows how somebody moves."""
     known: int = 60
     """Frames of the longest gap between such that it fills unasked: the mean length that it was trained on."""
-    good: float = 0.15
+    good: float = 0.2
     """Cost, m/s, of an answer with which nobody else is asked."""
     tempos: tuple[float, ...] = (1.0, 0.94, 1.06)
     """Of rollouts, in this order: how long they are before they are brought to the gap's length. Steps then end
@@ -65,7 +65,7 @@ class ChoiceSettings:
     step: float = 0.13
     """Metres that hands and feet go in a frame, seen from the hips, from which on it counts."""
     rolling: RolloutSettings = field(default_factory=lambda: RolloutSettings(
-        temperature=0.0, longest=300, method=LatentMethod(
+        temperature=0.0, longest=300, trajectory=0.2, stage=45, method=LatentMethod(
             rounds=2, proposal=zero_start, lbfgs=LbfgsSettings(max_iterations=16),
             budget=Budget(evaluations=48))))  # fmt: skip
     """Rollouts: the likeliest ones, without a swarm before L-BFGS, which did not lower the cost here."""

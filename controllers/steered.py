@@ -56,6 +56,11 @@ class RolloutSettings:
     """Planted feet."""
     shortest: int = 2
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
+    trajectory: float | None = None
+    """Distance of the hips from the proposal's trajectory, metres, as a sigma; None leaves them where they go."""
+    stage: int = 0
+    """Frames after which a longer rollout is solved first, then after twice as many, and so on, each from where the one
+    before it ended: from nothing, what is far ahead hardly turns a body. 0 solves all at once."""
     tempo: float = 1.0
     """How much longer than the gap a rollout is before its time is brought to the gap's: below 1, it is slowed down.
     A step that would end too early or too late ends in time."""
@@ -152,8 +157,14 @@ class Roller:
         self.state, self.done = state, start
         arrival = self._arrival(start, stop, settings)
         context = Context(self.density, self.state, place, _past(self.body, start), len(arrival.places))
-        terms = (Noise(settings.sigma_noise), settings.footing, arrival)
-        window = settings.method(context, terms, _drawn(context.frames, generator, settings), generator)
+        wishes = [arrival]
+        if settings.trajectory is not None:
+            wishes.append(self._trajectory(start, stop, context.frames, settings))
+        noise = _drawn(context.frames, generator, settings)
+        for frames in range(settings.stage, context.frames, settings.stage) if settings.stage else ():
+            window = _solved(replace(context, frames=frames), wishes, noise[:frames], generator, settings)
+            noise = torch.cat([window.carry, noise[frames:]])
+        window = _solved(context, wishes, noise, generator, settings)
         body, odds, missed = _put_in(self.body, self.odds, window, place, start, stop, settings.tempo)
         return Rollout(start, self._planted(body, odds), odds, missed)
 
@@ -166,6 +177,17 @@ class Roller:
         stands = contacts.steadied(odds > 0)
         lost = self.gap.turns.all(dim=1) & self.gap.root
         return hold_planted(body, stands, free=lost, rest_height=rest_height(body, stands))
+
+    def _trajectory(self, start: int, stop: int, frames: int, settings: RolloutSettings) -> Keyframe:
+        """Where the proposal has the hips in the gap, in the rollout's own time."""
+        count = stop - start
+        own = max(1, round(count * settings.tempo))
+        at = (torch.arange(own) + 1) * (count + 1) / (own + 1) - 1
+        hips = self.body.root_position[start : start + count][at.round().long().clamp(0, count - 1)]
+        goals = torch.zeros(frames, CANONICAL.num_joints, 3)
+        asked = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
+        goals[:own, 0], asked[:own, 0] = hips.float(), True
+        return Keyframe(goals, asked, settings.trajectory or 1.0, name="trajectory")
 
     def _arrival(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
         """Where a rollout is to be in the known frames after its gap, and at places wanted on the way, in its own
@@ -247,6 +269,15 @@ def _until(body: Motion, odds: Tensor, start: int) -> tuple[Float[Tensor, "frame
 def _past(body: Motion, start: int) -> Float[Tensor, "past joints 3"]:
     first = max(0, start - _PAST)
     return body.slice(first, start).joint_positions().float()
+
+
+def _solved(
+    context: Context, wishes: Sequence[Keyframe], noise: Tensor, generator: torch.Generator, settings: RolloutSettings
+) -> SolvedWindow:
+    """The rollout of the context's frames that comes nearest to the wishes, from this noise on."""
+    part = slice(0, context.frames)
+    near = [replace(wish, places=wish.places[part], wanted=wish.wanted[part]) for wish in wishes]
+    return settings.method(context, (Noise(settings.sigma_noise), settings.footing, *near), noise, generator)
 
 
 def _drawn(frames: int, generator: torch.Generator, settings: RolloutSettings) -> Float[Tensor, "frames continuous"]:
