@@ -1,14 +1,15 @@
-"""Denoising as a live capture needs it: each frame is decided a stated delay after it came.
+"""Denoising as a live capture needs it: each frame is decided within a stated delay after it came.
 
 The last seconds are cleaned anew every few frames; of each pass the frames that are due are kept, and fade over from
 what the pass before had foreseen for them, so that two passes never meet with a jump.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from controllers.denoise import denoise
+from controllers.denoise import SHORTEST, denoise
 from controllers.denoise_piece import DenoiseSettings
 from controllers.denoised import Denoised, faded, joined
 from mapctl.capture.masks import Mask, after, part_of, written_back
@@ -27,15 +28,24 @@ class CausalSettings:
     """How a stream is cut; seconds."""
 
     delay: float = 0.2
-    """That a frame waits for those after it."""
+    """That a frame waits at most, until it is decided."""
     step: float = 0.1
-    """Between passes: a frame waits for up to this much more. Half of the delay at most."""
+    """Between passes: a pass sees at least the rest of the delay beyond the frames that it decides. Half of the delay
+    at most."""
     past: float = 2.5
     """That a pass looks back on."""
 
     def __post_init__(self):
         if not 1 / PRIOR_FPS <= self.delay <= _LONGEST_DELAY:
             raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_LONGEST_DELAY:g} s, got {self.delay:g}")
+
+    def waiting(self, fps: float) -> tuple[int, int]:
+        """How many frames a frame waits for at most, and how many fewer it has waited for that a pass decides last.
+
+        Whole frames within the delay: at 24 a second and 0.2 s four, which take 0.17 s.
+        """
+        most = math.floor(self.delay * fps + 1e-9)
+        return most, max(1, round(min(self.step, self.delay / 2) * fps))
 
 
 class CausalDenoiser:
@@ -57,21 +67,20 @@ class CausalDenoiser:
 
     @property
     def delay(self) -> float:
-        """Seconds between a frame and its clean one, at most, but for the compute."""
-        return self._causal.delay + min(self._causal.step, self._causal.delay / 2)
+        """Seconds between a frame and its clean one, at most, but for the compute; at any rate of frames."""
+        return self._causal.delay
 
     def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> Denoised | None:
         """The next frames of the capture; returns those that are due by now, None if none are. Masks count from the
         first frame of all.
         """
-        fps = float(frames.fps)
+        most, step = self._causal.waiting(float(frames.fps))
         self._masks = (*self._masks, *masks)
         self._past = frames if self._past is None else self._past.join(frames)
         come = self._first + self._past.num_frames
-        due = come - round(self._causal.delay * fps)
-        if due - self._given < max(1, round(min(self._causal.step, self._causal.delay / 2) * fps)):
+        if come - 1 - self._given < most:  # the oldest may wait for another frame
             return None
-        return self._pass(due)
+        return self._pass(come - max(0, most + 1 - step))
 
     def finish(self) -> Denoised | None:
         """The frames that still wait; the capture is over."""
@@ -86,7 +95,7 @@ class CausalDenoiser:
         if not self._told and self._past.seconds >= _TELLING:
             self._rig, self._told = done.rig, True
         start, count = self._given - self._first, due - self._given
-        given = done.slice(start, start + count)
+        given = replace(done.slice(start, start + count), notes=self._notes(done, due))
         if self._foreseen is not None:
             old, first = self._foreseen
             shared = min(count, first + old.num_frames - self._given)
@@ -100,6 +109,14 @@ class CausalDenoiser:
         self._foreseen, self._given = (done.motion, self._first), due
         self._forget()
         return given
+
+    def _notes(self, done: Denoised, due: int) -> tuple[str, ...]:
+        """Of the frames that a pass decides: what it says of its beginning, the first has said."""
+        assert self._past is not None
+        if self._past.num_frames < SHORTEST:
+            few = f"frames {self._given}:{due} were due before noise could be told from motion: they were not changed"
+            return (few,)
+        return done.notes if self._given == 0 else ()
 
     def _forget(self) -> None:
         """What lies further back than a pass looks."""
@@ -130,7 +147,7 @@ def denoise_causal(
             if progress is not None:
                 progress(given, motion.num_frames)
     whole = joined(pieces)
-    note = f"causal: a frame is decided {stream.delay:.2f} s after it came"
+    note = f"causal: a frame is decided at most {stream.delay:.2f} s after it came"
     return replace(whole, seconds=time.perf_counter() - began, notes=(note, *whole.notes))
 
 

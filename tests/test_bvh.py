@@ -337,3 +337,29 @@ def test_unknown_endings_name_the_known_ones(tmp_path):
         formats.load(tmp_path / "walk.fbx")
     with pytest.raises(RequestError, match=r"'\.fbx'; allowed: \.bvh, \.npz"):
         standing().save(tmp_path / "walk.fbx")
+
+
+def test_two_joints_of_one_name_are_read_the_second_by_a_name_of_its_own(tmp_path, capsys):
+    """As other tools do; names in mapctl are unique. A name that the file has already is not taken."""
+    path = tmp_path / "twice.bvh"
+    path.write_text(PLAIN.replace("JOINT leftFoot", "JOINT hips"))
+    motion = formats.load(path)
+    assert motion.skeleton.names == ("hips", "leftUpperLeg", "hips_2")
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "twice.bvh: names must be unique, so it reads the joint 'hips' of line 10 as 'hips_2'" in told
+    plain = tmp_path / "plain.bvh"
+    plain.write_text(PLAIN)
+    assert torch.equal(motion.joint_positions(), formats.load(plain).joint_positions())
+    formats.save(motion, tmp_path / "again.bvh")
+    capsys.readouterr()
+    again = formats.load(tmp_path / "again.bvh")
+    assert again.skeleton.names == motion.skeleton.names
+    torch.testing.assert_close(again.joint_positions(), motion.joint_positions())
+    assert capsys.readouterr().err == ""
+
+
+def test_a_name_that_is_in_the_file_is_given_to_no_other_joint(tmp_path):
+    path = tmp_path / "taken.bvh"
+    path.write_text(PLAIN.replace("JOINT leftFoot", "JOINT hips_2").replace("JOINT leftUpperLeg", "JOINT hips"))
+    assert formats.load(path).skeleton.names == ("hips", "hips_3", "hips_2")

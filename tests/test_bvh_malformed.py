@@ -83,7 +83,6 @@ BROKEN = {
     "brace too many": (swap("}\nMOTION", "}\n}\nMOTION"), 16, "outside of a joint"),
     "no opening brace": (swap("hips\n{", "hips\n"), 4, "expected '{', got 'OFFSET'"),
     "no name": (swap("ROOT hips", "ROOT"), 3, "joint's name"),
-    "same name twice": (swap("JOINT leg", "JOINT hips"), 6, "a second joint named 'hips'"),
     "no offset": (swap("    OFFSET 10 0 0\n", ""), 13, "joint 'leg' has no OFFSET"),
     "two offsets": (swap("OFFSET 10 0 0", "OFFSET 10 0 0 OFFSET 1 0 0"), 8, "a second OFFSET"),
     "short offset": (swap("OFFSET 10 0 0", "OFFSET 10 0"), 9, "the Z of OFFSET"),

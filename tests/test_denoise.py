@@ -159,7 +159,7 @@ def test_frames_in_which_everything_is_masked_are_filled_in(rig):
 def test_masks_that_do_not_fit_are_refused():
     motion = on_rig("daz", 40)
     with pytest.raises(RequestError, match="the nearest is lHand"):
-        cleaned(motion, masks=[Mask("lhand", 0, 3)])
+        cleaned(motion, masks=[Mask("lHnd", 0, 3)])
     for span in ((30, 60), (50, 60)):
         with pytest.raises(RequestError, match="the recording at 40"):
             cleaned(motion, masks=[Mask("lHand", *span)])

@@ -71,7 +71,7 @@ def test_a_plot_is_a_picture(denoise, recording, tmp_path):
 
 def test_causal_is_said(denoise, recording, tmp_path, capsys):
     assert denoise(recording, "-o", tmp_path / "out.bvh", "--causal", "--delay", 0.3) == 0
-    assert "causal: a frame is decided 0.40 s after it came" in capsys.readouterr().out
+    assert "causal: a frame is decided at most 0.30 s after it came" in capsys.readouterr().out
     assert mapctl.load(tmp_path / "out.bvh").num_frames == 40
 
 

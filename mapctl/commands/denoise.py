@@ -41,9 +41,9 @@ class Denoise:
     """Let the body go where its planted feet say, for captures in which it drifts against them. The way over the
     ground changes."""
     causal: bool = False
-    """As a live capture would be cleaned: a frame is decided `--delay` after it came."""
+    """As a live capture would be cleaned: a frame is decided at most `--delay` after it came."""
     delay: options.MaybeNumber = None
-    """Seconds that --causal may look ahead; 0.2 if not given."""
+    """Seconds within which --causal decides a frame, at any frame rate, but for the compute; 0.2 if not given."""
     denoiser: options.Name = "denoiser"
     """The bundled denoiser, or the file or run folder of a trained one."""
     prior: options.MaybeName = None

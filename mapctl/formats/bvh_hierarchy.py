@@ -10,7 +10,7 @@ from typing import NoReturn
 import numpy as np
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.reading import NUMBER, finite_number, shorten
+from mapctl.formats.reading import NUMBER, finite_number, shorten, tell
 
 MAX_JOINTS = 1000
 """Most joints that are read; a body with fingers, face and props has about 200."""
@@ -22,6 +22,7 @@ AXES = {"X": 0, "Y": 1, "Z": 2}
 
 _WORD = re.compile(r"\s*+([{}]|[^\s{}]++)")
 _NAME = re.compile(r"\s*+([^\n{}]*+)")
+_NAMED = re.compile(r"^[ \t]*(?:ROOT|JOINT)[ \t]+([^\n{}]+)", re.IGNORECASE | re.MULTILINE)
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 
 Offset = tuple[float, float, float]
@@ -91,7 +92,7 @@ class Hierarchy:
     """Joints in file order; every parent precedes its children. Lengths are in the file's unit."""
 
     names: tuple[str, ...]
-    """Joint names, unique."""
+    """Joint names, unique: of joints that share one in the file, all but the first have a number behind it."""
     parents: tuple[int, ...]
     """Index of each joint's parent; -1 for the root."""
     offsets: tuple[Offset, ...]
@@ -156,6 +157,7 @@ class _Reader:
         self.nodes: list[_Node] = []
         self.ends: dict[int, _Node] = {}
         self.open: list[_Node] = []
+        self.renamed: list[str] = []
         self.handlers: dict[str, Callable[[], None]] = {
             "ROOT": self._root, "JOINT": self._joint, "END": self._end,
             "OFFSET": self._offset, "CHANNELS": self._channels, "}": self._close,
@@ -173,6 +175,9 @@ class _Reader:
             self.scanner.fail(f"expected '}}' before MOTION: {self.open[-1]} is still open")
         if not self.nodes:
             self.scanner.fail("expected ROOT before MOTION")
+        if self.renamed:
+            more = f" and {len(self.renamed) - 3} more" if len(self.renamed) > 3 else ""
+            tell(f"{self.scanner.path}: names must be unique, so it reads {', '.join(self.renamed[:3])}{more}")
         return Hierarchy(
             names=tuple(self.joints), parents=tuple(node.parent for node in self.nodes),
             offsets=tuple(node.offset or _ORIGIN for node in self.nodes),
@@ -193,13 +198,20 @@ class _Reader:
 
     def _open_joint(self, *, parent: int) -> None:
         name = self.scanner.name()
-        if name in self.joints:
-            self.scanner.fail(f"a second joint named {shorten(name)}, names must be unique")
         if len(self.joints) == MAX_JOINTS:
             self.scanner.fail(f"more than {MAX_JOINTS} joints, which is the most allowed")
+        if name in self.joints:
+            name = self._own(name)
         self.joints[name] = len(self.joints)
         self.nodes.append(_Node(name, parent, self.scanner.line))
         self._open_brace(self.nodes[-1])
+
+    def _own(self, name: str) -> str:
+        """A name for a joint whose own is taken: `Bip01_2` for the second Bip01, one that no joint of the file has."""
+        taken = {line.strip() for line in _NAMED.findall(self.scanner.text)} | set(self.joints)
+        own = next(own for number in count(2) if (own := f"{name}_{number}") not in taken)
+        self.renamed.append(f"the joint {shorten(name)} of line {self.scanner.line} as {own!r}")
+        return own
 
     def _end(self) -> None:
         node = self._current("End Site")

@@ -2,6 +2,8 @@
 
 import csv
 import io
+import sys
+from functools import lru_cache
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -41,6 +43,12 @@ def read_bytes(path: str | PathLike[str]) -> bytes:
 def shorten(word: str, limit: int = 40) -> str:
     """A quoted, printable, bounded form of a piece of a file, for error messages."""
     return ascii(word if len(word) <= limit else word[: limit - 3] + "...")
+
+
+@lru_cache(maxsize=256)
+def tell(message: str) -> None:
+    """One line on standard error of what was read otherwise than it stands in a file; said once."""
+    print(f"mapctl: {message}", file=sys.stderr)
 
 
 def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, str]:

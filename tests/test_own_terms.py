@@ -1,0 +1,77 @@
+"""A term of the user's own that is wrong is named, with what is wrong of it."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from test_terms_contract import trial
+
+from mapctl.errors import RequestError
+from mapctl.solver.objective import Objective
+from mapctl.terms import Noise
+from mapctl.trial import Trial
+
+
+@dataclass(frozen=True)
+class Own:
+    """Gives what it is told to, of the noise."""
+
+    energy: object
+    off: object = staticmethod(lambda noise: noise.sum(-1))
+    name: str = "own"
+    unit: str = "m"
+
+    def __call__(self, trial):
+        return self.energy(trial.noise)
+
+    def residual(self, trial):
+        return self.off(trial.noise)
+
+
+BASE = trial(2)
+
+
+def objective(term):
+    def build(unknowns):
+        noise = unknowns.unflatten(-1, BASE.noise.shape[1:])
+        return Trial(BASE.features, BASE.start, noise, BASE.log_density, BASE.contacts, BASE.before)
+
+    return Objective(build, (Noise(), term))
+
+
+START = torch.zeros_like(BASE.noise).flatten(1)
+SHAPES = {
+    "frames lost": (lambda noise: noise.square().sum((-1, -2)), r"shape \[2\]"),
+    "candidates lost": (lambda noise: noise.square().sum(-1)[0], r"shape \[12\]"),
+    "one more": (lambda noise: noise.square(), r"shape \[2, 12, "),
+    "no tensor": (lambda noise: 1.0, "a float"),
+}
+NONE = {
+    "energy": lambda noise: torch.log(noise.sum(-1) - 1e9),
+    "gradient": lambda noise: torch.sqrt(noise.square().sum(-1)),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_wrong_shape_is_named_with_the_one_expected(name):
+    wrong, told = SHAPES[name]
+    with pytest.raises(RequestError, match=f"the term 'own' gave an energy of .*{told}.*expected.*\\[2, 12\\]"):
+        objective(Own(wrong)).energy_and_gradient(START)
+    right = Own(lambda noise: noise.square().sum(-1), wrong)
+    with pytest.raises(RequestError, match=f"the term 'own' gave a residual of .*{told}"):
+        objective(right).ledger_of(BASE)
+
+
+@pytest.mark.parametrize("what", NONE)
+def test_what_is_not_finite_is_named(what):
+    with pytest.raises(RequestError, match=f"the term 'own' gave an? {what} that is not finite"):
+        objective(Own(NONE[what])).energy_and_gradient(START)
+    right = Own(lambda noise: noise.square().sum(-1), NONE["energy"])
+    with pytest.raises(RequestError, match="the term 'own' gave a residual that is not finite"):
+        objective(right).ledger_of(BASE)
+
+
+def test_a_motion_that_is_not_finite_is_no_terms_fault():
+    """A search may step far beyond what is a motion; that is the solver's to mend."""
+    energy, _ = objective(Own(lambda noise: noise.square().sum(-1))).energy_and_gradient(START * 0 + torch.inf)
+    assert not bool(torch.isfinite(energy).all())

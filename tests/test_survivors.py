@@ -1,0 +1,132 @@
+"""Mutations that had survived: what each piece of code says to the letter, so that a changed letter is seen."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator
+from test_steer import AHEAD, QUICK, begun
+from test_terms_contract import trial
+from test_window import BEGUN, METHOD, SHORT, context, solver, terms_of
+
+from controllers import loop, steer
+from controllers.loop import LoopSettings
+from mapctl.solver.methods import LatentMethod
+from mapctl.steering import Command, Limits, Wish
+from mapctl.terms import Footing
+
+
+@pytest.mark.parametrize("planted", [True, False])
+def test_a_toe_below_the_ground_costs_whether_it_is_planted_or_not(planted):
+    one = trial(1, disturbed=0.0)
+    one = replace(one, contacts=torch.full_like(one.contacts, planted))
+    toes = [one.skeleton.index(name) for name in ("leftToes", "rightToes")]
+    lowest = float(one.joints_world[..., toes, 1].amin())
+    free = Footing(rest_height=lowest, sigma_speed=1e6, sigma_height=1e6)
+    sunk = replace(free, rest_height=lowest + 0.2)
+    below = (one.joints_world[..., toes, 1] - sunk.rest_height).clamp(max=0)
+    assert float(free(one).sum()) == pytest.approx(0, abs=1e-6)
+    torch.testing.assert_close(sunk(one), 0.5 * (below / 0.005).square().sum(-1), rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [21, 20])
+def test_each_window_is_given_what_the_last_found_for_the_same_frames(frames):
+    given, found = [], []
+
+    def method(context, terms, tail, generator, *, seconds=math.inf):
+        solved = METHOD(context, terms, tail, generator, seconds=seconds)
+        given.append(tail)
+        found.append(solved.carry)
+        return solved
+
+    done, _ = solver(method).solve(BEGUN, terms_of, frames, generator=generator(0))
+    step = SHORT.frames - SHORT.overlap
+    for tail, carry in zip(given[1:], found, strict=False):
+        assert torch.equal(tail, carry[step:])
+    assert torch.equal(done.tail, found[-1][done.windows[-1].frames :])
+    assert len(given[1]) == SHORT.overlap
+
+
+def test_a_warm_start_begins_at_the_first_frame_of_the_window(monkeypatch):
+    started = []
+
+    def proposal(context, terms, warm, meter, generator):
+        started.append(warm.unflatten(-1, (SHORT.frames, -1))[0])
+        return warm
+
+    done, _ = solver(replace(METHOD, proposal=proposal)).solve(BEGUN, terms_of, 14, generator=generator(0))
+    assert len(done.windows) == 3
+    assert float(started[1][: SHORT.overlap].abs().max()) > 0
+    assert float(started[1][SHORT.overlap - 1].abs().max()) > 0
+    assert float(started[1][SHORT.overlap :].abs().max()) == 0
+
+
+def test_speed_falls_by_the_braking_limit_and_rises_by_the_acceleration():
+    limits = Limits(acceleration=3.0, braking=0.5)
+    assert Wish(2.0, 0, 0).toward(Command(0, 0), limits, 1.0).speed == pytest.approx(1.5)
+    assert Wish(0.0, 0, 0).toward(Command(9, 0), limits, 1.0).speed == pytest.approx(3.0)
+
+
+class Still:
+    """A real clock that stands where it was last waited for."""
+
+    real = True
+
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        return self.time
+
+    def wait_until(self, seconds):
+        self.time = max(self.time, seconds)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.03, 0.2])
+def test_a_search_ends_by_the_margin_before_its_frames_are_due(monkeypatch, margin):
+    allowed = []
+
+    def watched(state, command, *, seconds=None):
+        allowed.append(seconds)
+        return steer.step(state, command, seconds=None)
+
+    monkeypatch.setattr(loop, "step", watched)
+
+    class Source:
+        def at(self, seconds):
+            return AHEAD
+
+    loop.drive(begun()[0], Source(), [], frames=7, clock=Still(), settings=LoopSettings(margin=margin))
+    assert allowed == pytest.approx([max(0.0, QUICK.commit / 30 - margin)] * 2)
+
+
+def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypatch):
+    budgets = []
+    solve = LatentMethod.__call__
+
+    def watched(self, context, terms, tail, generator, *, seconds=math.inf):
+        budgets.append((self.budget.within(seconds).seconds, {term.name for term in terms}))
+        return solve(self, context, terms, tail, generator, seconds=math.inf)
+
+    monkeypatch.setattr(LatentMethod, "__call__", watched)
+    stuck = replace(begun()[0], settings=replace(QUICK, stuck=-1.0, draws=5))
+    steer.step(stuck, AHEAD, seconds=60.0)
+    (first, loose), (second, whole) = budgets
+    assert first == pytest.approx(30)
+    assert second == pytest.approx(30)
+    assert "footing" not in loose
+    assert "footing" in whole
+
+
+def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
+    given, solve = [], LatentMethod.__call__
+
+    def watched(self, context, terms, tail, generator, *, seconds=math.inf):
+        given.append(seconds)
+        return solve(self, context, terms, tail, generator)
+
+    monkeypatch.setattr(LatentMethod, "__call__", watched)
+    terms = terms_of(1, SHORT.frames)
+    steer._StepFirst(METHOD, METHOD, terms)(context(BEGUN), terms, BEGUN.tail, generator(), seconds=8.0)
+    assert given == [4.0, 4.0]
