@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from controllers.infill import infill
 from controllers.keys import Keys
@@ -15,9 +16,12 @@ from controllers.variations import best_of
 from mapctl import metrics
 from mapctl.capture.masks import ALL, Mask
 from mapctl.features import PRIOR_FPS
+from mapctl.gaps.targets import LIMBS
+from mapctl.metrics import worst
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
+from mapctl.terms.footing import TOES
 
 FRAMES = 6 * PRIOR_FPS
 """Of a clip that are looked at."""
@@ -31,20 +35,20 @@ def table(
     kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener, densities: Sequence[Any], *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:  # fmt: skip
-    """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens by the infiller, of a
+    """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens as they are by default, of a
     rolled variation and of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
     """
     rows, draws = [], torch.Generator().manual_seed(0)
     for number, (kind, clips) in enumerate(kinds.items()):
         shown = [clip.slice(0, FRAMES) for clip in clips if clip.num_frames >= FRAMES]
-        told: dict[str, list[Row]] = {"infiller": [], "rolled": [], f"best of {_BEST_OF}": []}
+        told: dict[str, list[Row]] = {"chosen": [], "rolled": [], f"best of {_BEST_OF}": []}
         for clip in shown:
             inner = (1 + torch.randperm(FRAMES - 2, generator=draws)[:_BETWEEN]).tolist()
             keys = Keys((0, *inner, FRAMES - 1))
             density = likeliest(densities, to_canonical(clip)[0])
             roll = partial(rolled, densities=[density], generator=draws)
             best = partial(best_of, count=_BEST_OF, rollable=densities, generator=draws)
-            ways = (tween, partial(tween, another=roll), best)
+            ways = (partial(tween, rollable=densities), partial(tween, another=roll), best)
             for method, way in zip(told, ways, strict=True):
                 began = time.perf_counter()
                 made = way(clip, keys, infiller).motion
@@ -68,9 +72,19 @@ def _of_keys(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) ->
     jerk, usual = (torch.diff(each, n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (places, truth))
     at_keys = max(float(jerk[max(0, key - 3) : key + 1].max()) for key in keys)
     away = (places - truth).norm(dim=-1)
+    ends, toes = ([made.skeleton.index(name) for name in names] for names in (LIMBS, TOES))
+    worst_ours, worst_mocap = (_worst(each.joint_positions(), ends, toes) for each in (made, clip))
     return {"key_mm": 1000 * float(away[list(keys)].max()), "error_cm": 100 * float(away.mean()),
-            "jerk_at_keys": at_keys / float(usual.quantile(0.95)), **_feet(made, clip),
+            "jerk_at_keys": at_keys / float(usual.quantile(0.95)), **_feet(made, clip), **worst_ours,
+            **{f"mocap_{name}": value for name, value in worst_mocap.items()},
             "ms_frame": 1000 * seconds / made.num_frames}  # fmt: skip
+
+
+def _worst(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
+    """Largest step (cm in a thirtieth of a second) and acceleration of hands and feet; longest time on no foot."""
+    peaks = worst.peaks(places[:, ends], places[:, 0], PRIOR_FPS)
+    return {"step_cm": 100 * peaks.step, "acceleration_m_s2": peaks.acceleration,
+            "unsupported_s": worst.longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS)}  # fmt: skip
 
 
 def _of_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence[Any]) -> Row:

@@ -22,6 +22,9 @@ _CORNER_SECONDS = 1.0
 _SPRINT = 10.0  # m/s of the hips
 _WHIP = 30.0  # rad/s of a joint
 _FLING = 25.0  # m/s of a hand or a foot: beyond what kicks and throws reach
+_JOLT = 130.0
+"""m/s^2 of a hand, seen from the hips: one frame in a thousand of mocap's (walks to fights) has more."""
+_JERKLESS = 5.77  # peak acceleration of the smoothest way there, over distance and time squared (Flash and Hogan 1985)
 
 
 def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
@@ -74,20 +77,29 @@ def between_keys(
         if float(rates[worst]) > _WHIP:
             notes.append(f"{motion.skeleton.names[worst]} needs {float(rates[worst]):.0f} rad/s between frames {start} "
                          f"and {stop}, which nobody turns")  # fmt: skip
-    return (*notes, *([] if targets is None else _limbs(motion, rigmap, lost, targets)))
+    return (*notes, *([] if targets is None else _limbs(motion, hips, rigmap, lost, targets)))
 
 
-def _limbs(motion: Motion, rigmap: RigMap, lost: Lost, targets: Targets) -> list[str]:
+def _limbs(
+    motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, lost: Lost, targets: Targets
+) -> list[str]:
     """Of hands and feet whose place is all that one of two neighbouring keys tells."""
     notes, whole, own = [], ~lost.frames, places_on_rig(motion, rigmap)
     for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
         wanted = targets.wanted[:, limb]
         places = torch.where(wanted[:, None], targets.places[:, limb], own[:, limb])
         for start, stop in pairwise((wanted | whole).nonzero()[:, 0].tolist()):
-            speed = float((places[stop] - places[start]).norm()) * float(motion.fps) / (stop - start)
-            if speed > _FLING and bool(wanted[start] | wanted[stop]):
-                name = motion.skeleton.names[rigmap.joint_of[limb] or 0]
+            if not bool(wanted[start] | wanted[stop]):
+                continue
+            way, seconds = places[stop] - places[start], (stop - start) / float(motion.fps)
+            speed, name = float(way.norm()) / seconds, motion.skeleton.names[rigmap.joint_of[limb] or 0]
+            own = float((way - (hips[stop] - hips[start])).norm())
+            jolt = _JERKLESS * own / seconds**2
+            if speed > _FLING:
                 notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, which nobody reaches")
+            elif jolt > _JOLT:
+                notes.append(f"{name} goes {100 * own:.0f} cm in {seconds:.2f} s between frames {start} and {stop}, which"
+                             f" takes {jolt:.0f} m/s^2; mocap's hardly ever reach {_JOLT:.0f}")  # fmt: skip
     return notes
 
 

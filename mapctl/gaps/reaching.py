@@ -75,10 +75,10 @@ def _frames_of(motion: Motion, frames: Tensor) -> Motion:
 def _offset_sigmas(
     turning: Bool[Tensor, "poses joints"], moving: Bool[Tensor, " poses"], stray: Float[Tensor, " poses"]
 ) -> Float[Tensor, "poses offsets"]:
-    """Of shift (x, z), lean (x, y, z) and the turns of `_TURNING`; next to nothing for what may not move."""
+    """Of shift (x, z), lean (x, y, z) and the turns of `_TURNING`; nothing for what may not move."""
     step, lean = stray[:, None].expand(-1, 2), stray.new_full((len(stray), 3), _SIGMA_LEAN)
     turn = _SIGMA_TURN * turning[:, _TURNING].to(stray).repeat_interleave(3, dim=1)
-    return torch.cat([torch.cat([step, lean], dim=1) * moving[:, None], turn], dim=1).clamp_min(1e-9)
+    return torch.cat([torch.cat([step, lean], dim=1) * moving[:, None], turn], dim=1)
 
 
 def _least_offsets(
@@ -186,6 +186,8 @@ def bend_limbs(
     lay = _world(before)
     for name, limb in LIMBS.items():
         told = wanted[:, limb.end] | name.endswith("Foot")
+        # Limbs hang from a trunk that leans as they hung before: carried along, knees would end up behind.
+        posed = _keep_orientation(posed, limb.upper, lay[:, limb.upper], turning[:, limb.upper])
         places = posed.joint_positions().clone()
         places[:, limb.end] = torch.where(told[:, None], ends[:, limb.end], places[:, limb.end])
         free = torch.zeros_like(turning)
@@ -193,9 +195,8 @@ def bend_limbs(
         quats = inverse_kinematics.solve(places, posed.local_quat_xyzw, posed.skeleton, free=free, limbs=(limb,),
                                          root_position=posed.root_position)  # fmt: skip
         posed = replace(posed, local_quat_xyzw=torch.where(free[..., None], quats, posed.local_quat_xyzw))
-        kept = limb.end if name.endswith("Foot") else limb.upper
-        alone = turning[:, kept] if name.endswith("Foot") else turning[:, kept] & ~told
-        posed = _keep_orientation(posed, kept, lay[:, kept], alone)
+        if name.endswith("Foot"):
+            posed = _keep_orientation(posed, limb.end, lay[:, limb.end], turning[:, limb.end])
     return posed
 
 

@@ -1,0 +1,90 @@
+"""Keys that tell a part: met, and the body goes there and comes back as bodies do, at any rate and on any rig.
+
+A network that is told one place in one frame answers with that place there and with its mean beside it; the tiny
+infiller (untrained: straight lines) does just that, so that a jump would show.
+"""
+
+import pytest
+import torch
+from captures import on_rig
+from helpers import walk
+from tiny_infiller import tiny_infiller
+
+from controllers.filling import InfillSettings
+from controllers.keys import Key, Keys
+from controllers.tween import tween
+from mapctl.gaps.targets import LIMBS
+from mapctl.metrics import worst
+from mapctl.retarget import to_canonical
+from mapctl.skeleton import CANONICAL
+
+ENDS = [CANONICAL.index(name) for name in LIMBS]
+HANDS = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
+
+
+def peaks_of(motion):
+    canonical = to_canonical(motion)[0]
+    return worst.peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
+
+
+def asked(motion, keys, *, method="infiller", drawn=0.0):
+    return tween(motion, Keys(keys), tiny_infiller(drawn=drawn), settings=InfillSettings(method=method))
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 30), ("daz", 120), ("canonical", 24)])
+@pytest.mark.parametrize("place", [(0.5, 1.5, 0.3), (0.25, 0.35, 0.5)])
+def test_a_hand_told_at_one_frame_goes_there_and_back(rig, fps, place):
+    """No faster than 1.9 times the distance over the time of a smooth reach, and as calmly."""
+    motion = on_rig(rig, 3 * fps, fps=fps)
+    scale = float(to_canonical(motion)[0].root_position[0, 1]) / 0.95
+    there = to_canonical(motion)[0].root_position[3 * fps // 2] * torch.tensor([1.0, 0.0, 1.0])
+    place = tuple((there + scale * torch.tensor(place).double()).tolist())
+    hand = Key(3 * fps // 2, places={HANDS[rig]: place})
+    done = asked(motion, (0, hand, 3 * fps - 1))
+    canonical, rigmap = to_canonical(done.motion)
+    at = canonical.joint_positions()[hand.frame, CANONICAL.index("leftHand")]
+    if rig != "daz":  # whose fingers' parents carry the hand elsewhere than on canonical joints
+        assert (at - torch.tensor(place).double()).norm() < 0.002
+    step, acceleration = peaks_of(done.motion)
+    assert step < 0.15
+    assert acceleration < 60
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+@pytest.mark.parametrize("turn", [0.0, 1.2])
+def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
+    motion = walk(3 * fps, fps=fps, turn_rate=turn)
+    own = peaks_of(motion)
+    done = asked(motion, (0, Key(4 * fps // 3, root_only=True), 3 * fps - 1), method="infiller")
+    step, acceleration = peaks_of(done.motion)
+    assert step < 1.3 * own.step
+    assert acceleration < 1.5 * own.acceleration
+    assert (done.motion.root_position - motion.root_position)[4 * fps // 3].norm() < 1e-9
+
+
+def test_a_trajectory_is_led_to_where_a_hand_is_wanted():
+    """Somebody on the way from A to B goes a little round for what lies beside the way, and faces as the way leads."""
+    motion = walk(91)
+    middle = motion.root_position[45] + torch.tensor([1.2, 0.2, 0.0]).double()
+    done = asked(motion, (0, Key(45, places={"leftHand": tuple(middle.tolist())}), 90))
+    aside = done.motion.root_position[:, 0]
+    assert aside[45] > 0.3
+    assert torch.diff(aside).abs().max() < 0.08
+    assert done.notes == ()
+
+
+def test_several_frames_of_one_hand_are_held_without_a_tremble():
+    motion = walk(90)
+    place = tuple((motion.root_position[45] + torch.tensor([0.2, 0.3, 0.4]).double()).tolist())
+    held = tuple(Key(frame, places={"leftHand": place}) for frame in range(40, 51))
+    made = asked(motion, (0, *held, 89)).motion
+    places = made.joint_positions()[40:51, CANONICAL.index("leftHand")]
+    assert (places - torch.tensor(place).double()).norm(dim=-1).max() < 0.002
+    assert peaks_of(made).acceleration < 80
+
+
+def test_a_hand_that_would_have_to_be_thrown_is_named_with_its_acceleration():
+    motion = walk(60)
+    high = tuple((motion.root_position[3] + torch.tensor([0.0, 0.9, 0.2]).double()).tolist())
+    done = asked(motion, (0, Key(3, places={"leftHand": high}), 59))
+    assert any("leftHand goes " in note and "m/s^2; mocap's hardly ever reach 130" in note for note in done.notes)

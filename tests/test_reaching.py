@@ -1,0 +1,125 @@
+"""Hands and feet at wanted places, with the whole body: reached, feet where they stood, no more moved than it takes."""
+
+import pytest
+import torch
+from captures import on_rig
+from helpers import generator, walk
+
+from mapctl.errors import RequestError
+from mapctl.gaps.reaching import reach_with_body
+from mapctl.gaps.targets import Targets
+from mapctl.retarget import to_canonical
+from mapctl.skeleton import CANONICAL
+
+JOINTS = CANONICAL.num_joints
+HAND, SHOULDER = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
+FEET = [CANONICAL.index(name) for name in ("leftFoot", "rightFoot", "leftToes", "rightToes")]
+
+
+def asked(motion, frame, joint, place):
+    places = motion.joint_positions().clone()
+    wanted = torch.zeros(motion.num_frames, JOINTS, dtype=torch.bool)
+    places[frame, joint], wanted[frame, joint] = place, True
+    return Targets(places, wanted)
+
+
+def reach(motion, targets, *, stray=0.0, turning=None, moving=None):
+    all_of_it = torch.ones(motion.num_frames, JOINTS, dtype=torch.bool)
+    turning = all_of_it if turning is None else turning
+    moving = all_of_it[:, 0] if moving is None else moving
+    return reach_with_body(motion, targets, turning=turning, moving=moving,
+                           stray=torch.full((motion.num_frames,), stray))  # fmt: skip
+
+
+def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
+    """A place seen from the left shoulder of somebody who faces +Z, metres."""
+    return motion.joint_positions()[frame, SHOULDER] + torch.tensor([aside, up, ahead]).double()
+
+
+@pytest.mark.parametrize("where", [{"ahead": 0.3}, {"ahead": 0.62}, {"up": -1.1, "ahead": 0.35}, {"aside": 0.55},
+                                   {"up": 0.5}, {"ahead": 0.05, "up": -0.1}])  # fmt: skip
+def test_a_hand_gets_there_and_standing_feet_stay(where):
+    motion = walk(5, cadence=0.0)
+    place = beside(motion, 2, **where)
+    made, shift = reach(motion, asked(motion, 2, HAND, place))
+    places, before = made.joint_positions(), motion.joint_positions()
+    assert (places[2, HAND] - place).norm() < 0.005
+    assert (places[2, FEET] - before[2, FEET]).norm(dim=-1).max() < 0.02  # at most a heel comes up for what is high
+    assert shift.norm() < 1e-6
+    others = [0, 1, 3, 4]
+    assert torch.equal(made.local_quat_xyzw[others], motion.local_quat_xyzw[others])
+
+
+def test_what_an_arm_reaches_alone_hardly_moves_the_rest_and_what_is_low_bends_the_knees():
+    motion = walk(3, cadence=0.0)
+    near, _ = reach(motion, asked(motion, 1, HAND, beside(motion, 1, ahead=0.3)))
+    low, _ = reach(motion, asked(motion, 1, HAND, beside(motion, 1, up=-1.1, ahead=0.35)))
+    assert (near.root_position - motion.root_position)[1].norm() < 0.01
+    assert (motion.root_position - low.root_position)[1, 1] > 0.1
+    for side in ("left", "right"):
+        joints = [CANONICAL.index(side + name) for name in ("UpperLeg", "LowerLeg", "Foot")]
+        assert forward(low, joints) > forward(motion, joints) - 0.02
+
+
+def forward(motion, joints):
+    """How far a knee is ahead of the line from hip to foot, as the hips face, metres."""
+    hip, knee, foot = motion.joint_positions()[1, joints]
+    share = ((knee - hip) @ (foot - hip)) / ((foot - hip) @ (foot - hip))
+    return float((knee - hip - share * (foot - hip))[2])
+
+
+def test_somebody_on_the_way_is_rather_a_little_further_than_stretched():
+    motion = walk(3, cadence=0.0)
+    targets = asked(motion, 1, HAND, beside(motion, 1, ahead=0.9))
+    made, shift = reach(motion, targets, stray=0.5)
+    assert shift[1, 2] > 0.3
+    feet = (made.joint_positions() - motion.joint_positions())[1, FEET]
+    torch.testing.assert_close(feet, shift[1].expand_as(feet), atol=1e-3, rtol=0)
+
+
+def test_what_may_not_move_does_not_and_bones_keep_their_lengths():
+    motion = to_canonical(on_rig("bandai", 5))[0]
+    targets = asked(motion, 2, HAND, beside(motion, 2, ahead=0.6))
+    turning = torch.zeros(5, JOINTS, dtype=torch.bool)
+    turning[:, [SHOULDER, CANONICAL.index("leftLowerArm")]] = True
+    made, _ = reach(motion, targets, turning=turning, moving=torch.zeros(5, dtype=torch.bool))
+    kept = ~turning[0]
+    assert torch.equal(made.local_quat_xyzw[:, kept], motion.local_quat_xyzw[:, kept])
+    assert torch.equal(made.root_position, motion.root_position)
+    bones = [(each[:, 1:] - each[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
+             for each in (made.joint_positions(), motion.joint_positions())]  # fmt: skip
+    torch.testing.assert_close(*bones, atol=1e-9, rtol=0)
+
+
+def test_what_no_body_reaches_is_pointed_at_and_stays_finite():
+    motion = walk(3, cadence=0.0)
+    place = beside(motion, 1, up=3.0)
+    made, _ = reach(motion, asked(motion, 1, HAND, place))
+    assert made.joint_positions().isfinite().all()
+    arm = (made.joint_positions()[1, HAND] - made.joint_positions()[1, SHOULDER]).norm()
+    assert arm > 0.46  # stretched
+
+
+def test_neighbouring_frames_reach_alike():
+    motion = walk(30)
+    places = motion.joint_positions().clone()
+    wanted = torch.zeros(30, JOINTS, dtype=torch.bool)
+    wanted[10:20, HAND] = True
+    places[10:20, HAND] += torch.tensor([0.1, 0.5, 0.3]).double()
+    made, _ = reach(motion, Targets(places, wanted), stray=0.02)
+    steps = torch.diff((made.joint_positions() - motion.joint_positions())[10:20], dim=0).norm(dim=-1)
+    assert steps.max() < 0.03
+
+
+@pytest.mark.parametrize("joint", ["hips", "head", "rightToes"])
+def test_joints_that_end_no_limb_are_refused(joint):
+    motion = walk(3)
+    with pytest.raises(RequestError, match=f"{joint} has none"):
+        reach(motion, asked(motion, 1, CANONICAL.index(joint), torch.zeros(3).double()))
+
+
+def test_nothing_wanted_changes_nothing():
+    motion = walk(4)
+    nothing = Targets(torch.randn(4, JOINTS, 3, generator=generator(0)).double(),
+                      torch.zeros(4, JOINTS, dtype=torch.bool))  # fmt: skip
+    assert reach(motion, nothing)[0] is motion
