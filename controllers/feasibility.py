@@ -80,9 +80,7 @@ def between_keys(
     return (*notes, *([] if targets is None else _limbs(motion, hips, rigmap, lost, targets)))
 
 
-def _limbs(
-    motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, lost: Lost, targets: Targets
-) -> list[str]:
+def _limbs(motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, lost: Lost, targets: Targets) -> list[str]:
     """Of hands and feet whose place is all that one of two neighbouring keys tells."""
     notes, whole, own = [], ~lost.frames, places_on_rig(motion, rigmap)
     for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
@@ -93,13 +91,14 @@ def _limbs(
                 continue
             way, seconds = places[stop] - places[start], (stop - start) / float(motion.fps)
             speed, name = float(way.norm()) / seconds, motion.skeleton.names[rigmap.joint_of[limb] or 0]
-            own = float((way - (hips[stop] - hips[start])).norm())
-            jolt = _JERKLESS * own / seconds**2
+            far = float((way - (hips[stop] - hips[start])).norm())
+            jolt = _JERKLESS * far / seconds**2
             if speed > _FLING:
                 notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, which nobody reaches")
             elif jolt > _JOLT:
-                notes.append(f"{name} goes {100 * own:.0f} cm in {seconds:.2f} s between frames {start} and {stop}, which"
-                             f" takes {jolt:.0f} m/s^2; mocap's hardly ever reach {_JOLT:.0f}")  # fmt: skip
+                where = f"between frames {start} and {stop}"
+                notes.append(f"{name} goes {100 * far:.0f} cm in {seconds:.2f} s {where}, which takes {jolt:.0f} m/s^2;"
+                             f" mocap's hardly ever reach {_JOLT:.0f}")  # fmt: skip
     return notes
 
 

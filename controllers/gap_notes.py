@@ -70,8 +70,10 @@ def _is_morph(gap: CanonicalGap, made: Motion, source: GapSource) -> bool:
     part = slice(max(0, source.start - 1), source.stop + 1)
     way, straight = (_way(each.joint_positions()[part], heading(each.local_quat_xyzw[part, 0]))
                      for each in (made, gap.motion))  # fmt: skip
-    quiet = straight * PRIOR_FPS / (source.stop - source.start) < _QUIET and _quiet_beside(gap, source)
-    return way < _MORPH * straight and not quiet
+    going = going_between(gap.motion, max(0, source.start - 1), min(source.stop, len(gap.root) - 1))
+    pace, least = (each * PRIOR_FPS / (source.stop - source.start) for each in (way, straight))
+    quiet = least < _QUIET and _quiet_beside(gap, source)
+    return pace < max(_QUIET, _MORPH * least) and (going or not quiet)
 
 
 def _quiet_beside(gap: CanonicalGap, source: GapSource) -> bool:

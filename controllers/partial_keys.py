@@ -107,15 +107,15 @@ def _lead(
     root[knots] = gap.motion.root_position[knots]
     own = heading(gap.motion.local_quat_xyzw[:, 0])
     facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
-    places, turned = root, facing
     if targets is not None:
         wanted = targets.wanted.any(dim=1) & blind.root & ~hips
         root = root + reach_with_body(body, targets, turning=blind.turns, moving=blind.root,
                                       stray=_stray(body, blind.root))[1]  # fmt: skip
-        places = _through(root, knots | wanted)
+        places = _through(root, knots | wanted, gap.seconds)
         facing = facing + torch.where(knots, 0.0, _turned_by(body.root_position, places, float(body.fps)))
         knots = knots | wanted
-    places, turned = _through(root, knots), _through(facing[:, None], knots)[:, 0]
+    places = _through(root, knots, gap.seconds)
+    turned = _through(facing[:, None], knots, gap.seconds)[:, 0]
     shown = gap.motion
     quats = shown.local_quat_xyzw.clone()
     turn = torch.where(blind.root, turned - heading(quats[:, 0]), 0.0)
@@ -135,13 +135,15 @@ def _stray(body: Motion, lost: Bool[Tensor, " frames"]) -> Float[Tensor, " frame
     return _STILL + _ASTRAY * away * way * fps / (after - before).clamp_min(1)
 
 
-def _through(values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"]) -> Float[Tensor, "frames width"]:
-    """The values at the knots, and monotone cubics between them; beyond the first and last, as these are."""
-    at = knots.nonzero()[:, 0].numpy()
+def _through(
+    values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames width"]:
+    """The values at the knots, and monotone cubics in time between them; beyond the first and last, as these are."""
+    at = seconds[knots]
     if len(at) < 2:
         return values
-    frame = torch.arange(len(values)).clamp(int(at[0]), int(at[-1])).numpy()
-    return torch.as_tensor(PchipInterpolator(at, values[at].numpy())(frame)).to(values)
+    curve = PchipInterpolator(at.numpy(), values[knots].numpy())
+    return torch.as_tensor(curve(seconds.clamp(at[0], at[-1]).numpy())).to(values)
 
 
 def _turned_by(

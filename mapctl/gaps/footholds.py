@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.capture.faults import runs
+from mapctl.capture.observed import filled
 from mapctl.gaps.reaching import bend_limbs
 from mapctl.gaps.second_differences import spread
 from mapctl.motion import Motion
@@ -39,9 +40,9 @@ def hold_planted(
 def _to_one_place(
     track: Float[Tensor, "stand 3"], held: Bool[Tensor, " stand"], rest_height: float
 ) -> Float[Tensor, "stand 3"]:
-    """What brings a stand's frames, but those that are held, to the place of these, or to its own middle."""
+    """What brings a stand's frames to the place of those that are held, straight between such, or to its own middle."""
     if bool(held.any()):
-        return torch.where(held[:, None], 0.0, track[held].mean(dim=0) - track)
+        return filled(track[None], held[None])[0] - track
     middle = track.mean(dim=0)
     middle[1] = rest_height
     return middle - track
