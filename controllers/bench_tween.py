@@ -16,7 +16,6 @@ from controllers.variations import best_of
 from mapctl import metrics
 from mapctl.capture.masks import ALL, Mask
 from mapctl.features import PRIOR_FPS
-from mapctl.gaps.targets import LIMBS
 from mapctl.metrics import worst
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -72,7 +71,7 @@ def _of_keys(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) ->
     jerk, usual = (torch.diff(each, n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (places, truth))
     at_keys = max(float(jerk[max(0, key - 3) : key + 1].max()) for key in keys)
     away = (places - truth).norm(dim=-1)
-    ends, toes = ([made.skeleton.index(name) for name in names] for names in (LIMBS, TOES))
+    ends, toes = ([made.skeleton.index(name) for name in names] for names in (("leftHand", "rightHand", *TOES), TOES))
     worst_ours, worst_mocap = (_worst(each.joint_positions(), ends, toes) for each in (made, clip))
     return {"key_mm": 1000 * float(away[list(keys)].max()), "error_cm": 100 * float(away.mean()),
             "jerk_at_keys": at_keys / float(usual.quantile(0.95)), **_feet(made, clip), **worst_ours,
@@ -81,7 +80,7 @@ def _of_keys(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) ->
 
 
 def _worst(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
-    """Largest step (cm in a thirtieth of a second) and acceleration of hands and feet; longest time on no foot."""
+    """Largest step (cm in a thirtieth of a second) and acceleration of hands and toes; longest time on no foot."""
     peaks = worst.peaks(places[:, ends], places[:, 0], PRIOR_FPS)
     return {"step_cm": 100 * peaks.step, "acceleration_m_s2": peaks.acceleration,
             "unsupported_s": worst.longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS)}  # fmt: skip

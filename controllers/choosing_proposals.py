@@ -19,7 +19,7 @@ from controllers.standing import rest_height
 from controllers.steered import Roller, Rollout, RolloutSettings, whole_gaps
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
-from mapctl.gaps.targets import LIMBS, Targets
+from mapctl.gaps.targets import Targets
 from mapctl.metrics import worst
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
@@ -32,7 +32,7 @@ from mapctl.terms.footing import TOES
 INFILLER = "infiller"
 STANDING = "standing still"
 _TOES = [CANONICAL.index(name) for name in TOES]
-_ENDS = [limb.end for limb in LIMBS.values()]
+_ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", *TOES)]
 _SKATE_REACH = 0.025  # metres
 _SURE = 4.0  # log odds of contacts of somebody who stands
 
@@ -62,8 +62,12 @@ class ChoiceSettings:
     """Weight of a way that is longer than the straight one, m/s."""
     missed: float = 0.3
     """Weight of the distance at which a rollout would have arrived, per second: m/s for a metre."""
-    step: float = 0.13
-    """Metres that hands and feet go in a frame, seen from the hips, from which on it counts."""
+    calm: float = 1.3
+    """How much farther than in the infiller's answer, which is a calm one, hands and feet may go in a frame."""
+    step: float = 0.08
+    """Metres that they may go in a frame at any rate."""
+    haste: float = 8.0
+    """Weight of a metre more than that, m/s."""
     rolling: RolloutSettings = field(default_factory=lambda: RolloutSettings(
         temperature=0.0, longest=300, trajectory=0.2, stage=45, method=LatentMethod(
             rounds=2, proposal=zero_start, lbfgs=LbfgsSettings(max_iterations=16),
@@ -121,6 +125,7 @@ def _best(
     """Of the infiller's answer, standing still, and rollouts of several tempos, the one that costs least."""
     start, stop = part
     first = replace(before, by=INFILLER, cost=viewers_cost(before.body, before.odds, part, settings))
+    calm = settings.calm * max(settings.step, _largest_step(before.body, part))
     on_the_way = wanted is not None and bool(wanted.wanted[start:stop].any())
     if not on_the_way and _stands(gap, start, stop, settings):
         return _standing(gap, first, part)
@@ -133,6 +138,7 @@ def _best(
         rolled = roller.roll(start, stop, torch.Generator(), replace(settings.rolling, tempo=tempo))
         body = roller.on_performer(rolled.body)
         cost = viewers_cost(body, rolled.odds, part, settings)
+        cost += settings.haste * max(0.0, _largest_step(body, part) - calm)
         cost += settings.missed * rolled.missed * PRIOR_FPS / (stop - start)
         found.append(_Candidate(body, rolled.odds, f"rollout of {roller.density.name}", cost, rolled))
     return min(found, key=lambda one: one.cost)
@@ -142,7 +148,7 @@ def viewers_cost(
     motion: Motion, odds: Float[Tensor, "frames 2"], part: tuple[int, int], settings: ChoiceSettings
 ) -> float:
     """What a viewer sees of a gap that is filled, as a speed, m/s: of what the body stands on, of toes that skate, of
-    a way round; and jumps.
+    a way round.
     """
     start, stop = part[0] - 1, part[1] + 1
     places, fps = motion.joint_positions()[start:stop], float(motion.fps)
@@ -153,8 +159,13 @@ def viewers_cost(
     skate = float((speeds * (1 - above / _SKATE_REACH).clamp(0, 1)).mean())
     ground = hips[:, ::2]
     way = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
-    jump = max(0.0, worst.peaks(places[:, _ENDS], hips, fps).step - settings.step)
-    return slide + settings.skate * skate + settings.detour * way * fps / len(places) + jump
+    return slide + settings.skate * skate + settings.detour * way * fps / len(places)
+
+
+def _largest_step(motion: Motion, part: tuple[int, int]) -> float:
+    """Of hands and toes in a gap and into it and out of it, seen from the hips, metres a frame."""
+    shown = motion.slice(part[0] - 1, part[1] + 1)
+    return worst.peaks(shown.joint_positions()[:, _ENDS], shown.root_position, float(motion.fps)).step
 
 
 def _stands(gap: CanonicalGap, start: int, stop: int, settings: ChoiceSettings) -> bool:

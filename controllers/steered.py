@@ -166,17 +166,19 @@ class Roller:
             noise = torch.cat([window.carry, noise[frames:]])
         window = _solved(context, wishes, noise, generator, settings)
         body, odds, missed = _put_in(self.body, self.odds, window, place, start, stop, settings.tempo)
-        return Rollout(start, self._planted(body, odds), odds, missed)
+        return Rollout(start, self._planted(body, odds, start, stop), odds, missed)
 
     def put_in(self, rollout: Rollout) -> None:
         """Go on from this one."""
         self.body, self.odds = rollout.body, rollout.odds
 
-    def _planted(self, body: Motion, odds: Tensor) -> Motion:
-        """With toes that stay where they stand: arriving where it must has moved them."""
-        stands = contacts.steadied(odds > 0)
-        lost = self.gap.turns.all(dim=1) & self.gap.root
-        return hold_planted(body, stands, free=lost, rest_height=rest_height(body, stands))
+    def _planted(self, body: Motion, odds: Tensor, start: int, stop: int) -> Motion:
+        """With toes that stay where they stand in the gap: arriving where it must has moved them."""
+        stands, free = contacts.steadied(odds > 0), torch.zeros(len(odds), dtype=torch.bool)
+        free[start:stop] = True
+        held = hold_planted(body, stands, free=free, rest_height=rest_height(body, stands))
+        quats = torch.where(free[:, None, None], held.local_quat_xyzw, body.local_quat_xyzw)
+        return replace(body, local_quat_xyzw=quats)
 
     def _trajectory(self, start: int, stop: int, frames: int, settings: RolloutSettings) -> Keyframe:
         """Where the proposal has the hips in the gap, in the rollout's own time."""

@@ -13,16 +13,51 @@ from mapctl.skeleton import CANONICAL, leg_length
 GOING = 0.35
 """Metres a second of the hips, from one end of a gap to the other, of a body with canonical legs, from which it is on
 its way."""
+_FEW = 5  # clips that tell no tenth of them
 KNOWN_FRAMES = 75
 """Of the longest gaps that the infiller was trained on: their mean length and a standard deviation."""
-MEASURED: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float]]] = {
-    ("infiller", "going", False): ((15, 5, 9), (180, 40, 80)),
-    ("infiller", "in place", False): ((15, 3, 9), (180, 20, 40)),
-    ("infiller", "going", True): ((15, 5, 9), (180, 40, 80)),
-    ("infiller", "in place", True): ((15, 5, 9), (180, 40, 80)),
+MEASURED: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float, int]]] = {
+    ("infiller", "going", False): (
+        (15, 4.5, 8.3, 22),
+        (30, 5.5, 9.5, 23),
+        (60, 8.2, 13.7, 5),
+        (90, 10.3, 10.3, 1),
+        (120, 9.6, 11.8, 2),
+        (180, 11.0, 11.0, 1),
+    ),
+    ("infiller", "going", True): (
+        (15, 3.2, 5.6, 22),
+        (30, 4.2, 7.9, 21),
+        (60, 5.2, 9.7, 17),
+        (90, 14.1, 14.1, 1),
+        (120, 11.6, 15.1, 2),
+        (180, 18.7, 18.7, 1),
+    ),
+    ("infiller", "in place", False): (
+        (15, 2.3, 5.0, 3),
+        (30, 2.4, 3.4, 2),
+        (90, 18.3, 18.3, 1),
+        (120, 17.7, 17.7, 1),
+        (180, 23.1, 23.1, 1),
+    ),
+    ("infiller", "in place", True): (
+        (15, 1.8, 3.9, 3),
+        (60, 14.5, 14.5, 1),
+        (90, 16.4, 16.4, 1),
+        (120, 17.8, 17.8, 1),
+        (180, 21.0, 21.0, 1),
+    ),
+    ("rollout", "going", False): (
+        (60, 9.7, 34.6, 15),
+        (90, 16.7, 35.4, 15),
+        (120, 16.4, 56.0, 12),
+        (180, 17.1, 66.4, 8),
+    ),
+    ("rollout", "going", True): ((90, 7.5, 33.1, 14), (120, 12.9, 39.3, 10), (180, 41.4, 119.2, 4)),
+    ("rollout", "in place", False): ((60, 18.9, 18.9, 1),),
 }
-"""By who answered, whether the body was on its way, and whether frames beside the gap were known: frames of the gap and
-centimetres in half and in nine of ten of the clips; `mapctl bench gaps --data DATA --count 30`."""
+"""By who answered, whether the body was on its way, and whether frames beside the gap were known: frames of the gap,
+centimetres in half and in nine of ten of the clips, and how many these were; `mapctl bench gaps --data DATA --count 25`."""
 
 
 def going_between(motion: Motion, start: int, stop: int) -> bool:
@@ -39,21 +74,27 @@ class Sureness:
     """At most, in half of unseen clips."""
     nine_in_ten_cm: float
     """And in nine of ten."""
+    clips: int
+    """That these were."""
 
     @property
     def text(self) -> str:
         """In words."""
-        return (f"joints within {self.half_cm:.0f} cm of mocap's in half of unseen clips and within"
+        if self.clips < _FEW:
+            return f"joints about {self.half_cm:.0f} cm from mocap's in the only {self.clips} unseen clips of the kind"
+        return (f"joints within {self.half_cm:.0f} cm of mocap's in half of {self.clips} unseen clips and within"
                 f" {self.nine_in_ten_cm:.0f} cm in nine of ten")  # fmt: skip
 
 
 def sureness_of(by: str, frames: int, *, going: bool, beside: bool) -> Sureness:
     """Of an answer for a gap of so many frames at the prior's rate; `beside` where frames around it are known.
 
-    Between measured lengths straight lines; longer gaps than measured are at least as unsure as the longest.
+    Between measured lengths straight lines; longer gaps than measured are at least as unsure as the longest. What was
+    never measured of an answer counts as the infiller's.
     """
-    name = "rollout" if by.split(" ")[0] in ("rollout", "density") else by.split(" ")[0]
+    name = "rollout" if by.split(" ")[0] in ("rollout", "density") else "infiller"
     what = "going" if going else "in place"
     rows = MEASURED.get((name, what, beside)) or MEASURED[("infiller", what, beside)]
-    lengths, half, most = np.array(rows).T
-    return Sureness(*(float(np.interp(frames, lengths, values)) for values in (half, most)))
+    lengths, half, most, clips = np.array(rows).T
+    nearest = int(clips[np.abs(lengths - frames).argmin()])
+    return Sureness(float(np.interp(frames, lengths, half)), float(np.interp(frames, lengths, most)), nearest)

@@ -36,7 +36,8 @@ def tween(
     canonical, rigmap, shown = shown_by(wanted, motion, rig)
     lost, targets = lost_between(wanted, motion, rigmap), targets_of(wanted, shown, rigmap)
     hasty = feasibility.between_keys(shown, canonical, rigmap, lost, targets)
-    another = another or partial(choose_proposals, densities=rollable)
+    if another is None and (settings is None or settings.method == "map"):
+        another = partial(choose_proposals, densities=rollable)
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=settled(rigmap), targets=targets,
                 another=another)  # fmt: skip
     by = "nearest key" if infiller is None else "infiller"

@@ -106,7 +106,7 @@ def put(page, label: str, value: float) -> None:
 def shows(page, label: str, value: float) -> bool:
     """Whether a slider comes to show a value within 5 s."""
     for _ in range(50):
-        if float(number(page, label).input_value()) == value:
+        if number(page, label).input_value() not in ("", None) and float(number(page, label).input_value()) == value:
             return True
         time.sleep(0.1)
     return False

@@ -82,6 +82,9 @@ class Still:
     def wait_until(self, seconds):
         self.time = max(self.time, seconds)
 
+    def hold(self, seconds):
+        self.time -= seconds
+
 
 @pytest.mark.parametrize("margin", [0.0, 0.03, 0.2])
 def test_a_search_ends_by_the_margin_before_its_frames_are_due(monkeypatch, margin):

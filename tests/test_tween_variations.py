@@ -106,7 +106,9 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     canonical, rigmap = to_canonical(motion)
     gap = CanonicalGap.of(canonical, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free), rigmap.joint_of)
     odds = torch.full((FRAMES, 2), -1.0)
-    made, bits = rolled(gap, gap.motion, odds, densities=[tiny_density()], generator=generator(0), settings=QUICK)
+    answer = rolled(gap, gap.motion, odds, densities=[tiny_density()], generator=generator(0), settings=QUICK)
+    made, bits = answer.motion, answer.odds
+    assert [(source.start, source.stop) for source in answer.sources] == [(20, 30)]
     same = torch.ones(FRAMES, dtype=torch.bool)
     same[20:30] = False
     torch.testing.assert_close(made.root_position[same], gap.motion.root_position[same])
