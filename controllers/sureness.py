@@ -57,7 +57,8 @@ MEASURED: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float, int]]
     ("rollout", "in place", False): ((60, 18.9, 18.9, 1),),
 }
 """By who answered, whether the body was on its way, and whether frames beside the gap were known: frames of the gap,
-centimetres in half and in nine of ten of the clips, and how many these were; `mapctl bench gaps --data DATA --count 25`."""
+centimetres in half and in nine of ten of the clips, and how many these were; by `mapctl bench gaps --data DATA
+--count 25`."""
 
 
 def going_between(motion: Motion, start: int, stop: int) -> bool:

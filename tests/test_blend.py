@@ -6,11 +6,14 @@ from fractions import Fraction
 import pytest
 import torch
 from helpers import run, walk
+from tiny_infiller import tiny_infiller
 
 from controllers import blend as blending
 from controllers.blend import Borrowed, blend
+from controllers.filling import InfillSettings
 from mapctl import rotations
 from mapctl.errors import RequestError
+from mapctl.metrics import worst
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -86,3 +89,36 @@ def test_ranges_beyond_the_other_clip_are_refused_in_its_frames(tmp_path, capsys
     assert "the range of --frames 100:121 must begin before it ends" in capsys.readouterr().err
     assert run("blend", *paths, "--frames", "20:120", "--at", "30") == 2  # 25 frames of IN from its 30th of 40
     assert "frames 30:55 are not within the motion's 0:40" in capsys.readouterr().err
+
+
+ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", "rightToes")]
+
+
+def peaks_of(motion):
+    return worst.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
+
+
+@pytest.mark.parametrize("fps", [30, 60])
+@pytest.mark.parametrize("margin", [None, 0.5])
+def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
+    """README's figures: 20 frames of a raised arm at frame 70 of a walk, without the jumps of 85 cm that there were."""
+    motion, source = walk(4 * fps, fps=fps), waving(30)
+    done = blend(motion, source, Borrowed(("leftHand",), 8, 28, 70 * fps // 30, margin=margin), tiny_infiller(),
+                 settings=InfillSettings(method="infiller"))  # fmt: skip
+    own, theirs, made = peaks_of(motion), peaks_of(source), peaks_of(done.motion)
+    assert made.step < max(1.3 * max(own.step, theirs.step), 0.17)
+    assert made.acceleration < max(1.5 * max(own.acceleration, theirs.acceleration), 60)
+    assert not any("takes" in note for note in done.notes)
+
+
+def test_a_limb_that_is_hurried_is_named_with_numbers_and_bends_as_it_did():
+    motion, source = walk(120), waving(30)
+    done = blend(motion, source, Borrowed(("leftHand",), 8, 28, 70, margin=0.1), tiny_infiller(),
+                 settings=InfillSettings(method="infiller"))  # fmt: skip
+    assert any(
+        "leftHand goes " in note and "80 is the most that is common: a margin of " in note for note in done.notes
+    )
+    lent = (done.motion.joint_positions() - done.motion.joint_positions()[:, ARM : ARM + 1])[70:90, HAND]
+    theirs = (source.joint_positions() - source.joint_positions()[:, ARM : ARM + 1])[8:28, HAND]
+    facing = done.motion.root_position[70:90, 1:2] * 0  # both face +Z
+    torch.testing.assert_close(lent + facing, theirs, atol=0.02, rtol=0)
