@@ -60,6 +60,8 @@ class ChoiceSettings:
     """Weight of skating beside sliding."""
     detour: float = 0.5
     """Weight of a way that is longer than the straight one, m/s."""
+    hung: float = 0.5
+    """Weight of the longest time on no planted foot, m/s for a second."""
     missed: float = 0.3
     """Weight of the distance at which a rollout would have arrived, per second: m/s for a metre."""
     calm: float = 1.3
@@ -148,7 +150,7 @@ def viewers_cost(
     motion: Motion, odds: Float[Tensor, "frames 2"], part: tuple[int, int], settings: ChoiceSettings
 ) -> float:
     """What a viewer sees of a gap that is filled, as a speed, m/s: of what the body stands on, of toes that skate, of
-    a way round.
+    a way round, of the longest time on no foot.
     """
     start, stop = part[0] - 1, part[1] + 1
     places, fps = motion.joint_positions()[start:stop], float(motion.fps)
@@ -159,7 +161,8 @@ def viewers_cost(
     skate = float((speeds * (1 - above / _SKATE_REACH).clamp(0, 1)).mean())
     ground = hips[:, ::2]
     way = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
-    return slide + settings.skate * skate + settings.detour * way * fps / len(places)
+    hung = worst.longest_unsupported(toes, hips, fps)
+    return slide + settings.skate * skate + settings.detour * way * fps / len(places) + settings.hung * hung
 
 
 def _largest_step(motion: Motion, part: tuple[int, int]) -> float:
