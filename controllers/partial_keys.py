@@ -139,11 +139,14 @@ def _through(
     values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
 ) -> Float[Tensor, "frames width"]:
     """The values at the knots, and monotone cubics in time between them; beyond the first and last, as these are."""
-    at = seconds[knots]
+    at, told = seconds[knots], values[knots]
     if len(at) < 2:
         return values
-    curve = PchipInterpolator(at.numpy(), values[knots].numpy())
-    return torch.as_tensor(curve(seconds.clamp(at[0], at[-1]).numpy())).to(values)
+    # Straight on beyond the ends: a monotone cubic's own guess of its slope there is up to half too fast.
+    at = torch.cat([2 * at[:1] - at[1:2], at, 2 * at[-1:] - at[-2:-1]])
+    told = torch.cat([2 * told[:1] - told[1:2], told, 2 * told[-1:] - told[-2:-1]])
+    curve = PchipInterpolator(at.numpy(), told.numpy())
+    return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
 
 
 def _turned_by(
