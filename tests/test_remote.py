@@ -5,12 +5,14 @@ import os
 import signal
 import time
 from itertools import pairwise
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
 from tiny_prior import save_tiny_prior
 
 import priors
+from controllers.desk import work
 from controllers.remote import Remote, RemoteRequest
 from mapctl.errors import MapctlError, RequestError
 from mapctl.steering import Command
@@ -168,3 +170,15 @@ def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
     made.close()
     assert time.perf_counter() - began < 6.0
     assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_an_end_that_is_wanted_is_no_failure(load):
+    """Else who is started anew after an end is taken for ended, too."""
+    here, there = Pipe()
+    here.send(("close",))
+    work(there, RemoteRequest(load, Command(1.0, 0.0)))
+    words = []
+    while here.poll():
+        words.append(here.recv()[0])
+    assert "ready" in words
+    assert "failed" not in words
