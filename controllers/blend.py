@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from controllers.feasibility import JERKLESS
 from controllers.filling import Infilled, InfillSettings, fill
 from controllers.keys import limb_end
 from mapctl import inverse_kinematics, rotations
@@ -26,7 +27,6 @@ from mapctl.skeleton import CANONICAL
 from mapctl.stance import Stance
 
 _LEAST = 0.3  # seconds
-_JERKLESS = 5.77  # peak acceleration of the smoothest way, of least jerk, over distance and time squared (Flash 1985)
 _CALM, _HASTY = 20.0, 80.0  # m/s^2 of a hand
 
 
@@ -134,7 +134,7 @@ def _margins(own: Motion, posed: Motion, limbs: Sequence[Limb], there: slice, as
     for frame in (there.start, there.stop - 1):
         way = (posed.slice(frame, frame + 1).joint_positions() - own.slice(frame, frame + 1).joint_positions())[0]
         far = max(float(way[limb.end].norm()) for limb in limbs)
-        found.append(round(fps * (max(_LEAST, math.sqrt(_JERKLESS * far / _CALM)) if asked is None else asked)))
+        found.append(round(fps * (max(_LEAST, math.sqrt(JERKLESS * far / _CALM)) if asked is None else asked)))
     return found[0], found[1]
 
 
@@ -148,12 +148,12 @@ def _haste(
         for name, limb in zip(borrowed.limbs, limbs, strict=True):
             far, needed = (
                 float(way[limb.end].norm()),
-                _JERKLESS * float(way[limb.end].norm()) * (fps / max(1, count)) ** 2,
+                JERKLESS * float(way[limb.end].norm()) * (fps / max(1, count)) ** 2,
             )
             if needed > _HASTY:
                 notes.append(f"{name} goes {100 * far:.0f} cm in {count / fps:.2f} s beside frame {frame}, which takes "
                              f"{needed:.0f} m/s^2; {_HASTY:.0f} is the most that is common: a margin of "
-                             f"{math.sqrt(_JERKLESS * far / _HASTY):.2f} s would do")  # fmt: skip
+                             f"{math.sqrt(JERKLESS * far / _HASTY):.2f} s would do")  # fmt: skip
     return tuple(notes)
 
 

@@ -24,7 +24,8 @@ _WHIP = 30.0  # rad/s of a joint
 _FLING = 25.0  # m/s of a hand or a foot: beyond what kicks and throws reach
 _JOLT = 130.0
 """m/s^2 of a hand, seen from the hips: one frame in a thousand of mocap's (walks to fights) has more."""
-_JERKLESS = 5.77  # peak acceleration of the smoothest way there, over distance and time squared (Flash and Hogan 1985)
+JERKLESS = 5.77
+"""Peak acceleration of the smoothest way, of least jerk, over distance and time squared (Flash and Hogan 1985)."""
 
 
 def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
@@ -92,7 +93,7 @@ def _limbs(motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, lost
             way, seconds = places[stop] - places[start], (stop - start) / float(motion.fps)
             speed, name = float(way.norm()) / seconds, motion.skeleton.names[rigmap.joint_of[limb] or 0]
             far = float((way - (hips[stop] - hips[start])).norm())
-            jolt = _JERKLESS * far / seconds**2
+            jolt = JERKLESS * far / seconds**2
             if speed > _FLING:
                 notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, which nobody reaches")
             elif jolt > _JOLT:
