@@ -18,10 +18,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from mapctl import __version__, interruption
+from mapctl import __version__
 from mapctl.commands import COMMANDS, Command
-from mapctl.commands.walks import INTERRUPTED
+from mapctl.commands.shared.path_walk import INTERRUPTED
 from mapctl.errors import MapctlError, RequestError
+from mapctl.runtime import interruption
 
 _WRONG, _UNREAD, _SIGNALLED = 2, 1, 128
 _EXTRAS = {

@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping, Sequence
 from difflib import SequenceMatcher
 from typing import TYPE_CHECKING
 
-from mapctl.body.parts import Part, Role, Side, role
 from mapctl.errors import RequestError
-from mapctl.roles import plain_name
+from mapctl.joint_parts import Part, Role, Side, role
+from mapctl.joint_roles import plain_name
 
 if TYPE_CHECKING:
     from mapctl.motion import Motion
-    from mapctl.rigs import Rig
+    from mapctl.retarget.rigs import Rig
 
 _FEW = 3  # names in a refusal
 _LIMBS = (

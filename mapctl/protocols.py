@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mapctl.capture import Capture, Cleaned
-from mapctl.gaps import PositionImage, Proposed
+from mapctl.inbetweening import PositionImage, Proposed
+from mapctl.recording import Capture, Cleaned
 
 State = TypeVar("State")
 

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from mapctl import __version__, metrics
-from mapctl.curve import Curve
+from mapctl.curves.curve import Curve
 from mapctl.formats.atomic import write_text
 from mapctl.motion import Motion
-from mapctl.solver.result import Solution, WindowRecord
+from mapctl.problem.solution import Solution, WindowRecord
 
 _PACKAGES = ("torch", "numpy", "scipy", "numba")
 

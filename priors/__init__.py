@@ -3,18 +3,18 @@
 from typing import TYPE_CHECKING
 
 AUTO = ("locomotion", "general")
-"""Bundled densities that `auto` chooses from, by likelihood (see mapctl.choosing)."""
+"""Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection)."""
 
 if TYPE_CHECKING:
-    from priors.denoiser import ConvDenoiser
-    from priors.density import LstmGmmDensity
-    from priors.infiller import ConvInfiller
-    from priors.refiner import LstmRefiner
+    from priors.denoiser.network import ConvDenoiser
+    from priors.infiller.network import ConvInfiller
+    from priors.lstm_gmm.density import LstmGmmDensity
+    from priors.refiner.network import LstmRefiner
 
 
 def load(name: str) -> "LstmGmmDensity":
     """A bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
-    from priors import density
+    from priors.lstm_gmm import density
 
     return density.load(name)
 
@@ -28,23 +28,23 @@ def load_choice(name: str | None) -> "list[LstmGmmDensity]":
 
 def load_refiner(name: str) -> "LstmRefiner":
     """A bundled refiner by name (`locomotion-refiner`), or a trained one by its file or run folder."""
-    from priors import refiner
+    from priors.refiner import network
 
-    return refiner.load(name)
+    return network.load(name)
 
 
 def load_denoiser(name: str = "denoiser") -> "ConvDenoiser":
     """The bundled denoiser, or a trained one by its file or run folder."""
-    from priors import denoiser
+    from priors.denoiser import network
 
-    return denoiser.load(name)
+    return network.load(name)
 
 
 def load_infiller(name: str = "infiller") -> "ConvInfiller":
     """The bundled infiller, or a trained one by its file or run folder."""
-    from priors import infiller
+    from priors.infiller import network
 
-    return infiller.load(name)
+    return network.load(name)
 
 
 def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":

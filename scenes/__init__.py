@@ -13,21 +13,21 @@ from mapctl.errors import RequestError
 if TYPE_CHECKING:
     from scenes import film as film
     from scenes.cameras import CameraSettings as CameraSettings
-    from scenes.description import Actor as Actor
-    from scenes.description import SceneDescription as SceneDescription
-    from scenes.description import load as load
-    from scenes.painters import back_end as back_end
+    from scenes.renderers.select import back_end as back_end
+    from scenes.scene_file import Actor as Actor
+    from scenes.scene_file import SceneDescription as SceneDescription
+    from scenes.scene_file import load as load
     from scenes.stage import Shot as Shot
 
 # Graphics libraries take seconds to import and may be missing, so public names arrive on first use.
 _HOMES = {
     "CameraSettings": "scenes.cameras",
-    "Actor": "scenes.description",
-    "SceneDescription": "scenes.description",
-    "load": "scenes.description",
+    "Actor": "scenes.scene_file",
+    "SceneDescription": "scenes.scene_file",
+    "load": "scenes.scene_file",
     "film": "scenes.film",
     "Shot": "scenes.stage",
-    "back_end": "scenes.painters",
+    "back_end": "scenes.renderers.select",
 }
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import brentq
 
-from mapctl.body.shapes import Array, unit
 from mapctl.errors import RequestError
+from mapctl.mesh.primitives import Array, unit
 
 _UP = np.array([0.0, 1.0, 0.0])
 _ROOM = 1.12

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from mapctl.body import colours
-from mapctl.body.mannequin import Body
-from mapctl.body.shapes import Array, Surface
+from mapctl.mesh import colours
+from mapctl.mesh.mannequin import Body
+from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import View
 
 

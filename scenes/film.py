@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mapctl.body.shapes import Array
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
+from mapctl.mesh.primitives import Array
 from scenes.cameras import CameraSettings
+from scenes.contact_sheet import contact_sheet
 from scenes.content import Painter
-from scenes.painters import RendererName, painter
-from scenes.sheet import contact_sheet
+from scenes.renderers.select import RendererName, painter
 from scenes.stage import Shot, Stage
 from scenes.writers import gif_writer, mp4_writer, save_png
 
@@ -43,7 +43,7 @@ def film(
     left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
     the way over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
     them. `size` is the width and height in pixels (MP4 rounds up to even). `progress` is called with frames
-    done and all frames. `renderer` is that of `scenes.painters.painter`. RequestError for endings, sizes
+    done and all frames. `renderer` is that of `scenes.renderers.select.painter`. RequestError for endings, sizes
     and places that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)

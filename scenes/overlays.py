@@ -6,8 +6,8 @@ All are flat surfaces a few millimetres apart; whoever draws them keeps the orde
 import numpy as np
 from scipy.spatial import KDTree
 
-from mapctl.body import colours
-from mapctl.body.shapes import Array, Surface, unit
+from mapctl.mesh import colours
+from mapctl.mesh.primitives import Array, Surface, unit
 
 TILE_HEIGHT, LINE_HEIGHT, WISH_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT = (
     0.0,

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from mapctl.body import colours
-from mapctl.body.mannequin import Body
-from mapctl.body.parts import Side
-from mapctl.body.shapes import Array, Surface, merge
 from mapctl.contacts import planted
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
+from mapctl.joint_parts import Side
+from mapctl.mesh import colours
+from mapctl.mesh.mannequin import Body
+from mapctl.mesh.primitives import Array, Surface, merge
 from mapctl.motion import Motion
 from scenes import overlays
 from scenes.cameras import CameraSettings, View, views
@@ -31,7 +31,7 @@ class Shot(NamedTuple):
     curve: Curve | None = None
     """What the actor was asked to follow."""
     colour: str | None = None
-    """Name from `mapctl.body.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
+    """Name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
     start_seconds: float = 0.0
     """When the motion begins; until then the actor stands in its first pose."""
 

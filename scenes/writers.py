@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapctl.body import colours
-from mapctl.body.shapes import Array
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
+from mapctl.mesh import colours
+from mapctl.mesh.primitives import Array
 
 Write = Callable[[Array], None]
 _QUALITY = {"crf": "19", "preset": "veryfast"}

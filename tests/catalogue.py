@@ -21,7 +21,7 @@ from mapctl.terms import (
     Term,
     Travel,
 )
-from priors.lstm_gmm import LstmGmm
+from priors.lstm_gmm.network import LstmGmm
 
 FRAMES = 12
 """Of the windows that the terms are tried on."""

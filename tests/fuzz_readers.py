@@ -26,13 +26,13 @@ from acclaim import pair
 from mutations import mutated
 
 from mapctl import formats
-from mapctl.capture.masks import load_masks
-from mapctl.command_files import read_commands
-from mapctl.curve_files import read_csv, read_svg
+from mapctl.curves.files import read_csv, read_svg
 from mapctl.errors import MapctlError
-from mapctl.formats import bvh_text
-from mapctl.formats.bvh_layout import BvhLayout
+from mapctl.formats.bvh import text as bvh_text
+from mapctl.formats.bvh.layout import BvhLayout
+from mapctl.intent.steering_csv import read_commands
 from mapctl.motion import Motion
+from mapctl.recording.masks import load_masks
 
 SLOWEST_SECONDS, MOST_MEGABYTES = 4.0, 600
 """Bounds on one case: its time, and what it adds to the peak of memory."""
@@ -298,7 +298,7 @@ def _real(path: Path) -> Iterator[Specimen]:
     elif ending == ".npz":
         yield Specimen(path.name, "npz", path.read_bytes())
     elif ending == ".amc":
-        from mapctl.formats.asf_amc import paths
+        from mapctl.formats.acclaim import paths
 
         asf, lines = paths(path)[0].read_bytes(), path.read_bytes().splitlines(keepends=True)
         fourth = next((k for k, line in enumerate(lines) if line.split() == [b"4"]), len(lines))

@@ -1,8 +1,9 @@
 """Golden outputs: every command on small priors with fixed seeds, and fingerprints of all that it writes and prints.
 
-`python tests/golden.py` compares this checkout's outputs with tests/golden.json; with `--write` it makes that file anew,
-which a commit that means to change what the program does explains. Bits hold on the kind of machine that wrote the file
-(processor and libraries, see `kind_of_machine`); elsewhere the numbers in each file are compared, within a tolerance.
+`python tests/golden.py` compares this checkout's outputs with tests/golden.json; with `--write` it makes that file
+anew, which a commit that means to change what the program does explains. Bits hold on the kind of machine that wrote
+the file (processor and libraries, see `kind_of_machine`); elsewhere the numbers in each file are compared, within a
+tolerance.
 """
 
 import contextlib
@@ -61,10 +62,11 @@ STEERING = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.4,0.9,60\n1,1,0\n"
 
 COMMANDS = {
     "follow": "follow wave:0.5x2 -o follow.bvh --prior tiny.safetensors --seconds 1.5 --report follow.json",
-    "follow on a rig": "follow line:2 -o rigged.npz --prior tiny.safetensors --seconds 1 --speed 0:1,1:1.4 --rig walk.bvh"
-    " --seed 3",
+    "follow on a rig": "follow line:2 -o rigged.npz --prior tiny.safetensors --seconds 1 --speed 0:1,1:1.4"
+    " --rig walk.bvh --seed 3",
     "generate": "generate -o drawn --prior tiny.safetensors --seconds 1.5 --count 2 --seed 4",
-    "generate on": "generate -o on --prior tiny.safetensors --seconds 1 --start walk.bvh --temperature 0.5 --no-footing",
+    "generate on": "generate -o on --prior tiny.safetensors --seconds 1 --start walk.bvh --temperature 0.5"
+    " --no-footing",
     "run": "run scene.toml -o scene --quiet",
     "steer": "steer steering.csv -o steered.bvh --prior tiny.safetensors --report steered.json",
     "denoise": "denoise noisy.bvh -o clean.bvh --denoiser denoiser.safetensors --report clean.json",
@@ -72,8 +74,8 @@ COMMANDS = {
     " --mask mask.csv --anchor",
     "denoise causal": "denoise noisy.bvh -o causal.bvh --denoiser denoiser.safetensors --causal",
     "infill": "infill walk.bvh -o filled.bvh --gap 10:22 --infiller infiller.safetensors --report filled.json",
-    "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand --infiller infiller.safetensors"
-    " --prior tiny.safetensors",
+    "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand"
+    " --infiller infiller.safetensors --prior tiny.safetensors",
     "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --infiller infiller.safetensors",
     "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method linear",
     "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --infiller infiller.safetensors --report tweened.json",
@@ -95,7 +97,8 @@ COMMANDS = {
     "train lstm-gmm": "train lstm-gmm --data data -o lstm --steps 3 --batch 4 --window 20 --width 8 --seed 2",
     "train denoiser": "train denoiser --data data -o denoiser --steps 2 --batch 2 --window 32 --seed 2",
     "train infiller": "train infiller --data data -o infiller --steps 2 --batch 2 --window 32 --seed 2",
-    "train lstm-gmm, paper": "train lstm-gmm --data data -o paper --steps 2 --batch 2 --window 20 --width 8 --seed 2 --paper",
+    "train lstm-gmm, paper": "train lstm-gmm --data data -o paper --steps 2 --batch 2 --window 20 --width 8 --seed 2"
+    " --paper",
     "train infiller, image": "train infiller --data data -o image --steps 1 --batch 2 --window 32 --architecture image",
 }  # fmt: skip
 """By name, a command line that is run in the folder `prepare` makes, one after the other."""

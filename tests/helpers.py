@@ -13,17 +13,18 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mapctl import cli, retarget, rigs, rotations
+from mapctl import cli, retarget, rotations
 from mapctl.features import LAYOUT, Place, encode, root_places
 from mapctl.motion import Motion
+from mapctl.retarget import rigs
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 from priors.checkpoints import Card
-from priors.density import LstmGmmDensity
-from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus
-from priors.training.lstm_gmm import statistics
-from priors.training.starts import abilities, choose
+from priors.training.initial_states import abilities, choose
+from priors.training.recipes.lstm_gmm import statistics
 
 STRIDE = 0.25
 """Swing of the upper legs, radians."""

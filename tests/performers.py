@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import retarget, rotations
-from mapctl.carry import Body
 from mapctl.motion import Motion
+from mapctl.retarget.carry import Body
+from mapctl.retarget.stance import Stance
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
-from mapctl.stance import Stance
 
 SIDES = ("left", "right")
 HIPJOINTS, KNEES, FEET, TOES = (

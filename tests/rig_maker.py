@@ -9,8 +9,9 @@ from helpers import random_motion, walk
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mapctl import rigs, rotations
+from mapctl import rotations
 from mapctl.motion import Motion
+from mapctl.retarget import rigs
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
 _SIDES = (("left", 1.0), ("right", -1.0))

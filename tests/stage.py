@@ -6,8 +6,8 @@ import numpy as np
 from helpers import walk
 
 from mapctl.errors import RequestError
+from mapctl.runtime.live_protocol import Delivered
 from mapctl.skeleton import CANONICAL
-from mapctl.streaming import Delivered
 
 
 def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> Delivered:

@@ -4,8 +4,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from mapctl import gaussian, rotations
-from mapctl.roles import find_hips
+from mapctl import rotations
+from mapctl.joint_roles import find_hips
+from mapctl.numerics import gaussian
 
 
 def test_shapes_are_checked():

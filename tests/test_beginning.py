@@ -7,8 +7,8 @@ from helpers import tiny_density, walk
 
 from mapctl.features import encode
 from mapctl.solver.budget import Budget
-from priors.beginning import BeginningSettings, likely_state
-from priors.lstm_gmm import LstmState
+from priors.lstm_gmm.network import LstmState
+from priors.lstm_gmm.state_inference import BeginningSettings, likely_state
 
 
 @cache

@@ -8,12 +8,12 @@ import torch
 from helpers import run, walk
 from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infiller
 
-from controllers import bench_infill
-from controllers.bench_infill import TASKS, Task, middle, on_canonical_bones, table
+from controllers.benchmarks import infilling
+from controllers.benchmarks.infilling import TASKS, Task, middle, on_canonical_bones, table
 from mapctl import retarget
-from mapctl.gaps import Proposed
+from mapctl.inbetweening import Proposed
 from priors import checkpoints
-from priors.infiller import ConvInfiller
+from priors.infiller.network import ConvInfiller
 
 SOME = (Task("nothing missing", 40), Task("gap", 40, 10), Task("noise", 40, noise=0.03),
         Task("dropped", 40, dropout=0.4), Task("longer than any", 400, 10))  # fmt: skip
@@ -28,7 +28,7 @@ def clips():
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """As the whole table would take long."""
-    monkeypatch.setattr(bench_infill, "TASKS", SOME)
+    monkeypatch.setattr(infilling, "TASKS", SOME)
 
 
 def rows_of(rows, task):
@@ -45,7 +45,7 @@ def rows():
     """Of a network with drawn weights and of a baseline."""
     networks, told = {"skips": tiny_infiller(drawn=0.1), "vanilla": vanilla()}, []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_infill, "TASKS", SOME)
+        patch.setattr(infilling, "TASKS", SOME)
         rows = table([walk(40, turn_rate=-1.0, seed=2)], networks, ours="skips",
                      progress=lambda done, of: told.append((done, of)))  # fmt: skip
     assert told == [(number + 1, len(SOME)) for number in range(len(SOME))]
@@ -76,7 +76,7 @@ def test_bones_are_rigid_but_for_networks_as_they_are(rows):
 
 def test_an_untrained_network_is_interpolation_and_no_better(clips, monkeypatch):
     """It gives back the guess that it was shown: were that the truth, it would be perfect."""
-    monkeypatch.setattr(bench_infill, "TASKS", SOME[1:2])
+    monkeypatch.setattr(infilling, "TASKS", SOME[1:2])
     found, again = (rows_of(table(clips, {"skips": tiny_infiller()}, ours="skips"), "gap") for _ in range(2))
     assert found == again
     assert found["interpolation"]["error_cm"] > 0.5
@@ -98,7 +98,7 @@ class Keeping:
 @pytest.mark.parametrize("task", [SOME[1], SOME[3]], ids=lambda task: task.name)
 def test_networks_are_not_shown_what_is_missing(clips, monkeypatch, task):
     """What is known is the truth, and what is not is some way from it."""
-    monkeypatch.setattr(bench_infill, "TASKS", (task,))
+    monkeypatch.setattr(infilling, "TASKS", (task,))
     keeping = Keeping()
     table(clips[:1], {"skips": keeping}, ours="skips")
     image = keeping.images[0]

@@ -7,7 +7,7 @@ import torch
 from helpers import walk
 from tiny_infiller import tiny_infiller
 
-from controllers.bench_lost import LIMBS_LOST, at_pose, lost_joints, mean_rotations
+from controllers.benchmarks.lost_joints import LIMBS_LOST, at_pose, lost_joints, mean_rotations
 from mapctl.skeleton import CANONICAL
 
 

@@ -5,7 +5,7 @@ import math
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
-from controllers.bench_tween import FRAMES, table
+from controllers.benchmarks.tweening import FRAMES, table
 
 
 def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough():

@@ -8,12 +8,12 @@ import torch
 from helpers import run, walk
 from tiny_infiller import tiny_infiller
 
-from controllers import blend as blending
-from controllers.blend import Borrowed, blend
-from controllers.filling import InfillSettings
+from controllers.inbetweening import blend as blending
+from controllers.inbetweening.blend import Borrowed, blend
+from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.metrics import worst
+from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -95,7 +95,7 @@ ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", 
 
 
 def peaks_of(motion):
-    return worst.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
+    return worst_frame.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
 
 
 @pytest.mark.parametrize("fps", [30, 60])

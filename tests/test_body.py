@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes_walks import renamed, scaled, walk
 
-from mapctl.body import colours
-from mapctl.body.anatomy import Anatomy
-from mapctl.body.mannequin import Body
-from mapctl.body.parts import Part, Side
-from mapctl.body.shapes import RoundedBoxes, Surface, ball, frame_along, merge
+from mapctl.joint_parts import Part, Side
+from mapctl.mesh import colours
+from mapctl.mesh.anatomy import Anatomy
+from mapctl.mesh.mannequin import Body
+from mapctl.mesh.primitives import RoundedBoxes, Surface, ball, frame_along, merge
 from mapctl.skeleton import CANONICAL, Skeleton
-from scenes.lighting import shade
+from scenes.renderers.lighting import shade
 
 GREY = colours.rgb("slate")
 LIMBS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")

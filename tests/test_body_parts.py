@@ -3,7 +3,7 @@
 import pytest
 from scenes_walks import walk
 
-from mapctl.body.parts import Part, Role, Side, role, roles
+from mapctl.joint_parts import Part, Role, Side, role, roles
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
 NAMES = {

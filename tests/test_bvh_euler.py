@@ -9,7 +9,8 @@ import torch
 from turns import turn
 
 from mapctl import rotations
-from mapctl.formats import bvh, bvh_text
+from mapctl.formats import bvh
+from mapctl.formats.bvh import text
 
 AXES = "XYZ"
 EULER_ORDERS = [order for order in product(range(3), repeat=3) if order[0] != order[1] != order[2]]
@@ -17,12 +18,12 @@ EULER_ORDERS = [order for order in product(range(3), repeat=3) if order[0] != or
 
 def written_angles(quat, order, tmp_path):
     """What is written in the three channels of a single joint, degrees."""
-    tree = bvh_text.Hierarchy(("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {})
-    (tmp_path / "in.bvh").write_text(bvh_text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
+    tree = text.Hierarchy(("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {})
+    (tmp_path / "in.bvh").write_text(text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
     source = bvh.load(tmp_path / "in.bvh")
     root = torch.zeros(len(quat), 3, dtype=torch.float64)
     replace(source, root_position=root, local_quat_xyzw=quat[:, None]).save(tmp_path / "out.bvh")
-    return bvh_text.read(tmp_path / "out.bvh").values
+    return text.read(tmp_path / "out.bvh").values
 
 
 def euler_quat(degrees, order):

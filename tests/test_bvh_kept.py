@@ -10,14 +10,14 @@ from lossy_files import with_all_channels
 
 import mapctl
 from mapctl import rotations
-from mapctl.formats import bvh_text
+from mapctl.formats.bvh import text
 
 FRAMES = 40
 
 
 def restless(file, seed):
     """The file's angles as equal ones: now and then the other Euler solution, or by whole turns, joint by joint."""
-    read, draw = bvh_text.read(file), np.random.default_rng(seed)
+    read, draw = text.read(file), np.random.default_rng(seed)
     values = read.values.copy()
     for _, _, columns in read.hierarchy.rotation_groups():
         for joint in columns:
@@ -28,7 +28,7 @@ def restless(file, seed):
             other = (frame >= from_frame[0]) & (frame < from_frame[1])
             turns = 360 * draw.integers(-2, 3, (4, 3))[np.sort(draw.integers(0, 4, FRAMES))]
             values[:, joint] = np.where(other[:, None], twin, values[:, joint]) + turns
-    file.write_text(bvh_text.compose(read.hierarchy, read.frame_time, values, decimals=6))
+    file.write_text(text.compose(read.hierarchy, read.frame_time, values, decimals=6))
     return file
 
 
@@ -59,7 +59,7 @@ def test_frames_that_are_not_changed_have_the_numbers_of_the_file(source, tmp_pa
     start, stop = gap
     motion = turned(mapctl.load(source), start, stop)
     motion.save(tmp_path / "out.bvh")
-    before, after = (bvh_text.read(path).values for path in (source, tmp_path / "out.bvh"))
+    before, after = (text.read(path).values for path in (source, tmp_path / "out.bvh"))
     known = [frame for frame in range(FRAMES) if not start <= frame < stop]
     assert np.array_equal(before[known], after[known])
     again = mapctl.load(tmp_path / "out.bvh")
@@ -71,7 +71,7 @@ def test_angles_in_changed_frames_go_on_from_those_before_or_lead_to_those_after
     start, stop = gap
     motion = mapctl.load(source)
     turned(motion, start, stop, size=0.02).save(tmp_path / "out.bvh")
-    read = bvh_text.read(tmp_path / "out.bvh")
+    read = text.read(tmp_path / "out.bvh")
     edges = slice(max(0, start - 1), stop if start else stop + 1)
     for _, _, columns in read.hierarchy.rotation_groups():
         steps = np.abs(np.diff(read.values[edges][:, columns], axis=0))
@@ -81,13 +81,13 @@ def test_angles_in_changed_frames_go_on_from_those_before_or_lead_to_those_after
 def test_where_the_file_is_continuous_the_change_meets_it_on_both_sides(tmp_path):
     """Also where it has wound up by many turns by then."""
     file = with_all_channels(on_rig("daz", FRAMES), tmp_path / "in.bvh", seed=5)
-    read = bvh_text.read(file)
+    read = text.read(file)
     _, _, columns = read.hierarchy.rotation_groups()[0]
     wound = read.values.copy()
     wound[:, columns[1, 0]] += np.linspace(0, 1000, FRAMES)
-    file.write_text(bvh_text.compose(read.hierarchy, read.frame_time, wound, decimals=6))
+    file.write_text(text.compose(read.hierarchy, read.frame_time, wound, decimals=6))
     turned(mapctl.load(file), 10, 30, size=0.01).save(tmp_path / "out.bvh")
-    assert np.abs(bvh_text.read(tmp_path / "out.bvh").values - wound).max() < 3
+    assert np.abs(text.read(tmp_path / "out.bvh").values - wound).max() < 3
 
 
 def test_what_was_written_into_the_tensors_is_written(source, tmp_path):
@@ -108,5 +108,5 @@ def test_a_part_of_the_motion_is_itself(source, tmp_path):
 
 def test_in_another_unit_the_numbers_stay(source, tmp_path):
     mapctl.formats.load(source, metres_per_unit=0.0254).save(tmp_path / "out.bvh")
-    before, after = (bvh_text.read(path).values for path in (source, tmp_path / "out.bvh"))
+    before, after = (text.read(path).values for path in (source, tmp_path / "out.bvh"))
     assert np.abs(before - after).max() < 1e-6

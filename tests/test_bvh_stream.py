@@ -9,7 +9,7 @@ import torch
 import mapctl
 from mapctl import rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.formats.bvh_stream import bvh_stream
+from mapctl.formats.bvh.stream import bvh_stream
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 

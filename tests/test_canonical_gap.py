@@ -7,10 +7,10 @@ import torch
 from captures import apart_deg, on_rig
 from helpers import walk
 
-from controllers.canonical_gap import CanonicalGap
+from controllers.inbetweening.canonical_gap import CanonicalGap
 from mapctl import retarget
-from mapctl.capture.masks import ALL, ROOT, Mask
-from mapctl.gaps.lost import Lost
+from mapctl.inbetweening.missing import Lost
+from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL
 
 RATES = (10, 24, 25, 30, 50, 60, 120)

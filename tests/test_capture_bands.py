@@ -10,8 +10,8 @@ from captures import DEGREE, apart_deg, shaken, trembling, vectors
 from helpers import generator, quat_xyzw
 
 from mapctl import rotations
-from mapctl.capture.bands import Bands, split
 from mapctl.motion import Motion
+from mapctl.recording.frequency_bands import Bands, split
 from mapctl.skeleton import CANONICAL
 
 JOINTS = CANONICAL.num_joints

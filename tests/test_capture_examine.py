@@ -7,8 +7,8 @@ import torch
 from captures import DEGREE, apart_deg, on_rig, shaken, trembling
 
 from mapctl import rotations
-from mapctl.capture.examine import examine
-from mapctl.capture.masks import ROOT, Mask
+from mapctl.recording.inspection import examine
+from mapctl.recording.masks import ROOT, Mask
 
 
 @pytest.fixture(scope="module", params=["canonical", "bandai", "daz"])

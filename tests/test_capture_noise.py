@@ -7,7 +7,7 @@ import torch
 from captures import DEGREE, shaken, swaying
 from helpers import generator
 
-from mapctl.capture.noise import angle_noise, place_noise
+from mapctl.recording.noise_estimation import angle_noise, place_noise
 
 
 def all_seen(quats):

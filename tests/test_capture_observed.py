@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import rotations
-from mapctl.capture import Capture, filled, last_seen, next_seen
+from mapctl.recording import Capture, filled, last_seen, next_seen
 from mapctl.skeleton import CANONICAL
 
 masks = st.lists(st.lists(st.booleans(), min_size=9, max_size=9), min_size=1, max_size=3).map(torch.tensor)

@@ -7,8 +7,8 @@ import torch
 from captures import DEGREE, apart_deg, shaken, swaying
 from helpers import generator
 
-from mapctl.capture.residuals import returned
-from mapctl.capture.smoothing import smoothed_angles
+from mapctl.recording.residual_motion import returned
+from mapctl.recording.sure_smoothing import smoothed_angles
 
 
 def even(degrees, joints=6):

@@ -8,7 +8,7 @@ from captures import DEGREE, shaken, swaying
 from helpers import generator, quat_xyzw
 
 from mapctl import rotations
-from mapctl.capture.spikes import angle_spikes, leaps, place_spikes
+from mapctl.recording.spike_detection import angle_spikes, leaps, place_spikes
 
 
 def turned(quats, frames, joint, degrees):

@@ -7,9 +7,9 @@ from helpers import bandai_skeleton, generator
 from performers import FEET, TOES, Performer
 from rig_maker import Make, make, names_of
 
-from controllers.blend import Borrowed, blend
-from controllers.chain import ChainSettings, chain
-from controllers.filling import InfillSettings
+from controllers.inbetweening.blend import Borrowed, blend
+from controllers.inbetweening.chain import ChainSettings, chain
+from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import retarget
 from mapctl.motion import Motion
 from mapctl.skeleton import TOE_REST_HEIGHT

@@ -9,11 +9,11 @@ import torch
 from helpers import corpus, generator, tiny_density, walk
 
 import priors
-from mapctl import choosing
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, encode
+from mapctl.problem import density_selection
 from mapctl.rotations import from_rotation_vector, multiply
-from priors.training.lstm_gmm import window_nats
+from priors.training.recipes.lstm_gmm import window_nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ def tiny():
 def test_densities_are_compared_in_physical_units():
     """The narrower statistics are worth their logarithm; those of the contact bits count for neither."""
     wide, narrow = flat("wide", 0.0), flat("narrow", -10.0, std=0.5)
-    assert choosing.likeliest_of_motion([wide, narrow], walk(20)).density is narrow
-    found = choosing.likeliest_of_motion([wide, narrow], walk(20)).nats
+    assert density_selection.likeliest_of_motion([wide, narrow], walk(20)).density is narrow
+    found = density_selection.likeliest_of_motion([wide, narrow], walk(20)).nats
     assert found == pytest.approx({"wide": 0.0, "narrow": -10 + LAYOUT.continuous * math.log(2)}, rel=1e-5)
 
 
@@ -62,34 +62,36 @@ def test_other_units_of_the_network_change_nothing():
             return (-0.5 * (white / spread).square() - spread.log()).sum(-1)
 
     densities = [Gaussian(f"{std}", 0.0, torch.full((LAYOUT.size,), std)) for std in (0.5, 3.0)]
-    nats = choosing.likeliest_of_motion(densities, walk(20)).nats
+    nats = density_selection.likeliest_of_motion(densities, walk(20)).nats
     assert nats["0.5"] == pytest.approx(nats["3.0"], rel=1e-5)
 
 
 def test_any_rate_will_do_and_too_little_is_refused():
     densities = [flat("a", 1.0), flat("b", 2.0)]
-    assert choosing.likeliest_of_motion(densities, walk(40, fps=120)).density.name == "b"
+    assert density_selection.likeliest_of_motion(densities, walk(40, fps=120)).density.name == "b"
     with pytest.raises(MapctlError, match="at least two frames"):
-        choosing.likeliest_of_motion(densities, walk(2, fps=120))
+        density_selection.likeliest_of_motion(densities, walk(2, fps=120))
     with pytest.raises(RequestError, match="no density"):
-        choosing.likeliest_of_motion([], walk(20))
+        density_selection.likeliest_of_motion([], walk(20))
 
 
 def test_a_density_without_a_finite_answer_is_never_chosen():
-    choice = choosing.likeliest_of_motion([flat("lost", math.nan), flat("bad", -1e4)], walk(20))
+    choice = density_selection.likeliest_of_motion([flat("lost", math.nan), flat("bad", -1e4)], walk(20))
     assert choice.density.name == "bad"
-    lost = choosing.likeliest_of_motion([flat("lost", math.nan)], walk(20))
+    lost = density_selection.likeliest_of_motion([flat("lost", math.nan)], walk(20))
     assert 0 < lost.weight < 1e-3
 
 
 @pytest.mark.parametrize(("lacking", "weight"), [(-50.0, 1.0), (0.0, 1.0), (33.0, 0.5), (99.0, 0.25)])
 def test_the_weight_falls_with_what_is_lacking(lacking, weight):
-    assert choosing.likeliest_of_motion([flat("a", 0.0, usual=lacking)], walk(20)).weight == pytest.approx(weight)
+    assert density_selection.likeliest_of_motion([flat("a", 0.0, usual=lacking)], walk(20)).weight == pytest.approx(
+        weight
+    )
 
 
 def test_a_card_that_does_not_say_what_is_usual_leaves_the_weight():
     assert tiny().usual_nats == -math.inf
-    assert choosing.likeliest_of_motion([tiny()], walk(20)).weight == 1.0
+    assert density_selection.likeliest_of_motion([tiny()], walk(20)).weight == 1.0
 
 
 def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
@@ -97,7 +99,7 @@ def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
     turns = 0.3 * torch.randn(*motion.local_quat_xyzw.shape[:2], 3, generator=generator(), dtype=torch.float64)
     twisted = replace(motion, local_quat_xyzw=multiply(motion.local_quat_xyzw, from_rotation_vector(turns)))
     name = tiny().name
-    plain, other = (choosing.likeliest_of_motion([tiny()], each).nats[name] for each in (motion, twisted))
+    plain, other = (density_selection.likeliest_of_motion([tiny()], each).nats[name] for each in (motion, twisted))
     assert plain > other + 10
 
 
@@ -109,7 +111,7 @@ def test_blur_widens_the_density_and_nothing_widens_it_by_nothing():
     assert torch.allclose(none, sharp, rtol=1e-4)
     away = features.clone()
     away[..., 10] += 0.3  # radians, far beyond what the walks show
-    blurs = [tiny().blurred(times * choosing.spread()) for times in (1, 30)]
+    blurs = [tiny().blurred(times * density_selection.spread()) for times in (1, 30)]
     costs = [float((density.log_prob(features[:, 1:], state) - density.log_prob(away[:, 1:], state)).mean())
              for density in (tiny(), *blurs)]  # fmt: skip
     assert costs[0] > costs[1] > costs[2] > 0
@@ -119,7 +121,7 @@ def test_a_blurred_density_is_that_of_a_sum():
     """Of one Gaussian with independent values: its variances and those of the errors add up."""
     density = tiny_density(components=1)
     features = encode(walk(12))[0].float()[None]
-    state, spread = density.initial_state(features[:, 0]), 3 * choosing.spread()
+    state, spread = density.initial_state(features[:, 0]), 3 * density_selection.spread()
     model = density.reference
     with torch.no_grad():
         mixture, _ = model(model.normalise(features[:, :-1]), (state.hidden, state.cell))
@@ -135,7 +137,10 @@ def test_a_blurred_density_is_that_of_a_sum():
 def test_what_windows_of_its_own_data_reach_is_below_their_mean():
     found = window_nats(tiny().reference, [corpus(4, 120)])
     assert found["p2"] <= found["mean"]
-    name, walked = tiny().name, choosing.likeliest_of_motion([tiny().blurred(choosing.spread())], walk(100))
+    name, walked = (
+        tiny().name,
+        density_selection.likeliest_of_motion([tiny().blurred(density_selection.spread())], walk(100)),
+    )
     assert abs(walked.nats[name] - found["mean"]) < 30
 
 

@@ -7,19 +7,19 @@ import torch
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
-from controllers.canonical_gap import CanonicalGap
-from controllers.choosing_proposals import STANDING, ChoiceSettings, choose_proposals, viewers_cost
-from controllers.keys import Keys
-from controllers.steered import RolloutSettings
-from controllers.sureness import sureness_of
-from controllers.tween import tween
+from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.inbetweening.error_estimates import sureness_of
+from controllers.inbetweening.geometry.footholds import hold_planted
+from controllers.inbetweening.keyframes import Keys
+from controllers.inbetweening.proposers.rollout import RolloutSettings
+from controllers.inbetweening.proposers.selection import STANDING, ChoiceSettings, choose_proposals, viewers_cost
+from controllers.inbetweening.tween import tween
 from mapctl import contacts
-from mapctl.gaps.footholds import hold_planted
-from mapctl.gaps.lost import Lost, straight
+from mapctl.inbetweening.missing import Lost, straight
+from mapctl.problem.window_solvers import LatentMethod
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.solver.methods import LatentMethod
 
 TOES = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
 QUICK = ChoiceSettings(tempos=(1.0, 0.9), rolling=RolloutSettings(

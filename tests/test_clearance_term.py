@@ -9,7 +9,7 @@ from helpers import walking_trial
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import Clearance
-from mapctl.terms.footing import TOES
+from mapctl.terms.foot_contact import TOES
 
 FRAMES = 20
 INDICES = [CANONICAL.index(name) for name in TOES]

@@ -15,7 +15,7 @@ from helpers import run
 import mapctl
 from mapctl import cli
 from mapctl.commands import COMMANDS
-from mapctl.commands.options import parse_size
+from mapctl.commands.shared.options import parse_size
 from mapctl.commands.train import Train
 
 HEAVY = (
@@ -146,7 +146,7 @@ def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
 
 def test_long_motion_comes_in_pieces(prior, tmp_path, monkeypatch):
     """Of two seconds here: 4.5 s are three; the header was written before the last of them was drawn."""
-    monkeypatch.setattr(import_module("controllers.generate"), "_CHUNK", 60)
+    monkeypatch.setattr(import_module("controllers.generation.generate"), "_CHUNK", 60)
     assert run("generate", "-o", tmp_path, "--seconds", 4.5, "--prior", prior, "--quiet") == 0
     motion = mapctl.load(tmp_path / "generated_000.bvh")
     assert motion.num_frames == 135
@@ -297,7 +297,7 @@ def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
 
 
 def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
-    from mapctl.formats.bvh_stream import BvhStream
+    from mapctl.formats.bvh.stream import BvhStream
 
     append = BvhStream.append
 
@@ -315,7 +315,7 @@ def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
 
 def presses_ctrl_c(monkeypatch, *, after):
     """Every walk from here on is interrupted once so many frames are solved."""
-    from mapctl.solver.window import WindowSolver
+    from mapctl.problem.receding_horizon import WindowSolver
 
     solve = WindowSolver.solve
 

@@ -197,7 +197,7 @@ def test_weights_that_are_none(fails):
 
 
 def test_missing_extra_is_named(fails, monkeypatch):
-    monkeypatch.setattr("mapctl.commands.outputs.find_spec", lambda name: None)
+    monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None)
     assert "pip install 'mapctl[render]'" in fails("follow", "line:4", "-o", "a.bvh", "--video", "a.mp4")
 
 

@@ -6,7 +6,7 @@ from helpers import generator, walk
 
 from mapctl.features import LAYOUT, Place, encode
 from mapctl.terms import Closeness
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 TARGET = encode(walk(20, turn_rate=0.3))[0]
 

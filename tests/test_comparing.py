@@ -13,10 +13,10 @@ from helpers import random_motion, run, walk
 from rig_maker import Make, make, names_of, person
 
 from mapctl import metrics
-from mapctl.metrics.comparing import make_comparable
+from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
+from mapctl.retarget.upright import UNKNOWN, put_upright
 from mapctl.skeleton import Skeleton
-from mapctl.upright import UNKNOWN, put_upright
 
 TREMOR = math.radians(0.3)
 

@@ -9,7 +9,7 @@ from helpers import corpus, generator
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
-from priors.training.corruption import LIMBS, CorruptionSettings, clean_capture, corrupted
+from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, clean_capture, corrupted
 
 JOINTS = CANONICAL.num_joints
 NOTHING = CorruptionSettings(clean=1.0, uneven=0.0, markers=0.0, correlated=0.0, spikes=0.0, dropout=0.0, limb=0.0,

@@ -11,13 +11,13 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from tiny_denoiser import tiny_denoiser
 
 import mapctl
-from controllers.denoise import DenoiseSettings, begins_with_tpose, denoise
-from controllers.denoised import faded, joined
-from controllers.standing import StandingSettings
+from controllers.common.map_refinement import StandingSettings
+from controllers.denoising.denoise import DenoiseSettings, begins_with_tpose, denoise
+from controllers.denoising.result import faded, joined
 from mapctl import retarget, rotations
-from mapctl.capture.masks import ALL, ROOT, Mask
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
+from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -220,7 +220,7 @@ def test_a_tpose_in_frame_0_stays(rig):
 
 @pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])
 def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, fps):
-    module = import_module("controllers.denoise")  # the package has a function of this name
+    module = import_module("controllers.denoising.denoise")  # the package has a function of this name
     monkeypatch.setattr(module, "_PIECE", 2.0)
     monkeypatch.setattr(module, "_SHARED", 0.5)
     truth, calls = on_rig(rig, 7 * fps, fps=fps), []

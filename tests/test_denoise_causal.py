@@ -9,11 +9,11 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from test_denoise import QUICK
 from tiny_denoiser import tiny_denoiser
 
-from controllers.denoise_causal import CausalDenoiser, CausalSettings, denoise_causal
-from controllers.standing import StandingSettings
-from mapctl.capture.masks import Mask
+from controllers.common.map_refinement import StandingSettings
+from controllers.denoising.causal import CausalDenoiser, CausalSettings, denoise_causal
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
+from mapctl.recording.masks import Mask
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 

@@ -9,12 +9,12 @@ from captures import apart_deg, noisy, on_rig, shaken
 from test_denoise import QUICK
 from tiny_denoiser import tiny_denoiser
 
-from controllers.denoise import begins_with_tpose, denoise
-from controllers.denoise_passage import passage
+from controllers.denoising.denoise import begins_with_tpose, denoise
+from controllers.denoising.lead_transition import passage
 from mapctl import retarget, rotations
-from mapctl.capture.masks import Mask
 from mapctl.motion import Motion
-from mapctl.rigs import Rig
+from mapctl.recording.masks import Mask
+from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
 SHARES = (0.26, 0.53, 0.78, 0.95)

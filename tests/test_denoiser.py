@@ -11,12 +11,13 @@ from tiny_denoiser import CONFIG, card, network, save_tiny_denoiser, tiny_denois
 
 import priors
 from mapctl import rotations
-from mapctl.capture import Capture
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.protocols import Denoiser
+from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
-from priors import checkpoints, denoiser
-from priors.denoiser import DenoiserConfig
+from priors import checkpoints
+from priors.denoiser import network as denoiser
+from priors.denoiser.network import DenoiserConfig
 
 JOINTS = CANONICAL.num_joints
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mapctl.features import LAYOUT, Place, decode, mirror_features
 from mapctl.skeleton import CANONICAL
-from priors.end_effectors import channels, end_effectors
+from priors.refiner.end_effectors import channels, end_effectors
 
 JOINTS = ("hips", "head", "leftHand", "rightToes")
 

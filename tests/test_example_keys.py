@@ -6,7 +6,7 @@ import pytest
 from helpers import run
 
 import mapctl
-from mapctl.metrics import worst
+from mapctl.metrics import worst_frame
 from mapctl.skeleton import CANONICAL
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -15,7 +15,7 @@ ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", 
 
 def peaks_of(path):
     motion = mapctl.load(path)
-    return worst.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
+    return worst_frame.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
 
 
 @pytest.mark.slow

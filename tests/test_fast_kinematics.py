@@ -12,12 +12,13 @@ import torch
 from catalogue import FRAMES, TERMS
 from helpers import generator, walk
 
-from mapctl import curves, fast_kinematics
-from mapctl.curve_axes import axes_near
+from mapctl import curves
 from mapctl.curves import Curve
+from mapctl.curves.local_frame import axes_near
 from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.kinematics import fast
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 PAST = 8
 ROOT = FilePath(__file__).resolve().parent.parent
@@ -40,7 +41,7 @@ def reference(monkeypatch):
     """A switch that leaves only the torch code."""
 
     def switch():
-        monkeypatch.setattr(fast_kinematics, "serves", lambda features, start, skeleton: False)
+        monkeypatch.setattr(fast, "serves", lambda features, start, skeleton: False)
 
     return switch
 
@@ -156,7 +157,7 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_the_body_is_left_alone_while_only_the_root_is_asked_for(monkeypatch):
-    monkeypatch.setattr(fast_kinematics, "joints_world", None)
+    monkeypatch.setattr(fast, "joints_world", None)
     whole = trial()
     assert TERMS["path of the hips"](whole).shape == (3, FRAMES)
     with pytest.raises(TypeError):

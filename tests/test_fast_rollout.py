@@ -8,11 +8,11 @@ import pytest
 import torch
 from numba import njit
 
-from mapctl import compiled
+from mapctl.numerics import jit
 from mapctl.protocols import Plan
-from priors import fast_kernels
-from priors.fast_rollout import FastRollout
-from priors.lstm_gmm import LstmGmm, LstmGmmConfig, LstmState
+from priors.lstm_gmm.fast import kernels
+from priors.lstm_gmm.fast.rollout import FastRollout
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
 
 CASES = [(7, 1, 5), (64, 3, 5), (64, 8, 1), (33, 5, 4), (256, 1, 5)]  # width, batch, components
 FRAMES = 12
@@ -173,7 +173,7 @@ def test_a_plan_that_does_not_fit_is_refused():
 def test_exponential_is_accurate_over_its_range():
     x = np.linspace(-87, 88, 20_001, dtype=np.float32)
     wanted = np.exp(x.astype(np.float64))
-    exp, tanh = fast_kernels.exp, fast_kernels.tanh
+    exp, tanh = kernels.exp, kernels.tanh
 
     @njit
     def both(values, exponentials, tangents):
@@ -189,7 +189,7 @@ def test_exponential_is_accurate_over_its_range():
 
 
 def test_kernels_compile_where_nothing_can_be_kept(monkeypatch):
-    real, asked = compiled.njit, []
+    real, asked = jit.njit, []
 
     def nowhere_to_write(**options):
         asked.append(options.get("cache", False))
@@ -197,12 +197,12 @@ def test_kernels_compile_where_nothing_can_be_kept(monkeypatch):
             raise RuntimeError("cannot cache function: no locator available")
         return real(**options)
 
-    monkeypatch.setattr(compiled, "njit", nowhere_to_write)
-    entry, _ = compiled.compilers("contract")
+    monkeypatch.setattr(jit, "njit", nowhere_to_write)
+    entry, _ = jit.compilers("contract")
     assert entry(lambda x: x + 1)(1) == 2
     assert True in asked
 
 
 def test_importing_the_module_does_not_import_the_compiler():
-    code = "import sys, priors.fast_rollout; sys.exit('numba' in sys.modules)"
+    code = "import sys, priors.lstm_gmm.fast.rollout; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

@@ -8,16 +8,16 @@ import torch
 from helpers import corpus, write_corpus
 
 import priors
-from priors.lstm_gmm import LstmGmmConfig
-from priors.training import health, run
-from priors.training.lstm_gmm import Trainer, TrainingSettings
+from priors.lstm_gmm.network import LstmGmmConfig
+from priors.training import free_run, run
+from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings
 
 TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 
 def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
     request = run.TrainRequest(write_corpus(tmp_path / "data"), tmp_path / "first", config=TINY, settings=SETTINGS,
                                device="cpu", starts=4, labels=r"-(?P<number>[0-4])")  # fmt: skip
     first = run.train(request)

@@ -4,15 +4,15 @@ import pytest
 import torch
 from helpers import corpus, generator, tiny_density, tiny_model
 
-from controllers.finish import FinishSettings, finish
+from controllers.generation.foot_cleanup import FinishSettings, finish
 from mapctl.contacts import without_short_runs
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place
-from mapctl.solver.methods import GuidedMethod
-from mapctl.solver.variables import Context
-from mapctl.solver.window import WindowSettings
+from mapctl.problem.latent_noise import Context
+from mapctl.problem.receding_horizon import WindowSettings
+from mapctl.problem.window_solvers import GuidedMethod
 from mapctl.terms import Closeness, Footing
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 SETTINGS = FinishSettings(window=WindowSettings(frames=12, overlap=6))
 DENSITY = tiny_density()

@@ -11,20 +11,20 @@ import torch
 from helpers import generator, tiny_density
 
 import controllers
-from controllers.feasibility import after_the_fact, in_advance
-from controllers.follow import FollowSettings, follow_terms
-from controllers.starting import choose_start
+from controllers.common.feasibility import after_the_fact, in_advance
+from controllers.common.initial_state import choose_start
+from controllers.following.follow import FollowSettings, follow_terms
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import encode
-from mapctl.intent import Follow, SpeedProfile
+from mapctl.intent.path import Follow, SpeedProfile
 from mapctl.kinematics import heading
+from mapctl.problem.receding_horizon import WindowSettings
+from mapctl.problem.solution import Outcome
+from mapctl.problem.window_solvers import LatentMethod
 from mapctl.protocols import Abilities
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
-from mapctl.solver.methods import LatentMethod
-from mapctl.solver.result import Outcome
-from mapctl.solver.window import WindowSettings
 from mapctl.terms import Likelihood
 
 DENSITY = tiny_density()
@@ -37,7 +37,7 @@ HILL = torch.stack(
 
 
 def follow(curve, *, seed=0, **wishes):
-    return controllers.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **wishes})
+    return controllers.following.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **wishes})
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_an_interrupted_walk_keeps_what_was_solved():
 
 
 def test_the_deadlines_clock_starts_with_the_call(monkeypatch):
-    module = sys.modules["controllers.follow"]
+    module = sys.modules["controllers.following.follow"]
     slow = partial(after_a_while, module.choose_start)
     monkeypatch.setattr(module, "choose_start", slow)
     assert follow(curves.circle(radius=2), seconds=5, deadline_seconds=0.05).motion.num_frames == 1

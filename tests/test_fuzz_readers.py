@@ -14,11 +14,12 @@ from test_asf_amc import assert_same_places
 from test_bvh_malformed import GOOD
 
 import mapctl
-from mapctl.capture.masks import Mask, load_masks
-from mapctl.command_files import read_commands
-from mapctl.curve_files import read_csv, read_svg
+from mapctl.curves.files import read_csv, read_svg
 from mapctl.errors import FileFormatError
-from mapctl.formats import npz, reading
+from mapctl.formats import npz
+from mapctl.formats import text as reading
+from mapctl.intent.steering_csv import read_commands
+from mapctl.recording.masks import Mask, load_masks
 
 FEW = settings(max_examples=40, deadline=None, derandomize=True)
 

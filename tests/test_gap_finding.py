@@ -8,9 +8,9 @@ from captures import apart_deg, on_rig
 from helpers import quat_xyzw
 
 from mapctl import rotations
-from mapctl.capture.masks import ALL, ROOT, Mask
 from mapctl.errors import RequestError
-from mapctl.gaps.finding import find
+from mapctl.recording.gap_detection import find
+from mapctl.recording.masks import ALL, ROOT, Mask
 
 RIGS = ("canonical", "bandai", "daz")
 

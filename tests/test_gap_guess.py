@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import kinematics
-from mapctl.gaps.guess import led, slerped
+from mapctl.inbetweening.interpolation import led, slerped
 from mapctl.skeleton import CANONICAL
 
 FRAMES = 40

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import kinematics, rotations
-from mapctl.gaps import PositionImage
+from mapctl.inbetweening import PositionImage
 from mapctl.skeleton import CANONICAL
 
 TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))

@@ -6,9 +6,9 @@ from captures import apart_deg, on_rig
 from scipy.spatial.transform import Rotation, Slerp
 
 from mapctl import retarget
-from mapctl.capture.masks import ALL, ROOT, Mask
 from mapctl.errors import RequestError
-from mapctl.gaps.lost import Lost, put_back, straight
+from mapctl.inbetweening.missing import Lost, put_back, straight
+from mapctl.recording.masks import ALL, ROOT, Mask
 
 RIGS = ("canonical", "bandai", "daz")
 

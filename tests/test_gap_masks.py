@@ -8,9 +8,9 @@ from helpers import generator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapctl.capture.faults import runs
+from mapctl.recording.artefacts import runs
 from mapctl.skeleton import CANONICAL
-from priors.training.gap_masks import GapSettings, known_places
+from priors.training.augmentation.gap_masks import GapSettings, known_places
 
 BATCH, FRAMES = 400, 120
 GAPS = GapSettings(keys=0.0, joints=0.0, partial=0.0, several=1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapctl.gaps.second_differences import WEIGHTS, solved, touching
+from mapctl.numerics.smooth_offsets import WEIGHTS, solved, touching
 
 SPANS = [(0, 9), (0, 3), (3, 4), (3, 5), (4, 9), (8, 9), (7, 9), (1, 8)]
 

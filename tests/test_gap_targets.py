@@ -8,7 +8,7 @@ from captures import apart_deg
 from helpers import generator, quat_xyzw, walk
 
 from mapctl.errors import RequestError
-from mapctl.gaps.targets import LIMBS, Targets, missed, reached
+from mapctl.inbetweening.effector_targets import LIMBS, Targets, missed, reached
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 

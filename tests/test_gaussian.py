@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import generator
 
-from mapctl import gaussian
+from mapctl.numerics import gaussian
 
 LINE = torch.linspace(0, 3, 40, dtype=torch.float64)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import bandai_skeleton, generator, tiny_density, turn_between, walk
 
-from controllers.generate import GenerateSettings, begin, generate, spread_starts, stream, stream_features
+from controllers.generation.generate import GenerateSettings, begin, generate, spread_starts, stream, stream_features
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place, decode, encode
@@ -22,7 +22,7 @@ RAW = GenerateSettings(finishing=None)
 @pytest.fixture(autouse=True)
 def short_pieces(monkeypatch):
     """Draws are made a piece at a time: the whole piece of 20 s for one second of motion else."""
-    monkeypatch.setattr(sys.modules["controllers.generate"], "_CHUNK", 100)
+    monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 100)
 
 
 def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):
@@ -52,7 +52,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 
 def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
     whole = made(2.0, seed=5)
-    monkeypatch.setattr(sys.modules["controllers.generate"], "_CHUNK", 13)
+    monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 13)
     pieces = list(stream(DENSITY, seconds=2.0, generator=generator(5), settings=RAW))
     assert [piece.num_frames for piece in pieces] == [13, 13, 13, 13, 8]
     joined = made(2.0, seed=5)

@@ -9,9 +9,9 @@ import pytest
 from helpers import random_motion
 
 from mapctl import rotations
-from mapctl.body.skin import at_rest, skin
 from mapctl.errors import RequestError
 from mapctl.formats import gltf
+from mapctl.mesh.skinning import at_rest, skin
 from mapctl.skeleton import CANONICAL
 
 _TYPES = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}

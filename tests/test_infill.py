@@ -8,13 +8,13 @@ from captures import error_cm, on_rig
 from helpers import random_motion, tiny_density
 from tiny_infiller import tiny_infiller
 
-from controllers.infill import InfillSettings, infill
+from controllers.inbetweening.infill import InfillSettings, infill
 from mapctl import retarget
-from mapctl.capture.masks import ALL, ROOT, Mask
 from mapctl.errors import RequestError
-from mapctl.gaps import PositionImage, Proposed
-from mapctl.gaps.lost import Lost, put_back, straight
+from mapctl.inbetweening import PositionImage, Proposed
+from mapctl.inbetweening.missing import Lost, put_back, straight
 from mapctl.motion import Motion
+from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, leg_length
 
 RIGS = ("canonical", "bandai", "daz")

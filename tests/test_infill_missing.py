@@ -11,7 +11,7 @@ from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
 
 import mapctl
-from mapctl.formats import bvh_text
+from mapctl.formats.bvh import text
 
 NAMES = {"canonical": ("leftHand", "rightLowerLeg"), "bandai": ("Hand_L", "LowerLeg_R"), "daz": ("lHand", "rShin")}
 
@@ -90,7 +90,7 @@ def test_what_is_no_nan_has_the_numbers_of_the_file(infilled, clip, tmp_path, ri
     source = clip(rig, seed=seed)
     lossy = without(source, tmp_path / "lossy.bvh", [("", 15, 30)])
     infilled(lossy)
-    before, after = bvh_text.read(source).values, bvh_text.read(tmp_path / "out.bvh").values
+    before, after = text.read(source).values, text.read(tmp_path / "out.bvh").values
     known = [frame for frame in range(45) if not 15 <= frame < 30]
     assert np.array_equal(before[known], after[known])
     assert np.isfinite(after).all()

@@ -11,11 +11,11 @@ from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infill
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
-from mapctl.gaps.image import mirrored_places
+from mapctl.inbetweening.position_image import mirrored_places
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.infiller import InfillerConfig
+from priors.infiller.network import InfillerConfig
 
 JOINTS = CANONICAL.num_joints
 ARCHITECTURES = ("skips", "image", "vanilla", "manifold")

@@ -6,8 +6,8 @@ import threading
 
 import pytest
 
-from mapctl import interruption
-from mapctl.interruption import SIGNALS, held_back, listen
+from mapctl.runtime import interruption
+from mapctl.runtime.interruption import SIGNALS, held_back, listen
 
 ALL = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 

@@ -9,9 +9,10 @@ from helpers import bandai_skeleton, cmu_skeleton, generator, quat_xyzw, random_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapctl import inverse_kinematics, rotations
+from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.gaps.targets import LIMBS
+from mapctl.inbetweening.effector_targets import LIMBS
+from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -20,7 +21,7 @@ SKELETONS = {"canonical": CANONICAL, "bandai": bandai_skeleton(), "daz": cmu_ske
 
 def solved(places, start, skeleton=CANONICAL, **options):
     """The solution as a motion."""
-    quats = inverse_kinematics.solve(places, start, skeleton, **options)
+    quats = inverse.solve(places, start, skeleton, **options)
     root = options.get("root_position", places[:, 0])
     return Motion(skeleton, walk(2).fps, root, quats)
 
@@ -50,12 +51,8 @@ def test_twist_and_swing_of_a_walk_come_back_as_places(rig):
     assert torch.allclose(lengths(made), lengths(still), atol=1e-12)
 
 
-ARM = inverse_kinematics.Limb(
-    *(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1)
-)
-LEG = inverse_kinematics.Limb(
-    *(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1)
-)
+ARM = inverse.Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1))
+LEG = inverse.Limb(*(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1))
 
 
 @settings(max_examples=10, deadline=None)
@@ -216,7 +213,7 @@ def test_straight_limbs_and_opposite_directions_give_something_finite(direction)
 
 def test_all_joints_in_one_point_give_something_finite():
     start = walk(3).local_quat_xyzw
-    made = inverse_kinematics.solve(torch.zeros(3, CANONICAL.num_joints, 3).double(), start, CANONICAL)
+    made = inverse.solve(torch.zeros(3, CANONICAL.num_joints, 3).double(), start, CANONICAL)
     assert made.isfinite().all()
 
 
@@ -236,4 +233,4 @@ def test_signs_of_the_solution_do_not_jump():
 def test_other_shapes_are_refused():
     motion = walk(4)
     with pytest.raises(RequestError, match=r"must be of the same frames and of 21 joints"):
-        inverse_kinematics.solve(motion.joint_positions()[:, :20], motion.local_quat_xyzw[:, :20], CANONICAL)
+        inverse.solve(motion.joint_positions()[:, :20], motion.local_quat_xyzw[:, :20], CANONICAL)

@@ -7,14 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rig_maker import Make, make, names_of, person, versions_of
 
-from controllers.keys import limb_end
-from mapctl import rigs
-from mapctl.body.parts import Side, role
-from mapctl.capture.masks import ALL, ROOT, Mask, by_own_names, masked
+from controllers.inbetweening.keyframes import limb_end
 from mapctl.errors import MapctlError, RequestError
-from mapctl.gaps.targets import LIMBS
+from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.joint_names import canonical_joints, find_joint, nearest, shorten, suggest
-from mapctl.retarget import map_rig
+from mapctl.joint_parts import Side, role
+from mapctl.recording.masks import ALL, ROOT, Mask, by_own_names, masked
+from mapctl.retarget import map_rig, rigs
 from mapctl.skeleton import CANONICAL
 
 VERSIONS = [(rig.name, version) for rig in rigs.known() for version in range(versions_of(rig.name))]

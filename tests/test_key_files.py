@@ -3,7 +3,7 @@
 import pytest
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.key_files import KeyRequest, PlacedKey, read_keys
+from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey, read_keys
 
 TWO = '[[key]]\nframe = 0\npose = "a.bvh"\n[[key]]\nframe = 30\npose = "b.bvh"\n'
 

@@ -10,15 +10,15 @@ from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 import mapctl
-from controllers.filling import InfillSettings
-from controllers.keyed import keyed
-from controllers.tween import key_errors, tween
+from controllers.inbetweening.keyframe_poses import keyed
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.tween import key_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.key_files import KeyRequest, PlacedKey
+from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey
 from mapctl.kinematics import heading
+from mapctl.retarget.stance import Stance
 from mapctl.skeleton import Skeleton, leg_length
-from mapctl.stance import Stance
 
 RIGS = ("canonical", "bandai", "daz")
 

@@ -7,15 +7,15 @@ import torch
 from helpers import corpus, generator
 
 from mapctl.errors import RequestError
-from priors import labels
 from priors.checkpoints import Card
-from priors.density import LstmGmmDensity
-from priors.labels import Labels
-from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.lstm_gmm import labels
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.lstm_gmm.labels import Labels
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus
-from priors.training.lstm_gmm import Trainer, TrainingSettings, statistics
-from priors.training.matching import MatchingSettings
-from priors.training.starts import choose
+from priors.training.initial_states import choose
+from priors.training.moment_matching import MatchingSettings
+from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings, statistics
 
 CLIPS = ("set_walk_glad_1.bvh", "set_turn-left_glad_2.bvh", "set_turn-right_old_3.bvh", "set_run_old_4.bvh", "odd.bvh")
 PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"

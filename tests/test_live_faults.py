@@ -12,12 +12,12 @@ from websockets.sync.client import connect
 
 from mapctl import formats
 from mapctl.errors import MapctlError
+from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL
-from mapctl.steering import Command
 from scenes.live import recording as recording_module
-from scenes.live.orders import Orders
+from scenes.live.app import Show
+from scenes.live.inputs import Orders
 from scenes.live.recording import Recording, as_some_file, keep
-from scenes.live.show import Show
 
 
 @pytest.fixture

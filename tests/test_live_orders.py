@@ -6,8 +6,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mapctl.steering import Command
-from scenes.live.orders import AS_IT_LIKES, Bounds, Orders
+from mapctl.intent.steering import Command
+from scenes.live.inputs import AS_IT_LIKES, Bounds, Orders
 
 BOUNDS = Bounds(3.8, {"gait": ["run", "walk"], "style": ["old"]})
 ANYTHING = st.one_of(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapctl.streaming import Delivered
-from scenes.live.pace import Pace
+from mapctl.runtime.live_protocol import Delivered
+from scenes.live.realtime import Pace
 
 
 def step(seconds: float, *, spare: float = 0.03, evaluations: int = 14) -> Delivered:

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection, connect
 
-from scenes.live.shield import Quiet, may_come, one_line, only_own_pages
+from scenes.live.access import Quiet, may_come, one_line, only_own_pages
 
 OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 

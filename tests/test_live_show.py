@@ -13,14 +13,14 @@ from stage import Actor, delivered, run
 from mapctl import formats
 from mapctl.commands.live import Live
 from mapctl.errors import RequestError
+from mapctl.intent.steering import Command
+from mapctl.runtime.live_protocol import LiveCharacter
 from mapctl.skeleton import CANONICAL
-from mapctl.steering import Command
-from mapctl.streaming import LiveCharacter
 from scenes.live import ground
-from scenes.live.gauges import Gauges
-from scenes.live.orders import Orders
+from scenes.live.app import Show
+from scenes.live.inputs import Orders
+from scenes.live.readouts import Gauges
 from scenes.live.recording import Recording, as_file
-from scenes.live.show import Show
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from torch.distributions import Bernoulli, Categorical, Independent, MixtureSame
 
 from mapctl.features import LAYOUT
 from mapctl.protocols import Plan
-from priors.lstm_gmm import LstmState
+from priors.lstm_gmm.network import LstmState
 
 SIZE = LAYOUT.continuous
 NETWORKS = densities()

@@ -6,8 +6,8 @@ from captures import on_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapctl.capture.masks import ALL, ROOT, Mask, load_masks, masked, part_of
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.recording.masks import ALL, ROOT, Mask, load_masks, masked, part_of
 
 
 @pytest.fixture

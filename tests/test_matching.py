@@ -6,9 +6,9 @@ from helpers import corpus, finite_difference, generator, tiny_model
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from priors.lstm_gmm import LstmGmmConfig
-from priors.training.lstm_gmm import Trainer, TrainingSettings
-from priors.training.matching import MatchingSettings, compare, mismatch
+from priors.lstm_gmm.network import LstmGmmConfig
+from priors.training.moment_matching import MatchingSettings, compare, mismatch
+from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings
 
 SETTINGS = MatchingSettings(batch=8, context=10, wander=0, frames=10)
 

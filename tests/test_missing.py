@@ -9,8 +9,8 @@ from lossy_files import archive_without, with_all_channels, without
 
 import mapctl
 from mapctl import formats
-from mapctl.capture.masks import ROOT, Mask, of_missing
 from mapctl.errors import FileFormatError
+from mapctl.recording.masks import ROOT, Mask, of_missing
 
 RIGS = ("canonical", "bandai", "daz")
 HAND = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}

@@ -10,7 +10,7 @@ from helpers import walk
 
 from mapctl.features import LAYOUT, encode, root_places
 from mapctl.terms import Observation
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 def trial_of(seed=1) -> Trial:

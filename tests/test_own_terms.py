@@ -7,9 +7,9 @@ import torch
 from test_terms_contract import trial
 
 from mapctl.errors import RequestError
-from mapctl.solver.objective import Objective
+from mapctl.problem.objective import Objective
 from mapctl.terms import Noise
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)

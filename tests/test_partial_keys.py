@@ -10,11 +10,11 @@ from captures import on_rig
 from helpers import walk
 from tiny_infiller import tiny_infiller
 
-from controllers.filling import InfillSettings
-from controllers.keys import Key, Keys
-from controllers.tween import tween
-from mapctl.gaps.targets import LIMBS
-from mapctl.metrics import worst
+from controllers.inbetweening.keyframes import Key, Keys
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.tween import tween
+from mapctl.inbetweening.effector_targets import LIMBS
+from mapctl.metrics import worst_frame
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 
@@ -24,7 +24,7 @@ HANDS = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
 
 def peaks_of(motion):
     canonical = to_canonical(motion)[0]
-    return worst.peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
+    return worst_frame.peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
 
 
 def asked(motion, keys, *, method="infiller", drawn=0.0):

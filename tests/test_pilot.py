@@ -7,12 +7,12 @@ import pytest
 import torch
 from helpers import walk
 
-from controllers.pilot import Pilot
-from controllers.steer import SteerFrames
+from controllers.steering.autopilot import Pilot
+from controllers.steering.steer import SteerFrames
 from mapctl import curves
+from mapctl.intent.steering import Command, Limits
 from mapctl.motion import Motion
-from mapctl.solver.result import Ledger
-from mapctl.steering import Command, Limits
+from mapctl.problem.solution import Ledger
 
 LINE = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 5.0]]))
 

@@ -9,11 +9,11 @@ from helpers import corpus, generator, walks
 from scipy.spatial.transform import Rotation
 
 from mapctl.features import LAYOUT, Place, decode
-from mapctl.gaps.lost import Lost, straight
+from mapctl.inbetweening.missing import Lost, straight
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus
-from priors.training.position_windows import PositionWindows, local_places
+from priors.training.windows import PositionWindows, local_places
 
 SWAP = CANONICAL.mirror_partners()
 

@@ -6,8 +6,8 @@ from captures import on_rig
 from helpers import generator, walk
 
 from mapctl.errors import RequestError
-from mapctl.gaps.reaching import reach_with_body
-from mapctl.gaps.targets import Targets
+from mapctl.inbetweening.effector_targets import Targets
+from mapctl.kinematics.whole_body import reach_with_body
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 

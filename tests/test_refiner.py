@@ -14,9 +14,9 @@ import priors
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
 from priors import checkpoints
-from priors import refiner as refiners
-from priors.end_effectors import channels
-from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
+from priors.refiner import network as refiners
+from priors.refiner.end_effectors import channels
+from priors.refiner.network import LstmRefiner, RefinerConfig, RefinerNetwork
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
 BITS = LAYOUT.slices["contacts"]

@@ -13,15 +13,15 @@ from tiny_prior import save_tiny_prior
 
 import priors
 from mapctl import cli
-from mapctl.commands import train_refiner
 from mapctl.commands.train import Train
+from mapctl.commands.train import refiner as train_refiner
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from priors import checkpoints
-from priors.refiner import RefinerConfig
+from priors.refiner.network import RefinerConfig
 from priors.training import corpus as corpora
 from priors.training import refiner_run
-from priors.training.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
+from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
 from priors.training.refiner_run import RefinerRequest, command, score, train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))

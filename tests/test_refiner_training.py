@@ -11,13 +11,13 @@ from torch.nn.functional import logsigmoid
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place, decode, encode, mirror_features
-from priors.end_effectors import channels
-from priors.refiner import RefinerConfig
-from priors.training import refiner as training
-from priors.training.adversary import Critic, History
+from priors.refiner.end_effectors import channels
+from priors.refiner.network import RefinerConfig
+from priors.training.adversarial import Critic, History
 from priors.training.corpus import Corpus
-from priors.training.matching import compare
-from priors.training.refiner import MOMENTS, AdversarialSettings, AdversarialTrainer
+from priors.training.moment_matching import compare
+from priors.training.recipes import refiner as training
+from priors.training.recipes.refiner import MOMENTS, AdversarialSettings, AdversarialTrainer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
 SETTINGS = AdversarialSettings(rounds=5, window=12, batch=4, warm_up=2, head_start=0, critic_updates=1, history=10,

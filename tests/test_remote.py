@@ -12,11 +12,11 @@ import pytest
 from tiny_prior import save_tiny_prior
 
 import priors
-from controllers.desk import work
-from controllers.remote import Remote, RemoteRequest
+from controllers.steering.process import Remote, RemoteRequest
+from controllers.steering.process_worker import work
 from mapctl.errors import MapctlError, RequestError
-from mapctl.steering import Command
-from mapctl.streaming import LiveCharacter
+from mapctl.intent.steering import Command
+from mapctl.runtime.live_protocol import LiveCharacter
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from mapctl import curves, report
 from mapctl.motion import Motion
+from mapctl.problem.solution import Ledger, LedgerEntry, Outcome, Solution, Status, WindowRecord
 from mapctl.skeleton import CANONICAL
-from mapctl.solver.result import Ledger, LedgerEntry, Outcome, Solution, Status, WindowRecord
 
 FRAMES = 90
 

@@ -10,19 +10,19 @@ from rig_maker import Make, make, names_of, person
 
 import controllers
 import mapctl
-from controllers import steer
-from controllers.follow import FollowSettings
-from controllers.generate import GenerateSettings, generate
-from controllers.stature import Stature
-from mapctl import curves, retarget, rigs
+from controllers.common.character import Stature
+from controllers.following.follow import FollowSettings
+from controllers.generation.generate import GenerateSettings, generate
+from controllers.steering import steer
+from mapctl import curves, retarget
 from mapctl.errors import RequestError
-from mapctl.rigs import figure
-from mapctl.rigs.tpose import vector
+from mapctl.intent.steering import Command
+from mapctl.problem.receding_horizon import WindowSettings
+from mapctl.problem.window_solvers import LatentMethod
+from mapctl.retarget import figure, rigs
+from mapctl.retarget.reference_pose import vector
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
-from mapctl.solver.methods import LatentMethod
-from mapctl.solver.window import WindowSettings
-from mapctl.steering import Command
 from mapctl.terms import Footing
 
 QUICK = FollowSettings(window=WindowSettings(frames=10, overlap=4, past=12),
@@ -201,12 +201,12 @@ def test_the_canonical_body_is_not_scaled_at_all():
 def test_twice_the_legs_make_twice_the_way():
     """The same walk, of everything twice as long: a prior cannot tell it from its own."""
     density, double = tiny_density(), Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 2)
-    small = controllers.follow(density, curves.circle(radius=2.0), seconds=1.0, speed=1.0, settings=QUICK,
+    small = controllers.following.follow(density, curves.circle(radius=2.0), seconds=1.0, speed=1.0, settings=QUICK,
                                generator=generator())  # fmt: skip
     footing = Footing(sigma_speed=0.06, sigma_height=0.02, sigma_below=0.01, rest_height=2 * TOE_REST_HEIGHT)
     twice = {name: 2 * getattr(QUICK, name) for name in
              ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")}  # fmt: skip
-    large = controllers.follow(density, curves.circle(radius=4.0), seconds=1.0, speed=2.0, skeleton=double,
+    large = controllers.following.follow(density, curves.circle(radius=4.0), seconds=1.0, speed=2.0, skeleton=double,
                                settings=replace(QUICK, footing=footing, **twice), generator=generator())  # fmt: skip
     assert large.motion.skeleton is double
     places = large.motion.joint_positions() / 2

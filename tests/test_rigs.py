@@ -12,10 +12,11 @@ from rig_maker import Make, make, names_of, person, versions_of
 from scipy.spatial.transform import Rotation
 
 import mapctl
-from mapctl import kinematics, retarget, rigs, rotations
+from mapctl import kinematics, retarget, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import bvh
-from mapctl.rigs.matching import ACCEPTED, REQUIRED, match
+from mapctl.retarget import rigs
+from mapctl.retarget.joint_matching import ACCEPTED, REQUIRED, match
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
 PRESETS = [rig.name for rig in rigs.known()]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mapctl.errors import RequestError
-from mapctl.roles import find_feet, find_hips, find_upper_legs
+from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
 from mapctl.skeleton import CANONICAL, Skeleton
 
 # hips, left and right upper leg, left and right toe; the order in a file varies and tells nothing.

@@ -8,7 +8,7 @@ import pytest
 import scenes
 from mapctl import curves
 from mapctl.errors import FileFormatError, RequestError
-from scenes.description import Actor, load, place
+from scenes.scene_file import Actor, load, place
 
 GOOD = """
 outputs = ["walk.mp4", "walk.bvh", "walk.json"]

@@ -10,13 +10,13 @@ from helpers import moved
 from scenes_walks import walk
 
 from mapctl import curves
-from mapctl.body import colours
 from mapctl.errors import RequestError
-from scenes import offscreen, painters
+from mapctl.mesh import colours
 from scenes.cameras import CameraSettings
 from scenes.content import Painter
 from scenes.film import film
-from scenes.painters import back_end, painter
+from scenes.renderers import offscreen, select
+from scenes.renderers.select import back_end, painter
 from scenes.stage import Shot, Stage
 
 av = pytest.importorskip("av")
@@ -223,7 +223,7 @@ def test_without_opengl_there_are_stick_figures_and_one_line_says_so(monkeypatch
         raise offscreen.NoGraphicsError("no OpenGL without a window (libEGL.so.1 not found)")
 
     monkeypatch.setattr(offscreen, "_graphics", missing)
-    monkeypatch.delenv(painters.VARIABLE, raising=False)
+    monkeypatch.delenv(select.VARIABLE, raising=False)
     with caplog.at_level(logging.WARNING, logger="mapctl.scenes"):
         brush = painter()
     assert brush.name.startswith("matplotlib")
@@ -242,8 +242,8 @@ def test_a_missing_pyrender_counts_as_no_graphics(monkeypatch):
 
 
 def test_the_renderer_can_be_chosen_by_the_environment(monkeypatch):
-    monkeypatch.setenv(painters.VARIABLE, "stick")
+    monkeypatch.setenv(select.VARIABLE, "stick")
     assert painter().name.startswith("matplotlib")
-    monkeypatch.setenv(painters.VARIABLE, "crayon")
+    monkeypatch.setenv(select.VARIABLE, "crayon")
     with pytest.raises(RequestError, match="auto, egl or stick"):
         painter()

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapctl.body import colours
 from mapctl.errors import RequestError
+from mapctl.mesh import colours
 from scenes import overlays
 
 

@@ -5,8 +5,8 @@ import torch
 from captures import apart_deg, error_cm, on_rig
 from helpers import generator
 
-from controllers.spoiling import CONDITIONS, misplaced, noisy, sliding, true_contacts, without_arm
-from mapctl.capture.masks import masked
+from controllers.benchmarks.corruptions import CONDITIONS, misplaced, noisy, sliding, true_contacts, without_arm
+from mapctl.recording.masks import masked
 
 
 @pytest.fixture(scope="module", params=["canonical", "bandai", "daz"])

@@ -8,21 +8,22 @@ import torch
 from captures import apart_deg
 from helpers import finite_difference, generator, tiny_density, walk
 
-from controllers import standing
-from controllers.standing import StandingSettings, guide_of, rest_height, stand
-from mapctl import choosing, rotations
-from mapctl.capture import Capture
-from mapctl.capture.faults import runs
+from controllers.common import map_refinement
+from controllers.common.map_refinement import StandingSettings, guide_of, rest_height, stand
+from mapctl import rotations
 from mapctl.contacts import steadied
 from mapctl.features import PRIOR_FPS, Place
 from mapctl.motion import Motion
+from mapctl.problem import density_selection
+from mapctl.problem.objective import Objective
+from mapctl.problem.pose_offsets import Guide, Poses
+from mapctl.recording import Capture
+from mapctl.recording.artefacts import runs
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.solver.objective import Objective
-from mapctl.solver.poses import Guide, Poses
 from mapctl.terms import Clearance, Footing, Noise
-from mapctl.terms.footing import TOES
+from mapctl.terms.foot_contact import TOES
 
 TOE = [CANONICAL.index(name) for name in TOES]
 QUICK = StandingSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
@@ -145,7 +146,7 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
 def test_of_several_densities_the_likelier_counts_in_each_window():
     motion = walk(50)
     near = tiny_density()
-    far = replace(near, name="far", reference=near.reference.blurred(100 * choosing.spread()))
+    far = replace(near, name="far", reference=near.reference.blurred(100 * density_selection.spread()))
     stood = stand(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10), densities=[far, near])
     for part in stood.stretches:
         assert part.prior == max(part.nats, key=lambda name: part.nats[name])
@@ -155,7 +156,7 @@ def test_of_several_densities_the_likelier_counts_in_each_window():
 def test_a_walk_that_is_moving_begins_so():
     """The density is not shown a first frame that stands: its step is the second's."""
     motion = walk(30)
-    place = standing._before(guide_of(motion, torch.zeros(30, 2, dtype=torch.bool)))
+    place = map_refinement._before(guide_of(motion, torch.zeros(30, 2, dtype=torch.bool)))
     step = motion.root_position[1, [0, 2]] - motion.root_position[0, [0, 2]]
     assert torch.allclose((motion.root_position[0, [0, 2]] - place.position_xz), step, atol=1e-4)
 
@@ -185,13 +186,13 @@ def test_windows_meet_without_a_jump():
 
 def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
     motion = standing_still(50, drift=0.2)
-    found = standing.minimise
+    found = map_refinement.minimise
 
     def lost(*args, **kwargs):
         result = found(*args, **kwargs)
         return replace(result, x=torch.full_like(result.x, math.nan), energy=torch.full_like(result.energy, math.nan))
 
-    monkeypatch.setattr(standing, "minimise", lost)
+    monkeypatch.setattr(map_refinement, "minimise", lost)
     stood = stand(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10))
     assert stood.motion.num_frames == 50
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-4

@@ -9,14 +9,14 @@ from helpers import generator, tiny_density
 from tiny_prior import save_tiny_prior
 
 import priors
-from controllers import steer
-from controllers.bench_steer import SteeringSettings, steering
-from controllers.loop import Recorder, StepRecord, StreamClock, WallClock, drive, timing
-from controllers.pursuit import Pursuit
-from controllers.steer import SteerSettings
+from controllers.benchmarks.steering import SteeringSettings, steering
+from controllers.steering import steer
+from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, timing
+from controllers.steering.pure_pursuit import Pursuit
+from controllers.steering.steer import SteerSettings
 from mapctl import curves
 from mapctl.errors import RequestError
-from mapctl.steering import Command, CommandTrack
+from mapctl.intent.steering import Command, CommandTrack
 
 DENSITY = tiny_density()
 QUICK = SteerSettings(horizon=8, commit=3, evaluations=4, least_evaluations=2)

@@ -10,8 +10,8 @@ from helpers import walk
 
 import mapctl
 from mapctl import cli
+from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics.travel import by_command, travelled
-from mapctl.steering import Command, CommandTrack
 
 SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
 

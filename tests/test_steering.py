@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapctl.command_files import read_commands
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.steering import STEP_LENGTHS, Command, CommandTrack, Limits, Wish
+from mapctl.intent.steering import STEP_LENGTHS, Command, CommandTrack, Limits, Wish
+from mapctl.intent.steering_csv import read_commands
 
 ANGLES = st.floats(-20, 20)
 SPEEDS = st.floats(0, 5)

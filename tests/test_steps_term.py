@@ -6,7 +6,7 @@ from helpers import walk
 
 from mapctl.features import LAYOUT, encode
 from mapctl.terms import Steps
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 def trial(contacts, *, before=None, contacts_before=(False, False)) -> Trial:

@@ -10,10 +10,10 @@ from test_steer import AHEAD, QUICK, begun
 from test_terms_contract import trial
 from test_window import BEGUN, METHOD, SHORT, context, solver, terms_of
 
-from controllers import loop, steer
-from controllers.loop import LoopSettings
-from mapctl.solver.methods import LatentMethod
-from mapctl.steering import Command, Limits, Wish
+from controllers.steering import loop, steer
+from controllers.steering.loop import LoopSettings
+from mapctl.intent.steering import Command, Limits, Wish
+from mapctl.problem.window_solvers import LatentMethod
 from mapctl.terms import Footing
 
 

@@ -14,7 +14,7 @@ from mapctl.features import LAYOUT, Place, encode, root_places
 from mapctl.rotations import rotate_ground
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.terms import Footing, Likelihood, Noise, Path, Seam
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 PAST = 8
 each_term = pytest.mark.parametrize("name", TERMS)

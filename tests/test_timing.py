@@ -9,12 +9,12 @@ from captures import on_rig
 from helpers import generator, moved, random_motion, run, walk, walks
 from tiny_infiller import card, network
 
-from controllers import bench_timing
-from controllers.bench_timing import Pairs, fitted, pairs_of, timing
-from controllers.keys import Key, Keys
-from controllers.timing import FEATURES, WEIGHTS, pair_features, suggest
+from controllers.benchmarks import keyframe_timing
+from controllers.benchmarks.keyframe_timing import Pairs, fitted, pairs_of, timing
+from controllers.inbetweening.keyframe_timing import FEATURES, WEIGHTS, pair_features, suggest
+from controllers.inbetweening.keyframes import Key, Keys
 from mapctl import retarget
-from mapctl.gaps.lost import Lost, put_back
+from mapctl.inbetweening.missing import Lost, put_back
 from priors import checkpoints
 
 KEYS = Keys((0, 20, 50, 89))
@@ -126,7 +126,7 @@ def test_the_bench_compares_with_what_poses_do_not_tell(monkeypatch):
     methods = ["suggested", "one speed for all", "one duration for all"]
     assert [(row["pairs"], row["method"]) for row in rows] == [(p, m) for p in ("on the way", "all") for m in methods]
     pairs = pairs_of(walks(3, 90), torch.Generator().manual_seed(0))
-    monkeypatch.setattr(bench_timing, "seconds_of", lambda features, metres: pairs.seconds)
+    monkeypatch.setattr(keyframe_timing, "seconds_of", lambda features, metres: pairs.seconds)
     for row in timing(walks(3, 90)):
         assert row["count"] == 15
         if row["method"] == "suggested":

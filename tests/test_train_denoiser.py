@@ -8,16 +8,23 @@ import torch
 from helpers import corpus, generator
 
 from mapctl import cli
-from mapctl.capture import Capture
-from mapctl.commands import train_windows
 from mapctl.commands.train import Train
+from mapctl.commands.train import windows as train_windows
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from priors.denoiser import DenoiserConfig
+from mapctl.recording import Capture
+from priors.denoiser.network import DenoiserConfig
+from priors.training.augmentation.corruption import CorruptionSettings, clean_capture
 from priors.training.corpus import Corpus
-from priors.training.corruption import CorruptionSettings, clean_capture
-from priors.training.denoiser import DenoiserSettings, DenoiserTrainer, Windows, joint_positions, losses, validate
 from priors.training.denoiser_run import DenoiserRequest, train
+from priors.training.recipes.denoiser import (
+    DenoiserSettings,
+    DenoiserTrainer,
+    Windows,
+    joint_positions,
+    losses,
+    validate,
+)
 
 TINY = DenoiserConfig(width=8, dilations=(1, 2))
 SETTINGS = DenoiserSettings(steps=6, batch=3, window=16)
@@ -73,8 +80,8 @@ def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
 
 
 def test_positions_of_a_clean_capture_are_those_of_its_motion():
-    from mapctl.capture import Cleaned
     from mapctl.features import Place, decode
+    from mapctl.recording import Cleaned
 
     features = corpus(1, 30).features
     capture: Capture = clean_capture(features[None])

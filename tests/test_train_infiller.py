@@ -12,10 +12,10 @@ from tiny_infiller import CONFIG, network
 import mapctl
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
-from priors.infiller import InfillerConfig
-from priors.training.gap_masks import GapSettings
-from priors.training.infiller import InfillerSettings, InfillerTrainer, losses, validate
-from priors.training.position_windows import PositionWindows
+from priors.infiller.network import InfillerConfig
+from priors.training.augmentation.gap_masks import GapSettings
+from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, losses, validate
+from priors.training.windows import PositionWindows
 
 SETTINGS = InfillerSettings(steps=6, batch=4, window=32)
 

@@ -9,17 +9,16 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 from mapctl import cli
-from mapctl.commands import train_refiner
-from mapctl.commands.train import Train
-from priors.refiner import RefinerConfig
+from mapctl.commands.train import Train, refiner
+from priors.refiner.network import RefinerConfig
 from priors.training import refiner_run
-from priors.training.refiner import PAPER, AdversarialSettings
+from priors.training.recipes.refiner import PAPER, AdversarialSettings
 
 
 def requested(*words):
     command = cli.parse(["train", "refiner", "--data", "data", "-o", "run", *words])
     assert isinstance(command, Train)
-    return train_refiner.request(command)
+    return refiner.request(command)
 
 
 def test_what_is_not_asked_for_is_the_measured_recipe():

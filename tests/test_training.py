@@ -15,10 +15,10 @@ import priors
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.features import LAYOUT, encode, ground_speed, mirror_features
 from mapctl.metrics.states import state_summary
-from priors.lstm_gmm import LstmGmmConfig
+from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import health, run, starts
-from priors.training.lstm_gmm import PAPER, Trainer, TrainingSettings, statistics
+from priors.training import free_run, initial_states, run
+from priors.training.recipes.lstm_gmm import PAPER, Trainer, TrainingSettings, statistics
 from priors.training.run import TrainRequest, train
 
 TINY = LstmGmmConfig(width=8, components=2)
@@ -27,7 +27,7 @@ SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
 
 
 def request_in(out, data, **changes):
@@ -201,7 +201,7 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, 
     assert json.loads((out / "checkpoint.json").read_text())["step"] == 3
     assert not (out / "model.safetensors").exists()
     monkeypatch.undo()
-    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
     assert train(request_in(out, data, resume=True)).exists()
 
 
@@ -349,7 +349,7 @@ def test_statistics_are_symmetric_and_floored():
 def test_starts_are_the_states_after_stretches_of_clips():
     data = corpus()
     trainer = Trainer(TINY, SETTINGS, data)
-    found = starts.choose(trainer.model, data, count=3, generator=generator())
+    found = initial_states.choose(trainer.model, data, count=3, generator=generator())
     assert len(set(found.names)) == 3
     clips = dict(zip(data.names, data.clips(), strict=True))
     for row, name in enumerate(found.names):
@@ -361,17 +361,17 @@ def test_starts_are_the_states_after_stretches_of_clips():
 
 
 def test_abilities_are_the_speeds_and_turns_of_the_data():
-    found = starts.abilities(corpus())
+    found = initial_states.abilities(corpus())
     speeds = [float(ground_speed(clip).mean()) for clip in corpus().clips()]
     assert min(speeds) * 0.9 < found.slowest < found.fastest < max(speeds) * 1.05
     assert found.turn_rate == pytest.approx(0.3, abs=0.05)
     still = corpora.Corpus(("still",), (80,), torch.zeros(80, LAYOUT.size))
-    assert starts.abilities(still).turn_rate == 0
+    assert initial_states.abilities(still).turn_rate == 0
 
 
 def test_free_runs_are_compared_with_the_data():
     data = corpus()
-    found = health.free_run(Trainer(TINY, SETTINGS, data).model, data, runs=4, frames=40)
+    found = free_run.free_run(Trainer(TINY, SETTINGS, data).model, data, runs=4, frames=40)
     assert found["free_run_finite"] == 1
     assert found["free_run_speed_ratio"] == pytest.approx(1, abs=0.3)
     assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)

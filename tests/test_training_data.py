@@ -14,10 +14,10 @@ import priors
 from mapctl import retarget
 from mapctl.errors import RequestError
 from priors.training import corpus as corpora
-from priors.training import denoiser_run, health, infiller_run
+from priors.training import denoiser_run, free_run, infiller_run
 from priors.training import run as density_run
-from priors.training.denoiser import DenoiserSettings, DenoiserTrainer, validate
 from priors.training.gathering import Source, gather
+from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, validate
 
 BALL = (
     "HIERARCHY\nROOT Ball\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\n"
@@ -27,7 +27,7 @@ ONE_FRAME = "one.bvh: features need at least two frames"
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(density_run, "free_run", partial(health.free_run, runs=2, frames=20))
+    monkeypatch.setattr(density_run, "free_run", partial(free_run.free_run, runs=2, frames=20))
 
 
 def write_walks(folder, *lengths):

@@ -20,25 +20,16 @@ import tiny_infiller
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
-from mapctl import cli, interruption
-from mapctl.commands import going_on
+from mapctl import cli
+from mapctl.commands.shared import resumption
 from mapctl.commands.train import Train
-from mapctl.interruption import Held
+from mapctl.runtime import interruption
+from mapctl.runtime.interruption import Held
 from priors import checkpoints, tensor_files
-from priors.lstm_gmm import LstmGmmConfig
-from priors.refiner import RefinerConfig
-from priors.training import (
-    corpus,
-    denoiser_run,
-    health,
-    infiller_run,
-    lstm_gmm,
-    refiner,
-    refiner_run,
-    run,
-    run_files,
-    window_run,
-)
+from priors.lstm_gmm.network import LstmGmmConfig
+from priors.refiner.network import RefinerConfig
+from priors.training import corpus, denoiser_run, free_run, infiller_run, refiner_run, run, run_files, window_run
+from priors.training.recipes import lstm_gmm, refiner
 
 
 @dataclass(frozen=True)
@@ -96,7 +87,7 @@ def model(request):
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(run, "free_run", partial(health.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
 
 
 @pytest.fixture
@@ -293,7 +284,7 @@ def test_every_option_is_in_the_line():
              "--skip-first", "--learning-rate", "0.0003", "--seed", "0", "--strict-data"]  # fmt: skip
     given = cli.parse(words)
     assert isinstance(given, Train)
-    assert cli.parse(going_on.words(given)[1:]) == given
+    assert cli.parse(resumption.words(given)[1:]) == given
 
 
 def test_a_full_disk_ends_it_with_its_last_checkpoint(tmp_path, data, monkeypatch, capsys):

@@ -7,7 +7,7 @@ import torch
 
 from mapctl.features import LAYOUT, Place
 from mapctl.terms import Travel
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 FRAMES, PAST = 40, 30
 

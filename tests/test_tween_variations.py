@@ -13,20 +13,20 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 import priors
-from controllers import infill
-from controllers.canonical_gap import CanonicalGap
-from controllers.keys import Keys
-from controllers.steered import RolloutSettings, rolled
-from controllers.tween import tween
-from controllers.variations import best_of, variations
-from mapctl.capture.masks import Mask
+from controllers.inbetweening import infill
+from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.inbetweening.keyframes import Keys
+from controllers.inbetweening.proposers.rollout import RolloutSettings, rolled
+from controllers.inbetweening.tween import tween
+from controllers.inbetweening.variations import best_of, variations
 from mapctl.errors import RequestError
-from mapctl.gaps.lost import Lost
+from mapctl.inbetweening.missing import Lost
+from mapctl.problem.warm_start import Swarm
+from mapctl.problem.window_solvers import LatentMethod
+from mapctl.recording.masks import Mask
 from mapctl.retarget import to_canonical
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.solver.methods import LatentMethod
-from mapctl.solver.proposals import Swarm
 from mapctl.solver.swarm import SwarmSettings
 
 FRAMES, KEYS = 45, (0, 20, 23, 44)

@@ -8,9 +8,9 @@ import pytest
 from helpers import bandai_skeleton, random_motion, walk
 
 from mapctl import rotations
-from mapctl.body.skin import skin
 from mapctl.errors import RequestError
 from mapctl.formats import usd
+from mapctl.mesh.skinning import skin
 from mapctl.skeleton import CANONICAL, Skeleton
 
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")

@@ -7,20 +7,20 @@ import pytest
 import torch
 from helpers import generator, tiny_density, tiny_model
 
-from controllers.starting import choose_start
+from controllers.common.initial_state import choose_start
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, root_places
+from mapctl.problem.latent_noise import Context, Latents
+from mapctl.problem.objective import Objective
+from mapctl.problem.receding_horizon import WindowSettings, WindowSolver
+from mapctl.problem.solution import Outcome
+from mapctl.problem.warm_start import BestOf, SteeringKnots, Swarm
+from mapctl.problem.window_solvers import LatentMethod, StateMethod
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.solver.methods import LatentMethod, StateMethod
-from mapctl.solver.objective import Objective
-from mapctl.solver.proposals import BestOf, SteeringKnots, Swarm
-from mapctl.solver.result import Outcome
 from mapctl.solver.swarm import SwarmSettings
-from mapctl.solver.variables import Context, Latents
-from mapctl.solver.window import WindowSettings, WindowSolver
 from mapctl.terms import Footing, Likelihood, Noise, Path
 
 DENSITY = tiny_density()

@@ -15,14 +15,13 @@ from helpers import killing, run
 
 import priors
 from mapctl import cli
-from mapctl.commands import train_windows
-from mapctl.commands.train import Train
+from mapctl.commands.train import Train, windows
 from mapctl.errors import CheckpointError, MapctlError, RequestError
-from priors.denoiser import DenoiserConfig
-from priors.infiller import InfillerConfig
+from priors.denoiser.network import DenoiserConfig
+from priors.infiller.network import InfillerConfig
 from priors.training import denoiser_run, infiller_run
-from priors.training.denoiser import DenoiserSettings
-from priors.training.infiller import InfillerSettings
+from priors.training.recipes.denoiser import DenoiserSettings
+from priors.training.recipes.infiller import InfillerSettings
 from priors.training.window_run import command
 
 
@@ -58,10 +57,10 @@ class Model:
 
 
 MODELS = (
-    Model(denoiser_run, denoiser_run.DenoiserRequest, train_windows.request, priors.load_denoiser,
+    Model(denoiser_run, denoiser_run.DenoiserRequest, windows.request, priors.load_denoiser,
           tiny_denoiser.CONFIG, replace(tiny_denoiser.CONFIG, width=7), DenoiserSettings(),
           (("--width", "12"), DenoiserConfig(width=12))),
-    Model(infiller_run, infiller_run.InfillerRequest, train_windows.request, priors.load_infiller,
+    Model(infiller_run, infiller_run.InfillerRequest, windows.request, priors.load_infiller,
           tiny_infiller.CONFIG, replace(tiny_infiller.CONFIG, kernel=5), InfillerSettings(),
           (("--architecture", "manifold"), InfillerConfig(architecture="manifold"))),
 )  # fmt: skip

@@ -17,7 +17,7 @@ from mapctl import formats, report
 from mapctl.errors import WriteError
 from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
-from mapctl.formats.bvh_stream import bvh_stream
+from mapctl.formats.bvh.stream import bvh_stream
 from priors import checkpoints
 from priors.tensor_files import write_tensors
 from priors.training import run_files
@@ -169,7 +169,7 @@ def test_a_command_says_it_in_one_line(tmp_path, prior, monkeypatch, capsys, req
 def test_compiled_code_that_finds_no_room_works(tmp_path, monkeypatch):
     from numba.core.caching import FunctionCache
 
-    from mapctl.compiled import compilers
+    from mapctl.numerics.jit import compilers
 
     monkeypatch.setattr(FunctionCache, "save_overload", _no_space)
     monkeypatch.setattr(FunctionCache, "load_overload", lambda *words: None)

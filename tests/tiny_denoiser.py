@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from priors import checkpoints
-from priors.denoiser import ConvDenoiser, DenoiserConfig, DenoiserNetwork
+from priors.denoiser.network import ConvDenoiser, DenoiserConfig, DenoiserNetwork
 
 CONFIG = DenoiserConfig(width=8, dilations=(1, 2))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from priors import checkpoints
-from priors.infiller import ConvInfiller, InfillerConfig, InfillerNetwork
+from priors.infiller.network import ConvInfiller, InfillerConfig, InfillerNetwork
 
 CONFIG = InfillerConfig(widths=(8, 8, 8, 8, 8))
 _SPREAD = 0.1  # metres: what one unit of a place is

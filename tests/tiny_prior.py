@@ -8,7 +8,7 @@ import torch
 from mapctl.features import LAYOUT
 from mapctl.protocols import Abilities
 from priors import checkpoints
-from priors.lstm_gmm import LstmGmm, LstmGmmConfig
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 
 SPEED = 1.2
 CONFIG = LstmGmmConfig(width=16, components=2)

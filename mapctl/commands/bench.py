@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options
-from mapctl.commands.tables import print_records
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options
+from mapctl.commands.shared.tables import print_records
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
-from mapctl.progress import bar
+from mapctl.runtime.progress import bar
 
 if TYPE_CHECKING:
-    from controllers.bench_denoise import Clip
+    from controllers.benchmarks.denoising import Clip
     from mapctl.motion import Motion
 
 
@@ -90,23 +90,23 @@ class Bench:
 
     def _of_a_prior(self) -> list[dict[str, Any]]:
         import priors
-        from controllers import bench
+        from controllers.benchmarks import solver
 
         name = self.prior or ("locomotion-live" if self.what in ("steer", "live") else "locomotion")
         prior = priors.load(name)
         if self.what == "generation":
             return self._generation(prior, name)
         if self.what == "steer":
-            from controllers.bench_steer import SteeringSettings, pursued, steering
+            from controllers.benchmarks.steering import SteeringSettings, pursued, steering
 
             return [*steering(prior, SteeringSettings(commands=self.count)), *pursued(prior)]
         if self.what == "live":
             return self._live(name)
-        return {"speed": bench.speed, "ablation": bench.ablation, "free-run": bench.free_run}[self.what](prior)
+        return {"speed": solver.speed, "ablation": solver.ablation, "free-run": solver.free_run}[self.what](prior)
 
     def _denoise(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_denoise import table
+        from controllers.benchmarks.denoising import table
 
         denoiser = priors.load_denoiser(self.denoiser)
         infiller = priors.load_infiller(self.infiller)
@@ -117,8 +117,8 @@ class Bench:
 
     def _infill(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_infill import by_kind, table
-        from controllers.bench_lost import lost_joints
+        from controllers.benchmarks.infilling import by_kind, table
+        from controllers.benchmarks.lost_joints import lost_joints
         from mapctl import retarget
 
         infiller = priors.load_infiller(self.infiller)
@@ -137,12 +137,12 @@ class Bench:
         return [*rows, *by_kind(kinds, infiller), *lost_joints(kinds, infiller)]
 
     def _tween(self) -> list[dict[str, Any]]:
-        from controllers.bench_tween import table
+        from controllers.benchmarks.tweening import table
 
         return self._of_kinds(table)
 
     def _gaps(self) -> list[dict[str, Any]]:
-        from controllers.bench_gaps import table
+        from controllers.benchmarks.gaps import table
 
         return self._of_kinds(table)
 
@@ -160,7 +160,7 @@ class Bench:
 
     def _timing(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_timing import timing
+        from controllers.benchmarks.keyframe_timing import timing
         from mapctl import retarget
 
         clips = self._clips_by_kind(priors.load_infiller(self.infiller).card)
@@ -168,8 +168,8 @@ class Bench:
 
     def _clips_by_kind(self, card: Any) -> "list[Clip]":
         """Unseen clips, as many of each kind, without their T-poses."""
-        from controllers.bench_denoise import KINDS, Clip, kind_of, shortened
-        from controllers.denoise import begins_with_tpose
+        from controllers.benchmarks.denoising import KINDS, Clip, kind_of, shortened
+        from controllers.denoising.denoise import begins_with_tpose
         from mapctl import formats
 
         paths: dict[str, list[Path]] = {}
@@ -195,7 +195,7 @@ class Bench:
 
     def _live(self, name: str) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_live import live
+        from controllers.benchmarks.live import live
 
         if not 0 < self.minutes <= 24 * 60:
             raise RequestError(f"--minutes must be more than 0 and at most a day, got {self.minutes:g}")
@@ -214,7 +214,7 @@ class Bench:
 
     def _generation(self, prior: Any, name: str) -> list[dict[str, Any]]:
         import priors
-        from controllers.bench_generation import GenerationSettings, generation
+        from controllers.benchmarks.generation import GenerationSettings, generation
         from mapctl import formats, retarget
         from mapctl.features import PRIOR_FPS
 

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands import beside, options
-from mapctl.commands.frames import parse_frame, parse_range
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options, results
+from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
+from mapctl.commands.shared.threads import compute_on_one
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class Blend:
         compute_on_one()
         from mapctl import formats
 
-        beside.check(self.out, self.video, given=(self.source, self.other))
+        results.check(self.out, self.video, given=(self.source, self.other))
         rig = options.read_rig(self.rig)
         motion, other = options.read_motion(self.source, rig), options.read_motion(self.other, None)
         import priors
-        from controllers.blend import Borrowed, blend
-        from controllers.filling import InfillSettings
+        from controllers.inbetweening.blend import Borrowed, blend
+        from controllers.inbetweening.pipeline import InfillSettings
 
         start, stop = parse_range(self.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
         names = tuple(name.strip() for name in self.joints.split(","))
@@ -59,7 +59,7 @@ class Blend:
         settings = InfillSettings(method=self.method)
         done = blend(motion, other, borrowed, priors.load_infiller(self.infiller), settings=settings, rig=rig)
         formats.save(done.motion, self.out)
-        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
+        results.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             print("\n".join((f"{self.out}: {done.motion.num_frames} frames", *done.notes)))
         return 0

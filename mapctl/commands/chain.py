@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import arg
 
-from mapctl.commands import beside, options
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options, results
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
 
 
@@ -41,13 +41,13 @@ class Chain:
         options.check_seed(self.seed)
         from mapctl import formats
 
-        beside.check_method(self.method, infiller=self.infiller)
-        beside.check(self.out, self.video, given=self.clips)
+        results.check_method(self.method, infiller=self.infiller)
+        results.check(self.out, self.video, given=self.clips)
         import torch
 
         import priors
-        from controllers.chain import ChainSettings, chain
-        from controllers.filling import InfillSettings
+        from controllers.inbetweening.chain import ChainSettings, chain
+        from controllers.inbetweening.pipeline import InfillSettings
 
         settings = ChainSettings(piece=self.piece, gap=self._gap())
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
@@ -57,8 +57,8 @@ class Chain:
                      generator=torch.Generator().manual_seed(self.seed))  # fmt: skip
         formats.save(done.motion, self.out)
         if self.video is not None:
-            from mapctl.progress import bar
             from mapctl.retarget import to_canonical
+            from mapctl.runtime.progress import bar
             from scenes.film import film
 
             with bar("filming", quiet=self.quiet) as progress:

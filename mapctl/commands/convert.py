@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs
+from mapctl.commands.shared import options, outputs
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
-    from mapctl.carry import Carried
     from mapctl.motion import Motion
-    from mapctl.rigs import Rig
+    from mapctl.retarget.carry import Carried
+    from mapctl.retarget.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Carr
 
 
     RequestError for rigs that are not known. A clip of the same skeleton stays as it is; others stand on their floor
-    (see mapctl.carry).
+    (see mapctl.retarget.carry).
     """
     from mapctl import retarget
-    from mapctl.carry import Body, Carried, carry
+    from mapctl.retarget.carry import Body, Carried, carry
 
     if rig == "canonical":
         return Carried(retarget.to_canonical(motion, source_rig)[0])

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapctl.commands import options, outputs
-from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
-from mapctl.progress import bar
+from mapctl.commands.shared import options, outputs
+from mapctl.commands.shared.path_walk import INTERRUPTED, Walk, as_follow, walk
+from mapctl.commands.shared.threads import compute_on_one
+from mapctl.runtime.progress import bar
 
 CURVE, SPEED = "figure8:2", "1.2"
 _SIZE = (960, 540)

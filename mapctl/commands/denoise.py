@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import beside, options, outputs
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options, outputs, results
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
-from mapctl.progress import bar
+from mapctl.runtime.progress import bar
 
 if TYPE_CHECKING:
-    from controllers.denoised import Denoised
+    from controllers.denoising.result import Denoised
 
 _NOT_ALL_HOLDS = 3
 _MOST_NAMED = 6
@@ -70,7 +70,7 @@ class Denoise:
         """Check everything, denoise, write, tell."""
         compute_on_one()
         if self.source.is_dir():
-            from mapctl.commands import denoise_folder
+            from mapctl.commands.shared import denoise_folder
 
             return denoise_folder.run(self)
         self._check()
@@ -90,13 +90,13 @@ class Denoise:
 
     def as_report(self, done: "Denoised") -> dict[str, object]:
         """The request, versions, and what the result says of itself."""
-        return beside.report("denoise", self, done.motion, done.summary())
+        return results.report("denoise", self, done.motion, done.summary())
 
     def _check(self) -> None:
         for name, idle in (("cluster", self.cluster is None), ("again", not self.again), ("jobs", self.jobs == 1)):
             if not idle:
                 raise RequestError(f"--{name} is for folders; {self.source} is a file")
-        beside.check(self.out, self.video, self.report, self.plot, given=(self.source,))
+        results.check(self.out, self.video, self.report, self.plot, given=(self.source,))
         outputs.check_plot(self.plot)
 
     def _denoised(self) -> "Denoised":
@@ -108,13 +108,13 @@ class Denoise:
         masks = (*masks, *lost)
         with bar("denoising", quiet=self.quiet) as progress:
             if self.causal:
-                from controllers.denoise_causal import denoise_causal
+                from controllers.denoising.causal import denoise_causal
 
                 delay = _DELAY if self.delay is None else self.delay
                 return denoise_causal(
                     motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
                 )
-            from controllers.denoise import denoise
+            from controllers.denoising.denoise import denoise
 
             return denoise(
                 motion, denoiser, masks=masks, settings=settings, densities=densities, rig=rig, progress=progress
@@ -122,7 +122,7 @@ class Denoise:
 
     def settings(self):
         """What is known of the capture; RequestError for numbers that make no sense."""
-        from controllers.denoise import DenoiseSettings
+        from controllers.denoising.denoise import DenoiseSettings
 
         if self.causal and self.prior is not None:
             raise RequestError("--causal has no time for a density; leave --prior out")
@@ -131,16 +131,16 @@ class Denoise:
         return DenoiseSettings(sigma_deg=self.sigma_deg, sigma_cm=self.sigma_cm, anchor=self.anchor)
 
     def _masks(self):
-        from mapctl.capture.masks import load_masks
+        from mapctl.recording.masks import load_masks
 
         return () if self.mask is None else load_masks(self.mask)
 
     def _pictures(self, done: "Denoised") -> None:
         if self.plot is not None:
-            from scenes.denoise_plot import plot
+            from scenes.plots.denoising import plot
 
             plot(done.capture, done.motion, self.plot, rig=done.rig)
-        beside.film(done.capture, done.motion, self.video, rig=done.rig, quiet=self.quiet)
+        results.film(done.capture, done.motion, self.video, rig=done.rig, quiet=self.quiet)
 
     def _tell(self, done: "Denoised") -> None:
         summary = done.summary()

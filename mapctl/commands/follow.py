@@ -6,11 +6,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs, rigged
-from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
+from mapctl.commands.shared import character, options, outputs
+from mapctl.commands.shared.path_walk import INTERRUPTED, Walk, as_follow, walk
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
-from mapctl.progress import bar
+from mapctl.runtime.progress import bar
 
 _NOT_ALL_HOLDS = 3
 _SIZE = "1280x720"
@@ -32,7 +32,7 @@ class FollowCurve:
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Of everything random: the same seed gives the same file."""
-    rig: rigged.OutRig = "canonical"
+    rig: character.OutRig = "canonical"
     """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     video: options.MaybeFile = None
@@ -57,7 +57,7 @@ class FollowCurve:
         request = as_follow(options.read_curve(self.curve, self.metres_per_unit), self.speed, self.seconds)
         import priors
 
-        person, prior = rigged.read(self.rig), priors.load(self.prior)
+        person, prior = character.read(self.rig), priors.load(self.prior)
         with bar("walking", quiet=self.quiet) as progress:
             done = walk(prior, request, seed=self.seed, progress=progress, person=person)
         video = None if done.interrupted else self.video

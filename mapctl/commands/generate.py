@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from mapctl.commands import options, outputs, rigged
-from mapctl.commands.going_on import telling_what_is_finished
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import character, options, outputs
+from mapctl.commands.shared.resumption import telling_what_is_finished
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
-from mapctl.progress import bar
+from mapctl.runtime.progress import bar
 
 if TYPE_CHECKING:
-    from controllers.generate import GenerateSettings
+    from controllers.generation.generate import GenerateSettings
     from mapctl.motion import Motion
 
 _MOST_CLIPS = 10_000
@@ -50,7 +50,7 @@ class Generate:
     """Leave out the pass that makes planted feet stand: many times faster, with the refiner's feet."""
     no_refine: bool = False
     """Leave the draws as they are: no refiner, and no pass that makes planted feet stand."""
-    rig: rigged.OutRig = "canonical"
+    rig: character.OutRig = "canonical"
     """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     quiet: bool = False
@@ -63,14 +63,14 @@ class Generate:
         import torch
 
         import priors
-        from controllers.generate import spread_starts, stream
+        from controllers.generation.generate import spread_starts, stream
 
         prior = priors.load(self.prior)
         if self.style not in (None, "none"):
             prior = prior.told([name.strip() for name in self.style.split(",")])
         wanted = self.refiner != "auto" or (self.no_footing and not self.no_refine)
         refiner = priors.refiner_of(self.prior, self.refiner) if wanted else None
-        person = rigged.read(self.rig)
+        person = character.read(self.rig)
         if settings.finishing is not None:
             footing = replace(settings.finishing.footing, rest_height=person.toe_rest_height)
             settings = replace(settings, finishing=replace(settings.finishing, footing=footing))
@@ -85,8 +85,8 @@ class Generate:
         return 0
 
     def _checked(self) -> tuple["GenerateSettings", "Motion | None"]:
-        from controllers.finish import FinishSettings
-        from controllers.generate import GenerateSettings
+        from controllers.generation.foot_cleanup import FinishSettings
+        from controllers.generation.generate import GenerateSettings
 
         options.check_seed(self.seed)
         if not 1 <= self.count <= _MOST_CLIPS:
@@ -115,7 +115,7 @@ class Generate:
 
     def _write(self, pieces: Iterable["Motion"], path: Path, frames: int) -> None:
         from mapctl.features import PRIOR_FPS
-        from mapctl.formats.bvh_stream import bvh_stream
+        from mapctl.formats.bvh.stream import bvh_stream
 
         began = time.perf_counter()
         with bar(path.name, quiet=self.quiet) as progress, bvh_stream(path, frames) as file:

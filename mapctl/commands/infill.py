@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
-from mapctl.commands import beside, options
-from mapctl.commands.frames import parse_ranges
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options, results
+from mapctl.commands.shared.frame_syntax import parse_ranges
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
-    from controllers.infill import Infilled
-    from mapctl.capture.masks import Mask
+    from controllers.inbetweening.infill import Infilled
     from mapctl.motion import Motion
-    from mapctl.rigs import Rig
+    from mapctl.recording.masks import Mask
+    from mapctl.retarget.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -67,24 +67,24 @@ class Infill:
             from mapctl import report
 
             report.write(self.as_report(done), self.report)
-        beside.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
+        results.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             self._tell(done)
         return 0
 
     def as_report(self, done: "Infilled") -> dict[str, object]:
         """The request, versions, and what the result says of itself."""
-        return beside.report("infill", self, done.motion, done.summary())
+        return results.report("infill", self, done.motion, done.summary())
 
     def _check(self) -> None:
         if self.curve is not None and self.method == "linear":
             raise RequestError("--curve needs a network's steps; leave --method linear out")
-        beside.check_method(self.method, prior=self.prior, infiller=self.infiller)
-        beside.check(self.out, self.video, self.report, given=(self.source,))
+        results.check_method(self.method, prior=self.prior, infiller=self.infiller)
+        results.check(self.out, self.video, self.report, given=(self.source,))
 
     def _asked(self, motion: "Motion") -> Sequence["Mask"]:
         """What is lost by the options; RequestError for what cannot be."""
-        from mapctl.capture.masks import ALL, Mask
+        from mapctl.recording.masks import ALL, Mask
 
         if not self.gap and self.joints is None:
             return ()
@@ -94,13 +94,13 @@ class Infill:
 
     def _found(self, motion: "Motion") -> Sequence["Mask"]:
         """What is wrong where nothing is marked; RequestError where nothing is."""
-        from mapctl.gaps.finding import find
+        from mapctl.recording.gap_detection import find
 
         return find(motion)
 
     def _infilled(self, motion: "Motion", masks: Sequence["Mask"], rig: "Rig | None") -> "Infilled":
         import priors
-        from controllers.infill import InfillSettings, infill
+        from controllers.inbetweening.infill import InfillSettings, infill
 
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)

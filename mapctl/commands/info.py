@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import clip_info, options
-from mapctl.commands.tables import print_table
+from mapctl.commands.shared import clip_info, options
+from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 
 NOTICE = "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is."

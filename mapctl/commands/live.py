@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-from mapctl.commands import options
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import RequestError
-from mapctl.processes import insist_on_ctrl_c
+from mapctl.runtime.processes import insist_on_ctrl_c
 
 if TYPE_CHECKING:
-    from controllers.remote import Remote
-    from scenes.live.show import Show
+    from controllers.steering.process import Remote
+    from scenes.live.app import Show
 
 _MOST = 16
 _APART = 1.5  # metres between characters where they begin
@@ -56,8 +56,8 @@ class Live:
 
     def _opened(self) -> "Show":
         import priors
-        from scenes.live.orders import Orders
-        from scenes.live.show import Show
+        from scenes.live.app import Show
+        from scenes.live.inputs import Orders
 
         prior = priors.load(self.prior)
         orders = [Orders() for _ in range(self.characters)]
@@ -82,8 +82,8 @@ class Live:
 
     def _characters(self) -> "Sequence[Remote]":
         import priors
-        from controllers.remote import Remote, RemoteRequest
-        from mapctl.steering import Command
+        from controllers.steering.process import Remote, RemoteRequest
+        from mapctl.intent.steering import Command
 
         load = functools.partial(priors.load, self.prior)
         places = [(_APART * (number - (self.characters - 1) / 2), 0.0) for number in range(self.characters)]

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options
-from mapctl.commands.tables import cell, print_table
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options
+from mapctl.commands.shared.tables import cell, print_table
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import CheckpointError, RequestError
 
 if TYPE_CHECKING:
-    from mapctl.commands.clip_sets import ClipSet
-    from mapctl.curve import Curve
+    from mapctl.commands.shared.clip_sets import ClipSet
+    from mapctl.curves.curve import Curve
     from mapctl.motion import Motion
 
 _MOST_LINES = 12  # of notes and clips that are left out
@@ -89,7 +89,7 @@ class Measure:
             raise RequestError(f"{self.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
 
     def _folders(self) -> dict[str, Any]:
-        from mapctl.commands.clip_sets import ClipSet
+        from mapctl.commands.shared.clip_sets import ClipSet
 
         compared = self.reference is not None
         ours = ClipSet.read(self.clip, with_windows=compared)
@@ -106,7 +106,7 @@ class Measure:
         return values if reference is None else values | self._compared(ours, reference)
 
     def _compared(self, ours: "ClipSet", reference: "ClipSet") -> dict[str, Any]:
-        from mapctl.commands.clip_sets import compared_realism, compared_spread
+        from mapctl.commands.shared.clip_sets import compared_realism, compared_spread
 
         realism = compared_realism(ours, reference, seed=self.seed)
         return {
@@ -143,7 +143,7 @@ def _short(lines: Sequence[str]) -> list[str]:
 def _comparable(path: Path) -> "tuple[Motion, list[str]]":
     """A clip as mocap's values were measured, and what could not be made so."""
     from mapctl import formats
-    from mapctl.metrics.comparing import make_comparable
+    from mapctl.metrics.comparison import make_comparable
 
     motion, notes = make_comparable(formats.load(path))
     return motion, [f"{path}: {note}" for note in notes]

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from mapctl.commands import options, outputs
-from mapctl.progress import bar
+from mapctl.commands.shared import options, outputs
+from mapctl.runtime.progress import bar
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Render:
         outputs.check_film(self.out, size)
         curve = None if self.curve is None else options.read_curve(self.curve, self.metres_per_unit)
         from mapctl import formats
-        from mapctl.upright import put_upright
+        from mapctl.retarget.upright import put_upright
         from scenes.cameras import CameraSettings
         from scenes.film import film
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs, rigged
-from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import INTERRUPTED, Walk, as_follow, walk
-from mapctl.progress import bar
+from mapctl.commands.shared import character, options, outputs
+from mapctl.commands.shared.path_walk import INTERRUPTED, Walk, as_follow, walk
+from mapctl.commands.shared.threads import compute_on_one
+from mapctl.runtime.progress import bar
 
 if TYPE_CHECKING:
-    from mapctl.intent import Follow
-    from priors.density import LstmGmmDensity
-    from scenes.description import SceneDescription
+    from mapctl.intent.path import Follow
+    from priors.lstm_gmm.density import LstmGmmDensity
+    from scenes.scene_file import SceneDescription
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class RunScene:
     """The scene file, or the name of a scene that comes with mapctl (`mapctl info` lists them)."""
     out: options.OutFolder = Path()
     """Folder for the scene's outputs; made if it is not there."""
-    rig: rigged.OutRig = "canonical"
+    rig: character.OutRig = "canonical"
     """Whose body the actors have: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     quiet: bool = False
@@ -41,7 +41,7 @@ class RunScene:
         compute_on_one()
         import priors
         import scenes
-        from scenes.description import load
+        from scenes.scene_file import load
 
         scene, curves = load(scenes.find(self.scene))
         requests = [
@@ -50,14 +50,14 @@ class RunScene:
         outputs.check_folder(self.out)
         for path in scene.films(self.out):
             outputs.require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
-        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior), rigged.read(self.rig))
+        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior), character.read(self.rig))
         with outputs.made_folder(self.out):
             self._write(scene, walks, films=() if interrupted else scene.films(self.out))
         return INTERRUPTED if interrupted else 0
 
     def _walk(
         self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity",
-        person: rigged.Wearer,
+        person: character.Wearer,
     ) -> tuple[list[Walk], bool]:  # fmt: skip
         """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
         walks: list[Walk] = []

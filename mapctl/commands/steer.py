@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands import options, outputs, rigged
-from mapctl.commands.threads import compute_on_one
-from mapctl.commands.walks import INTERRUPTED
-from mapctl.progress import bar
-from mapctl.steering import Limits
+from mapctl.commands.shared import character, options, outputs
+from mapctl.commands.shared.path_walk import INTERRUPTED
+from mapctl.commands.shared.threads import compute_on_one
+from mapctl.intent.steering import Limits
+from mapctl.runtime.progress import bar
 
 if TYPE_CHECKING:
-    from controllers.loop import Recorder, StepRecord
+    from controllers.steering.loop import Recorder, StepRecord
+    from mapctl.intent.steering import CommandTrack
     from mapctl.motion import Motion
-    from mapctl.steering import CommandTrack
 
 _NOT_ALL_HOLDS = 3
 _TURN_RATE = round(math.degrees(Limits.turn_rate), 1)
@@ -39,7 +39,7 @@ class Steer:
     cannot keep up the script's time goes slower than the clock's, and the summary says so."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
-    rig: rigged.OutRig = "canonical"
+    rig: character.OutRig = "canonical"
     """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     seed: options.Count = 0
@@ -64,10 +64,10 @@ class Steer:
         compute_on_one()
         self._check()
         import priors
-        from mapctl.command_files import read_commands
+        from mapctl.intent.steering_csv import read_commands
 
         track = read_commands(self.commands)
-        person, prior = rigged.read(self.rig), priors.load(self.prior)
+        person, prior = character.read(self.rig), priors.load(self.prior)
         track, lowered = track.clamped(prior.abilities.fastest_asked)
         for labels in {command.told for command in track.commands if command.told}:
             prior.told(labels)  # what it does not know is said now
@@ -80,7 +80,7 @@ class Steer:
 
             reports.write(report, self.report)
         if self.plot is not None:
-            from scenes.steering_plot import plot
+            from scenes.plots.steering import plot
 
             plot(motion, track, self.plot)
         if not self.quiet:
@@ -102,12 +102,12 @@ class Steer:
         return Limits(self.acceleration, self.braking, math.radians(self.turn_rate))
 
     def _steered(
-        self, prior: Any, track: "CommandTrack", person: rigged.Wearer
+        self, prior: Any, track: "CommandTrack", person: character.Wearer
     ) -> tuple["Recorder", list["StepRecord"], int]:
         import torch
 
-        from controllers import steer
-        from controllers.loop import Recorder, StreamClock, WallClock, drive
+        from controllers.steering import steer
+        from controllers.steering.loop import Recorder, StreamClock, WallClock, drive
         from mapctl.terms import Footing
 
         first, recorder = track.commands[0], Recorder()
@@ -129,7 +129,7 @@ class Steer:
         self, motion: "Motion", recorder: "Recorder", records: Sequence["StepRecord"], track: "CommandTrack",
         lowered: Sequence[str], prior: Any,
     ) -> dict[str, Any]:  # fmt: skip
-        from controllers.loop import timing
+        from controllers.steering.loop import timing
         from mapctl import metrics, report
         from mapctl.metrics.travel import by_command
 

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands import beside, options, tween_variations
-from mapctl.commands.frames import parse_frame
-from mapctl.commands.tables import print_table
-from mapctl.commands.threads import compute_on_one
+from mapctl.commands.shared import options, results, tween_variations
+from mapctl.commands.shared.frame_syntax import parse_frame
+from mapctl.commands.shared.tables import print_table
+from mapctl.commands.shared.threads import compute_on_one
 from mapctl.errors import FileFormatError, RequestError
 
 if TYPE_CHECKING:
-    from controllers.filling import Infilled
-    from controllers.keyed import Keyed
-    from controllers.timing import Interval
-    from mapctl.key_files import KeyRequest
-    from mapctl.rigs import Rig
+    from controllers.inbetweening.keyframe_poses import Keyed
+    from controllers.inbetweening.keyframe_timing import Interval
+    from controllers.inbetweening.pipeline import Infilled
+    from mapctl.intent.keyframe_toml import KeyRequest
+    from mapctl.retarget.rigs import Rig
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Tween:
             from mapctl import report
 
             report.write(self._as_report(done, asked, intervals), self.report)
-        beside.film(asked.motion, done.motion, self.video, rig=asked.rig, quiet=self.quiet)
+        results.film(asked.motion, done.motion, self.video, rig=asked.rig, quiet=self.quiet)
         if not self.quiet:
             self._tell(done, asked, intervals)
         return 0
@@ -100,7 +100,7 @@ class Tween:
             print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
 
     def _timing(self, asked: "Keyed") -> "list[Interval]":
-        from controllers.timing import suggest
+        from controllers.inbetweening.keyframe_timing import suggest
 
         return suggest(asked.motion, asked.keys, asked.rig) if self.suggest_timing else []
 
@@ -112,7 +112,7 @@ class Tween:
     def _key_request(self) -> "KeyRequest | None":
         if not self._of_file:
             return None
-        from mapctl.key_files import read_keys
+        from mapctl.intent.keyframe_toml import read_keys
 
         return read_keys(self.source)
 
@@ -129,12 +129,12 @@ class Tween:
         tween_variations.check(self, given)
         # Variations are rolled by a density whatever the method.
         prior = self.prior if self.variations == self.best_of == 1 else None
-        beside.check_method(self.method, prior=prior, infiller=self.infiller)
+        results.check_method(self.method, prior=prior, infiller=self.infiller)
 
     def _asked(self, request: "KeyRequest | None") -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""
-        from controllers.keyed import Keyed
-        from controllers.keys import Keys, check_limbs
+        from controllers.inbetweening.keyframe_poses import Keyed
+        from controllers.inbetweening.keyframes import Keys, check_limbs
 
         rig = options.read_rig(self.rig)
         if request is not None:
@@ -150,7 +150,7 @@ class Tween:
         return Keyed(motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig)
 
     def _of_key_file(self, request: "KeyRequest", rig: "Rig | None") -> "Keyed":
-        from controllers.keyed import keyed
+        from controllers.inbetweening.keyframe_poses import keyed
 
         try:
             return keyed(request, rig)
@@ -159,8 +159,8 @@ class Tween:
 
     def _made(self, asked: "Keyed") -> "Infilled":
         import priors
-        from controllers.filling import InfillSettings
-        from controllers.tween import tween
+        from controllers.inbetweening.pipeline import InfillSettings
+        from controllers.inbetweening.tween import tween
 
         method = "linear" if self.method == "slerp" else self.method
         infiller = None if method == "linear" else priors.load_infiller(self.infiller or "infiller")
@@ -173,8 +173,8 @@ class Tween:
                      rollable=rollable)  # fmt: skip
 
     def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:
-        from controllers.tween import key_errors
+        from controllers.inbetweening.tween import key_errors
 
         missed = key_errors(done.motion, asked.motion, asked.keys, asked.rig)
         timing = {"timing": [interval.summary() for interval in intervals]} if self.suggest_timing else {}
-        return beside.report("tween", self, done.motion, {"keys": missed, **timing, **done.summary()})
+        return results.report("tween", self, done.motion, {"keys": missed, **timing, **done.summary()})

@@ -6,7 +6,7 @@ from os import PathLike
 from pathlib import PurePath
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import asf_amc, bvh, npz
+from mapctl.formats import acclaim, bvh, npz
 from mapctl.formats.missing import Missing
 from mapctl.motion import Motion
 
@@ -24,10 +24,10 @@ def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {
-    ".bvh": bvh.load, ".npz": npz.load, ".amc": asf_amc.load,
+    ".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load,
 }  # fmt: skip
 _LOSSY_READERS: dict[str, Callable[[str | PathLike[str]], tuple[Motion, Missing]]] = {
-    ".bvh": bvh.load_lossy, ".npz": npz.load_lossy, ".amc": asf_amc.load_lossy,
+    ".bvh": bvh.load_lossy, ".npz": npz.load_lossy, ".amc": acclaim.load_lossy,
 }  # fmt: skip
 WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
     ".bvh": bvh.save, ".npz": npz.save, ".glb": _save_glb,
@@ -52,7 +52,7 @@ def load(
     ending = _readable(path)
     if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
-    motion = READERS[ending](path) if fps is None else asf_amc.load(path, fps=fps)
+    motion = READERS[ending](path) if fps is None else acclaim.load(path, fps=fps)
     return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit)
 
 

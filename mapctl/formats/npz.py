@@ -29,7 +29,7 @@ from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
 from mapctl.formats.missing import Missing
-from mapctl.formats.reading import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, read_bytes, shorten
+from mapctl.formats.text import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, read_bytes, shorten
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 

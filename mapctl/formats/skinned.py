@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapctl.body.shapes import Array
-from mapctl.body.skin import skin
+from mapctl.mesh.primitives import Array
+from mapctl.mesh.skinning import skin
 from mapctl.motion import Motion
 
 

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.curve import Curve
+from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
+from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
 from mapctl.metrics import body, feet, path
 from mapctl.motion import Motion
-from mapctl.roles import find_feet, find_hips, find_upper_legs
 
 _CM = 100.0
 

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import gaussian
-from mapctl.curve import Curve
+from mapctl.curves.curve import Curve
 from mapctl.metrics.smoothing import gaussian_kernel, slow_part
+from mapctl.numerics import gaussian
 
 LOW_PASS_SECONDS = 0.5
 """Standard deviation of the Gaussian that takes natural sway out of the path error."""

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import gaussian
+from mapctl.numerics import gaussian
 
 
 def gaussian_kernel(seconds: float, fps: float) -> Float[Tensor, "taps"]:

@@ -10,10 +10,10 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 from mapctl import contacts
+from mapctl.intent.steering import Command, CommandTrack
+from mapctl.joint_roles import find_feet
 from mapctl.metrics.realism.gait import step_lengths
 from mapctl.motion import Motion
-from mapctl.roles import find_feet
-from mapctl.steering import Command, CommandTrack
 
 _SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not

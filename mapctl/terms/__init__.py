@@ -2,17 +2,17 @@
 
 from mapctl.terms.base import Term
 from mapctl.terms.clearance import Clearance
-from mapctl.terms.closeness import Closeness
-from mapctl.terms.footing import Footing
+from mapctl.terms.foot_contact import Footing
+from mapctl.terms.jerk import Seam
 from mapctl.terms.keyframe import Keyframe
+from mapctl.terms.latent_prior import Noise
 from mapctl.terms.likelihood import Likelihood
-from mapctl.terms.noise import Noise
+from mapctl.terms.motion_tracking import Closeness
 from mapctl.terms.observation import Observation
 from mapctl.terms.path import Path
-from mapctl.terms.seam import Seam
-from mapctl.terms.steps import Steps
+from mapctl.terms.root_velocity import Travel
+from mapctl.terms.step_length import Steps
 from mapctl.terms.support import Support
-from mapctl.terms.travel import Travel
 
 ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe, Clearance, Support)
 

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 @runtime_checkable

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.skeleton import TOE_REST_HEIGHT
-from mapctl.terms.footing import TOES
-from mapctl.trial import Trial
+from mapctl.terms.foot_contact import TOES
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)

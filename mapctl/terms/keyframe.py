@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)

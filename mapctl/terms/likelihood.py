@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)

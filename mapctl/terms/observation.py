@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.trial import Trial
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)

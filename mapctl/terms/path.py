@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import gaussian
-from mapctl.curve_axes import CurveAxes, axes_near
 from mapctl.curves import Curve
-from mapctl.trial import Trial
+from mapctl.curves.local_frame import CurveAxes, axes_near
+from mapctl.numerics import gaussian
+from mapctl.terms.trial import Trial
 
 _REACH = 0.6  # metres around the wanted arc where the nearest place is sought: a crossing's other branch is farther
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from mapctl.contacts import support_speed
 from mapctl.skeleton import TOE_REST_HEIGHT
-from mapctl.terms.footing import TOES
-from mapctl.trial import Trial
+from mapctl.terms.foot_contact import TOES
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mapctl import retarget, rigs
+from mapctl import retarget
 from mapctl.contacts import ContactSettings
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.formats import load
+from mapctl.retarget import rigs
 from priors.tensor_files import write_tensors
 
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"

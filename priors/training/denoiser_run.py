@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from priors.denoiser import DenoiserConfig
-from priors.training.denoiser import DenoiserSettings, DenoiserTrainer, validate
+from priors.denoiser.network import DenoiserConfig
 from priors.training.gathering import Progress
+from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, validate
 from priors.training.window_run import Kind, WindowRequest
 from priors.training.window_run import train as train_on_windows
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from priors.infiller import InfillerConfig
+from priors.infiller.network import InfillerConfig
 from priors.training.gathering import Progress
-from priors.training.infiller import InfillerSettings, InfillerTrainer, validate
+from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, validate
 from priors.training.window_run import Kind, WindowRequest
 from priors.training.window_run import train as train_on_windows
 

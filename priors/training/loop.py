@@ -3,7 +3,7 @@
 import time
 from typing import Protocol, runtime_checkable
 
-from mapctl.interruption import Held, held_back
+from mapctl.runtime.interruption import Held, held_back
 
 
 @runtime_checkable

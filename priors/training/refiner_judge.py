@@ -13,7 +13,7 @@ from mapctl.metrics import measure
 from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows
 from mapctl.metrics.realism.classifier import held_out_accuracy
 from priors import checkpoints
-from priors.refiner import LstmRefiner, RefinerNetwork
+from priors.refiner.network import LstmRefiner, RefinerNetwork
 from priors.training.corpus import Corpus, Split
 
 

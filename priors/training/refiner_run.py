@@ -13,13 +13,14 @@ import torch
 
 from mapctl.errors import RequestError
 from mapctl.metrics.realism import RealismSettings
-from priors import checkpoints, density
-from priors.density import LstmGmmDensity
-from priors.refiner import RefinerConfig
+from priors import checkpoints
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.refiner.network import RefinerConfig
 from priors.training import loop, run_files
 from priors.training.corpus import Corpus
 from priors.training.gathering import Progress, Source, gather, of_card
-from priors.training.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
+from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
 from priors.training.refiner_judge import Judge, score
 
 Row = dict[str, float | None]

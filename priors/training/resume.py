@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from priors.training import run_files
-from priors.training.lstm_gmm import Trainer
+from priors.training.recipes.lstm_gmm import Trainer
 
 Curve = list[dict[str, float | None]]
 """A row for each validation."""

@@ -12,15 +12,16 @@ from mapctl.errors import RequestError
 from mapctl.features import Place, decode
 from mapctl.metrics import reference
 from mapctl.metrics.states import state_summary
-from priors import checkpoints, density, labels
-from priors.lstm_gmm import LstmGmm, LstmGmmConfig
-from priors.settings import check_least
+from priors import checkpoints
+from priors.config import check_least
+from priors.lstm_gmm import density, labels
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import loop, resume, run_files
+from priors.training.free_run import free_run
 from priors.training.gathering import Progress, Source, gather, of_card
-from priors.training.health import free_run
-from priors.training.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
-from priors.training.starts import abilities, choose
+from priors.training.initial_states import abilities, choose
+from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors import checkpoints
-from priors.settings import NetworkConfig
+from priors.config import NetworkConfig
 from priors.training import corpus as corpora
 from priors.training import loop, run_files
 from priors.training.gathering import Progress, Source, gather, of_card

@@ -1,4 +1,4 @@
 """The live viewer: characters in a browser, driven by sliders, keys and drawn paths (viser).
 
-It knows a LiveCharacter (mapctl.streaming) and nothing of how one is steered.
+It knows a LiveCharacter (mapctl.runtime.live_protocol) and nothing of how one is steered.
 """

@@ -8,9 +8,9 @@ import numpy as np
 import viser
 
 from mapctl import curves
-from mapctl.body import colours
-from mapctl.body.shapes import Array
 from mapctl.errors import RequestError
+from mapctl.mesh import colours
+from mapctl.mesh.primitives import Array
 from mapctl.skeleton import Skeleton
 
 _PATH_HEIGHT, _MARK_HEIGHT = 0.012, 0.008  # metres over the ground, so that neither flickers

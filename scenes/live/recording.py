@@ -11,10 +11,10 @@ import torch
 from mapctl import formats
 from mapctl.errors import MapctlError, RequestError
 from mapctl.motion import Motion
-from mapctl.processes import spawn
 from mapctl.rotations import sign_continuous
+from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.processes import spawn
 from mapctl.skeleton import Skeleton
-from mapctl.streaming import Delivered
 
 FORMATS = ("bvh", "glb", "mp4")
 

@@ -16,7 +16,7 @@ from mapctl.metrics.realism.frechet import Basis, frechet_distance
 from mapctl.metrics.realism.gait import GaitSpread, gait_spread, spread_ratios
 from mapctl.metrics.realism.windows import WindowSettings, canonical_positions, clip_windows
 from mapctl.motion import Motion
-from mapctl.progress import Progress
+from mapctl.runtime.progress import Progress
 
 __all__ = [
     "ClassifierSettings",

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from mapctl import contacts
 from mapctl.errors import RequestError
+from mapctl.joint_roles import find_feet, find_hips
 from mapctl.metrics import body
 from mapctl.metrics.smoothing import slow_part
 from mapctl.motion import Motion
-from mapctl.roles import find_feet, find_hips
 from mapctl.rotations import unwrap_angle
 
 PIECE_SECONDS = 3.0

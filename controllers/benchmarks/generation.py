@@ -1,0 +1,129 @@
+"""What the refiner and the finishing pass are worth: the rnn paper's figure 12, measured instead of voted."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from controllers.generation.foot_cleanup import FinishSettings
+from controllers.generation.generate import GenerateSettings, generate, spread_starts
+from mapctl.errors import RequestError
+from mapctl.metrics import measure
+from mapctl.metrics.realism import GaitSpread, RealismSettings, gait_spread, realism, sample_diversity, spread_ratios
+from mapctl.motion import Motion
+from mapctl.protocols import Refiner
+
+Row = dict[str, Any]
+
+_MEASURES = ("contact_speed_cm_s", "skate_cm_s", "jitter_m_s3", "penetration_cm", "float_cm", "speed_m_s")
+
+
+@dataclass(frozen=True)
+class GenerationSettings:
+    """How much is drawn."""
+
+    count: int = 48
+    """Clips of each variant."""
+    seconds: float = 10.0
+    """Of each clip."""
+    siblings: int = 8
+    """Samples from one start, whose distance is the diversity."""
+    sibling_seconds: float = 4.0
+    """Of each of them."""
+    running: float = 1.9
+    """Mean speed from which a clip counts as a run, m/s."""
+    seed: int = 0
+    """Of starts and draws; every variant draws the same."""
+    realism: RealismSettings = field(default_factory=RealismSettings)
+    """Of the classifier."""
+
+
+@dataclass(frozen=True)
+class _Variant:
+    name: str
+    refiner: Refiner | None
+    finishing: FinishSettings | None
+
+
+def generation(
+    prior: Any, refiner: Refiner | None, mocap: Sequence[Motion], settings: GenerationSettings | None = None
+) -> list[Row]:
+    """A row for mocap and one for each variant, walking and running apart, then all together.
+
+    `mocap` is canonical motion that no training saw. RequestError where it holds no walk or no run.
+    """
+    settings = settings or GenerationSettings()
+    kinds = _by_kind(mocap, settings)
+    if not all(kinds.values()):
+        raise RequestError("the table needs mocap of walking and of running")
+    rows = [{"motion": kind, "variant": "mocap", "clips": len(clips), **_means(clips)} for kind, clips in kinds.items()]
+    spread = gait_spread(mocap)
+    for variant in _variants(refiner):
+        clips, cost = _drawn(prior, variant, settings)
+        for kind, some in _by_kind(clips, settings).items():
+            rows.append({"motion": kind, "variant": variant.name, "clips": len(some), **_means(some)})
+        rows.append({"motion": "both", "variant": variant.name, "clips": len(clips), "ms_per_frame": cost,
+                     **_realism(clips, mocap, settings), **_diversity(prior, variant, settings),
+                     **_spreads(clips, spread)})  # fmt: skip
+    return rows
+
+
+def _variants(refiner: Refiner | None) -> list[_Variant]:
+    refined = [] if refiner is None else [_Variant("density, refiner", refiner, None),
+                                          _Variant("density, refiner, footing", refiner, FinishSettings())]  # fmt: skip
+    return [_Variant("density", None, None), _Variant("density, footing", None, FinishSettings()), *refined]
+
+
+def _drawn(prior: Any, variant: _Variant, settings: GenerationSettings) -> tuple[list[Motion], float]:
+    """Clips, and milliseconds of processor time a frame."""
+    wishes, clips = GenerateSettings(finishing=variant.finishing), []
+    starts = spread_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
+    began = time.process_time()
+    for number, start in enumerate(starts):
+        own = replace(wishes, start=start)
+        clips.append(_clip(prior, variant, own, settings.seconds, settings.seed + number))
+    spent = time.process_time() - began
+    return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
+
+
+def _clip(prior: Any, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
+    generator = torch.Generator().manual_seed(seed)
+    return generate(prior, seconds=seconds, generator=generator, settings=wishes, refiner=variant.refiner)
+
+
+def _spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread]) -> Row:
+    """How widely step length, speed and turning spread, as shares of the data's spread."""
+    return {f"{name}_spread": ratio for name, ratio in spread_ratios(gait_spread(clips), data).items()}
+
+
+def _diversity(prior: Any, variant: _Variant, settings: GenerationSettings) -> Row:
+    """Average pairwise distance of samples from one start, mean over a few starts."""
+    found = []
+    for start in range(0, len(prior.starts.speed), max(1, len(prior.starts.speed) // 4)):
+        wishes = replace(GenerateSettings(finishing=variant.finishing), start=start)
+        samples = [_clip(prior, variant, wishes, settings.sibling_seconds, settings.seed + k)
+                   for k in range(settings.siblings)]  # fmt: skip
+        found.append(sample_diversity(samples).root_aligned_cm)
+    return {"diversity_cm": sum(found) / len(found)}
+
+
+def _realism(clips: Sequence[Motion], mocap: Sequence[Motion], settings: GenerationSettings) -> Row:
+    generator = torch.Generator().manual_seed(settings.seed)
+    found = realism(clips, mocap, generator=generator, settings=settings.realism)
+    return {"told_apart": found.accuracy, "told_apart_floor": found.floor_accuracy, "frechet": found.frechet,
+            "frechet_floor": found.floor_frechet}  # fmt: skip
+
+
+def _by_kind(clips: Sequence[Motion], settings: GenerationSettings) -> dict[str, list[Motion]]:
+    runs = [measure(clip)["speed_m_s"] > settings.running for clip in clips]
+    return {kind: [clip for clip, ran in zip(clips, runs, strict=True) if ran == (kind == "run")]
+            for kind in ("walk", "run")}  # fmt: skip
+
+
+def _means(clips: Sequence[Motion]) -> Row:
+    if not clips:
+        return {}
+    rows = [measure(clip) for clip in clips]
+    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in _MEASURES}

@@ -1,0 +1,185 @@
+"""What infilling is worth (infilling paper, tables 1 and 2, figure 5, and its study of gap and context): clips that no
+training saw, with pieces taken out, filled by networks as they are, on rigid bones, by MAP, and by interpolation.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from controllers.inbetweening.infill import infill
+from controllers.inbetweening.pipeline import InfillSettings, Method
+from mapctl import contacts
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening import PositionImage
+from mapctl.inbetweening.interpolation import led, slerped
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.recording.masks import ALL, Mask
+from mapctl.skeleton import CANONICAL, leg_length
+from mapctl.terms.foot_contact import TOES
+
+Row = dict[str, Any]
+
+WINDOW = 120
+"""Frames of a clip that are looked at: the paper's 4 s."""
+_TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
+_CONTEXT = 40  # frames on either side while the gap's length is varied
+_COMPARED: tuple[Method, Method] = ("linear", "map")
+_BONES = tuple(CANONICAL.index(side + part) for side in ("left", "right") for part in ("LowerArm", "Hand", "Foot"))
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is taken out of a clip."""
+
+    name: str
+    """In the table."""
+    frames: int
+    """Of the piece of a clip that is shown, from its middle."""
+    gap: int = 0
+    """Frames that are taken out of its middle."""
+    noise: float = 0.0
+    """Of every coordinate of every joint, metres."""
+    dropout: float = 0.0
+    """Share of joints taken out of every frame."""
+
+
+TASKS: tuple[Task, ...] = (
+    Task("nothing missing", WINDOW), Task("gap of 0.5 s", WINDOW, 15), Task("gap of 1 s", WINDOW, 30),
+    Task("gap of 2 s", WINDOW, 60), Task("noise of 3 cm", WINDOW, noise=0.03),
+    Task("noise of 5 cm", WINDOW, noise=0.05), Task("30 % of joints dropped", WINDOW, dropout=0.3),
+    Task("50 % of joints dropped", WINDOW, dropout=0.5),
+    *(Task(f"gap of {gap} frames, {_CONTEXT} around it", gap + 2 * _CONTEXT, gap) for gap in (3, 10, 40, 125)),
+    *(Task(f"gap of 40 frames, {context} around it", 40 + 2 * context, 40) for context in (1, 3, 5, 13, 25)),
+)  # fmt: skip
+"""The paper's, at 30 frames a second in place of its 60; its noise is said in no unit, ours is."""
+
+
+def table(
+    clips: Sequence[Motion], networks: Mapping[str, Inbetweener], *, ours: str,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Row]:  # fmt: skip
+    """Every task for every method, over all clips that are long enough, if there are any; `ours` is the network that
+    MAP finishes.
+
+    Root-aligned joint error over what was missing (over everything where nothing was), cm, mean and standard deviation
+    over joints and frames; deviation of six bones' lengths, mm. Clips are on canonical joints.
+    """
+    rows = []
+    clips = [on_canonical_bones(clip) for clip in clips]
+    for number, task in enumerate(TASKS):
+        shown = [middle(clip, task.frames) for clip in clips if clip.num_frames >= task.frames]
+        done = _of_task(task, shown, networks, ours) if shown else []
+        rows += [{"task": task.name, "clips": len(shown), **row} for row in done]
+        if progress is not None:
+            progress(number + 1, len(TASKS))
+    return rows
+
+
+def by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
+    """Gaps of 0.5, 1 and 2 s by kind of clip: error of slerp and of MAP, cm, and their ratio. A longer and more lively
+    clip counts no more than another: the ratio is the mean of the clips' own.
+    """
+    rows = []
+    for kind, clips in kinds.items():
+        for task in TASKS[1:4]:
+            shown = [middle(on_canonical_bones(clip), WINDOW) for clip in clips if clip.seconds * PRIOR_FPS > WINDOW]
+            masks = [Mask(ALL, (WINDOW - task.gap) // 2, (WINDOW + task.gap) // 2)]
+            pairs = [[float(_filled(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
+                      for method in _COMPARED] for clip in shown]  # fmt: skip
+            if pairs:
+                errors = 100 * torch.tensor(pairs)
+                slerp, ours = errors.mean(dim=0).tolist()
+                rows.append({"task": task.name, "clips": len(pairs), "method": f"MAP on {kind}", "error_cm": ours,
+                             "slerp_cm": slerp, "ratio": float((errors[:, 1] / errors[:, 0]).mean())})  # fmt: skip
+    return rows
+
+
+def _of_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, Inbetweener], ours: str) -> list[Row]:
+    """One row a method."""
+    rows = []
+    for name, network in networks.items():
+        done = [_raw(clip, task, network, torch.Generator().manual_seed(n)) for n, clip in enumerate(clips)]
+        rows.append({"method": f"{name}, raw", **_summary(done)})
+    if task.gap:
+        masks = [Mask(ALL, (task.frames - task.gap) // 2, (task.frames + task.gap) // 2)]
+        methods: tuple[tuple[str, Method], ...] = (
+            ("on rigid bones", "infiller"), ("and MAP", "map"), ("interpolation", "linear"),
+        )  # fmt: skip
+        for name, method in methods:
+            settings = InfillSettings(method=method)
+            done = [_filled(clip, masks, networks[ours], settings) for clip in clips]
+            label = name if method == "linear" else f"{ours}, {name}"
+            rows.append({"method": label, **_summary(done)})
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """Of one clip."""
+
+    errors: Float[Tensor, " missing"]
+    """Of every joint and frame that counts, metres."""
+    bones: Float[Tensor, " lengths"]
+    """Deviations of bones from their lengths, metres."""
+
+
+def _raw(clip: Motion, task: Task, network: Inbetweener, generator: torch.Generator) -> _Result:
+    """A network's places as they are."""
+    truth = clip.joint_positions().float()
+    known = _known(task, generator)
+    seen = truth + task.noise * torch.randn(truth.shape, generator=generator)
+    facing = heading(clip.local_quat_xyzw[:, 0]).float()
+    stands = contacts.planted(truth[:, list(_TOES)], PRIOR_FPS).float()
+    guess = slerped(seen[None], clip.local_quat_xyzw.float()[None], known[None])
+    image = PositionImage.of_world(guess, led(facing[None], known[None]), stands[None], known=known[None],
+                                   present=torch.ones(1, len(truth), dtype=torch.bool), toes=_TOES)  # fmt: skip
+    places = image.to_world(network.propose(image).places)[0]
+    return _result(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))
+
+
+def _filled(clip: Motion, masks: Sequence[Mask], network: Inbetweener, settings: InfillSettings) -> _Result:
+    """A whole motion of rigid bones."""
+    places = infill(clip, network, masks, settings=settings).motion.joint_positions()
+    missing = torch.zeros(places.shape[:2], dtype=torch.bool)
+    missing[masks[0].start : masks[0].stop] = True
+    return _result(places, clip.joint_positions(), missing)
+
+
+def _result(places: Tensor, truth: Tensor, missing: Bool[Tensor, "frames joints"]) -> _Result:
+    wrong = (places - places[:, :1]) - (truth - truth[:, :1])
+    above = [CANONICAL.parents[bone] for bone in _BONES]
+    lengths = (places[:, list(_BONES)] - places[:, above]).norm(dim=-1)
+    away = lengths - CANONICAL.offsets[list(_BONES)].norm(dim=-1).to(lengths)
+    return _Result(wrong.norm(dim=-1)[missing], away[missing.any(dim=1)].flatten().abs())
+
+
+def _known(task: Task, generator: torch.Generator) -> Bool[Tensor, "frames joints"]:
+    known = torch.rand(task.frames, CANONICAL.num_joints, generator=generator) >= task.dropout
+    start = (task.frames - task.gap) // 2
+    known[start : start + task.gap] = False
+    return known
+
+
+def _summary(results: Sequence[_Result]) -> Row:
+    errors, bones = (torch.cat([getattr(result, name) for result in results]) for name in ("errors", "bones"))
+    return {"error_cm": 100 * float(errors.mean()), "std_cm": 100 * float(errors.std()),
+            "bones_mm": 1000 * float(bones.mean())}  # fmt: skip
+
+
+def on_canonical_bones(motion: Motion) -> Motion:
+    """A canonical motion at the prior's rate, on the canonical skeleton, in scale."""
+    motion = motion.resample(PRIOR_FPS)
+    scale = leg_length(motion.skeleton) / leg_length(CANONICAL)
+    return Motion(CANONICAL, motion.fps, motion.root_position / scale, motion.local_quat_xyzw)
+
+
+def middle(motion: Motion, frames: int) -> Motion:
+    """So many frames from the middle of a motion that has them."""
+    start = (motion.num_frames - frames) // 2
+    return motion.slice(start, start + frames)

@@ -1,0 +1,105 @@
+"""Random commands one after the other: which are reached, how soon, and what a frame costs."""
+
+import math
+import statistics
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+
+from controllers.steering import steer
+from controllers.steering.loop import Recorder, drive, timing
+from controllers.steering.pure_pursuit import Pursuit
+from mapctl import curves
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.steering import Command, CommandTrack
+from mapctl.metrics import measure
+from mapctl.metrics.travel import by_command
+
+Row = dict[str, Any]
+
+_SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
+
+
+@dataclass(frozen=True)
+class SteeringSettings:
+    """How much is asked."""
+
+    commands: int = 48
+    """Of a random speed and direction each."""
+    shortest: float = 3.5
+    """Seconds for which a command holds, at least."""
+    longest: float = 6.0
+    """At most."""
+    seed: int = 0
+    """Of the commands and the first pose."""
+
+
+def steering(prior: Any, settings: SteeringSettings | None = None) -> list[Row]:
+    """A row for each kind of change, and one for all with cost and feet."""
+    settings = settings or SteeringSettings()
+    generator = torch.Generator().manual_seed(settings.seed)
+    track = _random_track(settings, generator)
+    state, first = steer.begin(prior, track.commands[0], generator=generator)
+    recorder = Recorder()
+    recorder.show(first, 0.0)
+    frames = round(track.times[-1] * PRIOR_FPS)
+    _, records = drive(state, track, [recorder], frames=frames)
+    motion = recorder.motion(frames)
+    rows = by_command(motion, track)[:-1]
+    kinds: dict[str, list[Row]] = {}
+    for (before, after), row in zip(pairwise(track.commands), rows[1:], strict=False):
+        kinds.setdefault(_kind(before, after), []).append(row)
+    cost, feet = timing(records), measure(motion)
+    whole = {"frame_ms_p50": cost["frame_ms_p50"], "frame_ms_p99": cost["frame_ms_p99"],
+             "contact_speed_cm_s": feet["contact_speed_cm_s"], "jitter_m_s3": feet["jitter_m_s3"]}  # fmt: skip
+    return [*({"change": kind, **_summary(some)} for kind, some in sorted(kinds.items())),
+            {"change": "all", **_summary(rows[1:]), **whole}]  # fmt: skip
+
+
+def pursued(prior: Any, seed: int = 0) -> list[Row]:
+    """Curves walked live at 1 m/s by looking half a metre ahead."""
+    rows = []
+    for name, seconds in (("circle:2", 13.0), ("wave:1x8", 8.5)):
+        curve = curves.read(name)
+        pursuit, recorder = Pursuit(curve, speed=1.0), Recorder()
+        x, z = curve.point(0.0)[[0, -1]].tolist()
+        state, first = steer.begin(prior, pursuit.first, generator=torch.Generator().manual_seed(seed), at=(x, z))
+        recorder.show(first, 0.0)
+        drive(state, pursuit, [recorder, pursuit], frames=round(seconds * PRIOR_FPS))
+        found = measure(recorder.motion(), curve)
+        rows.append({"change": f"live along {name}", **{key: found[key] for key in
+                     ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")}})  # fmt: skip
+    return rows
+
+
+def _random_track(settings: SteeringSettings, generator: torch.Generator) -> CommandTrack:
+    def uniform(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+    times, commands = [0.0], [Command(1.2, 0.0)]
+    for _ in range(settings.commands):
+        times.append(times[-1] + uniform(settings.shortest, settings.longest))
+        speed = _SPEEDS[int(torch.randint(len(_SPEEDS), (1,), generator=generator))]
+        commands.append(Command(speed, uniform(-math.pi, math.pi)))
+    times.append(times[-1] + settings.longest)
+    return CommandTrack(tuple(times), (*commands, commands[-1]))
+
+
+def _kind(before: Command, after: Command) -> str:
+    if after.speed == 0:
+        return "to a stand"
+    side = abs(math.remainder(after.heading - before.heading, 2 * math.pi)) > math.pi / 2
+    came = "from a stand" if before.speed == 0 else "moving"
+    return f"{came}, turning by more than 90 degrees" if side else f"{came}, turning by less"
+
+
+def _summary(rows: list[Row]) -> Row:
+    reached = [row["reached_s"] for row in rows if row["reached_s"] is not None]
+    off = [abs(row["steady_heading_error_deg"]) for row in rows if row["steady_heading_error_deg"] is not None]
+    return {
+        "commands": len(rows), "reached": len(reached),
+        "seconds_mean": statistics.mean(reached) if reached else None, "seconds_max": max(reached, default=None),
+        "direction_off_deg_median": statistics.median(off) if off else None,
+    }  # fmt: skip

@@ -1,0 +1,108 @@
+"""What in-betweening is worth: clips that no training saw, of which a few keys are left; and their ends, extended."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from controllers.inbetweening.infill import infill
+from controllers.inbetweening.keyframes import Keys
+from controllers.inbetweening.proposers.rollout import likeliest, rolled
+from controllers.inbetweening.tween import tween
+from controllers.inbetweening.variations import best_of
+from mapctl import metrics
+from mapctl.features import PRIOR_FPS
+from mapctl.metrics import worst_frame
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.recording.masks import ALL, Mask
+from mapctl.retarget import to_canonical
+from mapctl.terms.foot_contact import TOES
+
+FRAMES = 6 * PRIOR_FPS
+"""Of a clip that are looked at."""
+_BETWEEN = 5  # keys, beside the first and the last
+_ENDS = (30, 60)  # frames
+_BEST_OF = 4  # answers
+Row = dict[str, Any]
+
+
+def table(
+    kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener, densities: Sequence[Any], *,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Row]:  # fmt: skip
+    """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens as they are by default, of a
+    rolled variation and of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
+    """
+    rows, draws = [], torch.Generator().manual_seed(0)
+    for number, (kind, clips) in enumerate(kinds.items()):
+        shown = [clip.slice(0, FRAMES) for clip in clips if clip.num_frames >= FRAMES]
+        told: dict[str, list[Row]] = {"chosen": [], "rolled": [], f"best of {_BEST_OF}": []}
+        for clip in shown:
+            inner = (1 + torch.randperm(FRAMES - 2, generator=draws)[:_BETWEEN]).tolist()
+            keys = Keys((0, *inner, FRAMES - 1))
+            density = likeliest(densities, to_canonical(clip)[0])
+            roll = partial(rolled, densities=[density], generator=draws)
+            best = partial(best_of, count=_BEST_OF, rollable=densities, generator=draws)
+            ways = (partial(tween, rollable=densities), partial(tween, another=roll), best)
+            for method, way in zip(told, ways, strict=True):
+                began = time.perf_counter()
+                made = way(clip, keys, infiller).motion
+                told[method].append(_of_keys(made, clip, keys.frames, time.perf_counter() - began))
+        rows += [{"kind": kind, "what": "keys", "by": method, "clips": len(each), **_mean(each)}
+                 for method, each in told.items() if each]  # fmt: skip
+        shown = [clip.slice(0, 4 * PRIOR_FPS) for clip in clips if clip.num_frames >= 4 * PRIOR_FPS]
+        for count in _ENDS:
+            for by, extending in (("infiller", ()), ("density", densities)):
+                each = [_of_end(clip, count, infiller, extending) for clip in shown]
+                rows += [{"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each),
+                          **_mean(each)}] if each else []  # fmt: skip
+        if progress is not None:
+            progress(number + 1, len(kinds))
+    return rows
+
+
+def _of_keys(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:
+    """Errors at keys and between them; jerk over the keys as a share of the clip's own 95th percentile."""
+    places, truth = made.joint_positions(), clip.joint_positions()
+    jerk, usual = (torch.diff(each, n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (places, truth))
+    at_keys = max(float(jerk[max(0, key - 3) : key + 1].max()) for key in keys)
+    away = (places - truth).norm(dim=-1)
+    ends, toes = ([made.skeleton.index(name) for name in names] for names in (("leftHand", "rightHand", *TOES), TOES))
+    worst_ours, worst_mocap = (_worst(each.joint_positions(), ends, toes) for each in (made, clip))
+    return {"key_mm": 1000 * float(away[list(keys)].max()), "error_cm": 100 * float(away.mean()),
+            "jerk_at_keys": at_keys / float(usual.quantile(0.95)), **_feet(made, clip), **worst_ours,
+            **{f"mocap_{name}": value for name, value in worst_mocap.items()},
+            "ms_frame": 1000 * seconds / made.num_frames}  # fmt: skip
+
+
+def _worst(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
+    """Largest step (cm in a thirtieth of a second) and acceleration of hands and toes; longest time on no foot."""
+    peaks = worst_frame.peaks(places[:, ends], places[:, 0], PRIOR_FPS)
+    return {"step_cm": 100 * peaks.step, "acceleration_m_s2": peaks.acceleration,
+            "unsupported_s": worst_frame.longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS)}  # fmt: skip
+
+
+def _of_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence[Any]) -> Row:
+    first = clip.num_frames - count
+    began = time.perf_counter()
+    made = infill(clip, infiller, [Mask(ALL, first, clip.num_frames)], extending=extending).motion
+    seconds = time.perf_counter() - began
+    away = (made.joint_positions() - clip.joint_positions())[first:].norm(dim=-1)
+    ends = [each.slice(first, clip.num_frames) for each in (made, clip)]
+    return {"error_cm": 100 * float(away.mean()), **_feet(*ends), "ms_frame": 1000 * seconds / count}
+
+
+def _feet(made: Motion, clip: Motion) -> Row:
+    ours, theirs = metrics.measure(made), metrics.measure(clip)
+    return {"skate_cm_s": ours["skate_cm_s"], "mocap_skate": theirs["skate_cm_s"],
+            "planted_cm_s": ours["contact_speed_cm_s"], "mocap_planted": theirs["contact_speed_cm_s"],
+            "jitter": ours["jitter_m_s3"] / theirs["jitter_m_s3"]}  # fmt: skip
+
+
+def _mean(rows: Sequence[Row]) -> Row:
+    """Of each column; clips in which no toe stands have no planted ones."""
+    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}

@@ -1,0 +1,97 @@
+"""People of another size than the one a prior knows: the solve is in the prior's size, the motion in theirs.
+
+A prior's steps, speeds and hip heights are those of the canonical body. For a person of other legs everything with a
+length in it (curve, speed, sigmas) is divided by how much longer the legs are, and the motion is multiplied by it.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from mapctl.curves import Curve
+from mapctl.errors import RequestError
+from mapctl.intent.steering import Command, Limits
+from mapctl.motion import Motion
+from mapctl.problem.solution import Ledger
+from mapctl.protocols import Abilities
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+from mapctl.terms import Footing
+
+_LEAST, _MOST = 0.1, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Stature:
+    """Whose bones move."""
+
+    skeleton: Skeleton = CANONICAL
+    """Canonical names and tree with the person's bones, metres."""
+    toe_rest_height: float = TOE_REST_HEIGHT
+    """Height of the person's toe joints while the foot stands flat, metres."""
+
+    def __post_init__(self):
+        if self.skeleton.names != CANONICAL.names or not _LEAST < self.scale < _MOST:
+            raise RequestError("a person needs the canonical joints, and legs of a human's length that hang down")
+
+    @cached_property
+    def scale(self) -> float:
+        """How much longer the legs are than the canonical ones; 1 for the canonical body, exactly."""
+        if self.skeleton is CANONICAL and self.toe_rest_height == TOE_REST_HEIGHT:
+            return 1.0
+        return (_drop(self.skeleton) + self.toe_rest_height) / (_drop(CANONICAL) + TOE_REST_HEIGHT)
+
+    @cached_property
+    def small(self) -> Skeleton:
+        """The person's bones at the prior's size: only their proportions are the person's own."""
+        if self.scale == 1.0:
+            return self.skeleton
+        ends = {name: (x / self.scale, y / self.scale, z / self.scale)
+                for name, (x, y, z) in self.skeleton.end_offsets.items()}  # fmt: skip
+        return Skeleton(CANONICAL.names, CANONICAL.parents, self.skeleton.offsets / self.scale, ends)
+
+    def curve(self, curve: Curve) -> Curve:
+        """A curve as the prior's size sees it."""
+        return curve if self.scale == 1.0 else Curve(curve.points / self.scale, curve.closed)
+
+    def abilities(self, abilities: Abilities) -> Abilities:
+        """What the prior's data show, at the person's size."""
+        if self.scale == 1.0:
+            return abilities
+        return Abilities(abilities.slowest * self.scale, abilities.fastest * self.scale, abilities.turn_rate)
+
+    def command(self, command: Command) -> Command:
+        """A command as the prior's size sees it."""
+        if self.scale == 1.0:
+            return command
+        step = None if command.step_length is None else command.step_length / self.scale
+        return replace(command, speed=command.speed / self.scale, step_length=step)
+
+    def limits(self, limits: Limits) -> Limits:
+        """How fast wishes change, as the prior's size sees it."""
+        return replace(limits, acceleration=limits.acceleration / self.scale, braking=limits.braking / self.scale)
+
+    def footing(self, footing: Footing) -> Footing:
+        """A footing term, whose rest height is the person's own, for the prior's size."""
+        return replace(
+            footing, sigma_speed=footing.sigma_speed / self.scale, sigma_height=footing.sigma_height / self.scale,
+            sigma_below=footing.sigma_below / self.scale, rest_height=self.toe_rest_height / self.scale,
+        )  # fmt: skip
+
+    def motion(self, motion: Motion) -> Motion:
+        """A motion of the prior's size on the person's bones."""
+        if self.scale == 1.0:
+            return motion
+        return replace(motion, skeleton=self.skeleton, root_position=motion.root_position * self.scale)
+
+    def ledger(self, ledger: Ledger) -> Ledger:
+        """Residuals with a length in them in the person's metres."""
+        if self.scale == 1.0:
+            return ledger
+        scaled = [replace(entry, residual=entry.residual * self.scale) if entry.unit.startswith(("m", "cm")) else entry
+                  for entry in ledger.entries]  # fmt: skip
+        return Ledger(tuple(scaled))
+
+
+def _drop(skeleton: Skeleton) -> float:
+    """How far below the hips the toe joints are in the rest pose, metres, mean of both."""
+    bones = [side + part for side in ("left", "right") for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")]
+    return -float(skeleton.offsets[[skeleton.index(name) for name in bones], 1].sum()) / 2

@@ -1,0 +1,51 @@
+"""The energy of a finished motion: what it would cost the MAP problem as it stands, whoever proposed it."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from controllers.common.map_refinement import StandingSettings, rest_height
+from mapctl.features import LAYOUT, PRIOR_FPS, Place, encode, root_places
+from mapctl.motion import Motion
+from mapctl.problem import density_selection
+from mapctl.problem.objective import Objective
+from mapctl.problem.solution import Ledger
+from mapctl.retarget import to_canonical
+from mapctl.retarget.rigs import Rig
+from mapctl.terms import Clearance, Likelihood, Seam, Support, Term
+from mapctl.terms.trial import Trial
+
+_PAST = 3  # frames that the others are seen after
+
+
+def energy_of(
+    motion: Motion, stands: Bool[Tensor, "frames 2"], density: Any, settings: StandingSettings, rig: Rig | None = None
+) -> Ledger:
+    """By term: the likelihood under a density, footing, clearance, what the body stands on, and jerk, of a motion on
+    any rig of more than three frames at the prior's rate; `stands` are its contacts at that rate.
+    """
+    canonical = to_canonical(motion, rig)[0].resample(PRIOR_FPS)
+    bits = stands[: canonical.num_frames]
+    features, before = encode(canonical)
+    features[: len(bits), LAYOUT.slices["contacts"]] = bits.to(features)
+    features = features.float()
+    ground, heading = root_places(features.double(), before)
+    place = Place(ground[_PAST - 1].float(), heading[_PAST - 1].float())
+    shown = features[None, _PAST:]
+    judge = density.blurred(density_selection.spread())
+    state = judge.advance(judge.likely_state(features), features[None, :_PAST])
+    with torch.no_grad():
+        nats = judge.log_prob(shown, state)
+    height = rest_height(canonical, bits)
+    terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, rest_height=height)]
+    terms.append(replace(settings.clearance or Clearance(), rest_height=height))
+    terms.append(Support(rest_height=height))
+    terms.append(settings.seam or Seam(sigma=50.0, frames=len(features)))
+    contacts = features[:, LAYOUT.slices["contacts"]] > 0.5
+    trial = Trial(shown, place, torch.zeros_like(shown), nats, contacts[None, _PAST:],
+                  canonical.joint_positions()[:_PAST].float(), canonical.skeleton, PRIOR_FPS,
+                  contacts[_PAST - 1])  # fmt: skip
+    return Objective(lambda unknowns: trial, terms).ledger_of(trial)

@@ -1,0 +1,135 @@
+"""Denoise many files, over processes (joblib) or over a cluster (ray). No file's failure stops another, but a full disk
+stops all.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from controllers.denoising.denoise import denoise
+from controllers.denoising.result import Denoised
+from controllers.denoising.segment import DenoiseSettings
+from mapctl import formats
+from mapctl.errors import DiskFullError, MapctlError, RequestError
+from mapctl.protocols import Denoiser
+from mapctl.recording.masks import of_missing
+from mapctl.retarget.rigs import Rig
+
+
+@dataclass(frozen=True)
+class Job:
+    """One file."""
+
+    source: Path
+    """A motion file."""
+    out: Path
+    """Where the clean motion goes; its folder is made."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a job."""
+
+    job: Job
+    """It."""
+    error: str = ""
+    """Why there is no result; empty where there is one."""
+    frames: int = 0
+    """Of the motion."""
+    seconds: float = 0.0
+    """Compute."""
+
+
+@dataclass(frozen=True)
+class Cleaner:
+    """Loads the denoiser on first use, in the process that uses it; what is sent to a process is small."""
+
+    load: Callable[[], Denoiser]
+    """Makes the denoiser: `functools.partial(priors.load_denoiser, "denoiser")`."""
+    settings: DenoiseSettings
+    """What is known of the captures."""
+    rig: Rig | None = None
+    """Of all files, where it is not the one that would be recognised."""
+    after: Callable[[Job, Denoised], None] | None = None
+    """Called with each result, in that process: to write a report."""
+
+    def __call__(self, job: Job) -> Done:
+        """Denoise one file and write the result; what goes wrong with it is said in what is returned, but for a full
+        disk, which is a DiskFullError.
+        """
+        torch.set_num_threads(1)
+        try:
+            unit = None if self.rig is None else self.rig.metres_per_unit
+            motion, missing = formats.load_lossy(job.source, metres_per_unit=unit)
+            masks = of_missing(motion, missing)
+            done = denoise(motion, _loaded(self.load), masks=masks, settings=self.settings, rig=self.rig)
+            job.out.parent.mkdir(parents=True, exist_ok=True)
+            if self.after is not None:
+                self.after(job, done)
+            # Last, so that a file which is there is a file which is done.
+            formats.save(done.motion, job.out)
+        except DiskFullError:
+            raise  # no other file would find room
+        except (MapctlError, OSError) as error:
+            return Done(job, error=" ".join(str(error).split()))
+        except Exception as error:
+            return Done(job, error=f"{type(error).__name__}: {' '.join(str(error).split())}")
+        return Done(job, "", done.motion.num_frames, done.seconds)
+
+
+_KEPT: dict[str, Any] = {}  # by process: what was loaded last
+
+
+def _loaded(load: Callable[[], Denoiser]) -> Denoiser:
+    key = repr(load)
+    if key not in _KEPT:
+        _KEPT.clear()
+        _KEPT[key] = load()
+    return _KEPT[key]
+
+
+def over_processes(jobs: Sequence[Job], cleaner: Cleaner, *, processes: int) -> Iterator[Done]:
+    """As they end, over so many processes of this machine; one works in this process."""
+    if processes == 1:
+        yield from map(cleaner, jobs)
+        return
+    from joblib import Parallel, delayed
+
+    ended: Any = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(cleaner)(job) for job in jobs)
+    yield from ended
+
+
+def over_cluster(jobs: Sequence[Job], cleaner: Cleaner, *, address: str, workers: int) -> Iterator[Done]:
+    """As they end, over a ray cluster; `local` starts one of so many workers on this machine. All machines must see the
+    files under the same paths. RequestError where ray is not installed or the cluster does not answer.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise RequestError(f"clusters need ray ({error}): pip install 'mapctl[cluster]'") from error
+    try:
+        if address == "local":
+            ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False, configure_logging=False)
+        else:
+            ray.init(address=address, log_to_driver=False, configure_logging=False)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise RequestError(f"no ray cluster at {address} ({' '.join(str(error).split())})") from error
+    try:
+
+        def clean(job: Job) -> Done:
+            return cleaner(job)
+
+        task = ray.remote(num_cpus=1, max_retries=2)(clean)
+        waiting = {task.remote(job): job for job in jobs}
+        while waiting:
+            ready, _ = ray.wait(list(waiting), num_returns=1)
+            job = waiting.pop(ready[0])
+            try:
+                yield ray.get(ready[0])
+            except ray.exceptions.RayError as error:
+                yield Done(job, error=" ".join(str(error).split())[:200])
+    finally:
+        ray.shutdown()

@@ -1,0 +1,233 @@
+"""One piece of a capture: proposal, what goes back, feet, and the way back to its rig."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from controllers.common.map_refinement import StandingSettings, Stood, anchored, rest_height, stand
+from controllers.denoising.result import Denoised
+from mapctl import retarget, rotations
+from mapctl.contacts import steadied
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.problem.density_selection import Stretch
+from mapctl.protocols import Denoiser
+from mapctl.recording import Capture, artefacts
+from mapctl.recording.frequency_bands import split
+from mapctl.recording.inspection import Examined
+from mapctl.recording.noise_estimation import angle_noise, place_noise
+from mapctl.recording.residual_motion import returned
+from mapctl.recording.spike_detection import leaps
+from mapctl.recording.sure_smoothing import smoothed_angles
+from mapctl.retarget import RigMap, to_canonical
+from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL, leg_length
+from mapctl.terms.foot_contact import TOES
+
+
+@dataclass(frozen=True)
+class DenoiseSettings:
+    """What is known of the capture, and how the search is done."""
+
+    sigma_deg: float | None = None
+    """Noise of each of a joint's angles; told from the capture, joint by joint, if None."""
+    sigma_cm: float | None = None
+    """Noise of each coordinate of the hips; told from the capture if None."""
+    anchor: bool = False
+    """Let the body go where its planted feet say, for captures that drift against them."""
+    standing: StandingSettings = field(default_factory=StandingSettings)
+    """The MAP stage."""
+
+    def __post_init__(self):
+        for name in ("sigma_deg", "sigma_cm"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 100:
+                raise RequestError(f"{name} must lie between 0 and 100, got {value:g}")
+
+
+class Piece:
+    """From an examined capture to a clean motion."""
+
+    def __init__(self, examined: Examined, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
+        self.examined, self.denoiser, self.settings = examined, denoiser, settings
+        self.repaired = _others_smoothed(examined, rig)
+        canonical, self.rigmap = to_canonical(self.repaired, rig)
+        seen = _on_canonical(examined.seen, self.rigmap)
+        self.hidden_root = examined.dropouts_root | ~_above_hips(~examined.dropouts, self.rigmap)
+        self.seen_root = examined.seen_root & _above_hips(examined.seen, self.rigmap)
+        self.sigma, self.sigma_root = self._noise(canonical, seen)
+        self.bands = split(canonical)
+        if self.bands.exact:
+            # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
+            self.bands = split(_signed_like(to_canonical(examined.motion, rig)[0], canonical))
+        self.shown = self.bands.at_prior_rate()
+        self.capture = self._capture(seen)
+
+    def run(self, densities: Sequence[Any]) -> Denoised:
+        """Propose, give back, put the feet down, return to the rig."""
+        proposal, contacts = self._propose()
+        if self.bands.exact:
+            self.capture = self._look_again(proposal)
+            proposal, contacts = self._propose()
+        proposal, share = self._given_back(proposal)
+        if self.settings.anchor:
+            proposal = anchored(proposal, steadied(contacts > 0))
+        stood = stand(proposal, contacts, self.capture, self.settings.standing, densities=densities)
+        joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
+        motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
+        within = self.bands.within
+        stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
+        examined, found = self.examined, self._faults(motion, proposal.slice(0, within), stood)
+        return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts,
+                        1 - share[:within], stood.ledger, stretches=self._at_own_rate(stood.stretches))  # fmt: skip
+
+    def _at_own_rate(self, stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+        """In frames of the capture; the last ends with it."""
+        frames, shown = self.examined.motion.num_frames, self.shown.num_frames
+        ratio = float(self.examined.motion.fps) / float(self.shown.fps)
+        moved = [replace(part, start=min(frames, round(part.start * ratio)),
+                         stop=frames if part.stop == shown else min(frames, round(part.stop * ratio)))
+                 for part in stretches]  # fmt: skip
+        return tuple(part for part in moved if part.start < part.stop)
+
+    def _faults(self, motion: Motion, proposal: Motion, stood: Stood) -> tuple[artefacts.Fault, ...]:
+        """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""
+        examined, names = self.examined, motion.skeleton.names
+        turn = rotations.multiply(rotations.inverse(examined.motion.local_quat_xyzw), motion.local_quat_xyzw)
+        away = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
+        traveller = names[examined.travels]
+        apart = 100 * (examined.place(motion) - examined.place(examined.motion)).norm(dim=-1)
+        found = artefacts.noise(
+            names, examined.noise, examined.noise_root, travels=examined.travels, frames=motion.num_frames
+        )
+        found += artefacts.leaping(names, self._spikes_on_rig(), away, "deg")
+        found += artefacts.leaping([traveller], self._spikes_of_root(), apart[:, None], "cm")
+        found += artefacts.lost(names, examined.dropouts)
+        toes = [proposal.skeleton.index(name) for name in TOES]
+        feet = [self.rigmap.joint_of[toe] for toe in toes]
+        known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
+        ratio = float(motion.fps) / float(self.shown.fps)
+        height = rest_height(proposal, stood.contacts)
+        steps = artefacts.feet(known, proposal.joint_positions()[:, toes], stood.contacts, rest_height=height,
+                            fps=float(self.shown.fps))  # fmt: skip
+        return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
+
+    def _spikes_on_rig(self) -> Bool[Tensor, "frames joints"]:
+        """By joint of the rig; where the proposal told them, as it told them."""
+        spikes = self.examined.spikes.clone()
+        if self.bands.exact:
+            told = ~self.capture.seen[0]
+            for canonical, joint in enumerate(self.rigmap.joint_of):
+                if joint is not None:
+                    spikes[:, joint] = told[:, canonical] & ~self.examined.dropouts[:, joint]
+        return spikes
+
+    def _spikes_of_root(self) -> Bool[Tensor, "frames 1"]:
+        """In which frames the root's place leaps."""
+        if not self.bands.exact:
+            return self.examined.spikes_root[:, None]
+        return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
+
+    def _noise(self, canonical: Motion, seen: Tensor) -> tuple[Float[Tensor, " joints"], float]:
+        """Of the canonical joints' angles (radians) and of the hips' place (metres), at the capture's rate."""
+        wanted = self.settings
+        sigma = angle_noise(canonical.local_quat_xyzw, seen)
+        if wanted.sigma_deg is not None:
+            # Joints that never move have no noise either: they are locked, or the rig has none there.
+            sigma = torch.where(sigma > 0, math.radians(wanted.sigma_deg), 0.0).to(sigma)
+        root = place_noise(canonical.root_position, self.seen_root)
+        return sigma, root if wanted.sigma_cm is None else wanted.sigma_cm / 100
+
+    def _capture(self, seen: Tensor) -> Capture:
+        """What the network is shown, at its own rate."""
+        root = self.seen_root[:, None]
+        sigma = self.bands.noise_at_prior_rate(self.sigma)
+        sigma_root = self.bands.noise_at_prior_rate(torch.tensor(self.sigma_root))
+        return Capture.of_motion(self.shown, seen=self._resampled(seen), seen_root=self._resampled(root)[:, 0],
+                                 sigma=sigma, sigma_root=float(sigma_root))  # fmt: skip
+
+    def _resampled(self, seen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
+        """Seen at the prior's rate is what was seen in half of the frames about there."""
+        ratio = float(self.examined.motion.fps) / float(self.shown.fps)
+        side = max(0, round((ratio - 1) / 2))
+        padded = torch.nn.functional.pad(seen.double().T[:, None], (side, side), mode="replicate")
+        share = torch.nn.functional.avg_pool1d(padded, 2 * side + 1, stride=1)[:, 0].T
+        at = (torch.arange(self.shown.num_frames) * ratio).round().long().clamp(max=len(seen) - 1)
+        return share[at] >= 0.5
+
+    def _propose(self) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+        """The network's motion on the performer's bones, and the log odds of contacts."""
+        scale = leg_length(CANONICAL) / leg_length(self.rigmap.skeleton)
+        asked = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
+        cleaned = self.denoiser.clean(asked)
+        quats = rotations.sign_continuous(cleaned.local_quat_xyzw[0].double())
+        motion = Motion(self.rigmap.skeleton, self.shown.fps, cleaned.root[0].double() / scale, quats)
+        return motion, cleaned.contacts[0]
+
+    def _look_again(self, proposal: Motion) -> Capture:
+        """Spikes told anew by what is left beside the proposal: fast motion that passed for one is seen again."""
+        dropouts = ~_on_canonical(~self.examined.dropouts, self.rigmap)
+        spikes = leaps(self._rest(proposal), self.capture.sigma[0].double())
+        root = (self.shown.root_position - proposal.root_position)[:, None]
+        leap = leaps(root, self.capture.sigma_root.double())[:, 0]
+        return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
+
+    def _given_back(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
+        """The proposal with the motion that it left out, and the share of that by frame and joint."""
+        capture = self.capture
+        angles, share = returned(self._rest(proposal), capture.seen[0], capture.sigma[0].double())
+        place = (self.shown.root_position - proposal.root_position)[:, None]
+        root, _ = returned(place, capture.seen_root[0][:, None], capture.sigma_root.double())
+        quats = rotations.multiply(proposal.local_quat_xyzw, rotations.from_rotation_vector(angles))
+        changed = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)
+        return changed, share
+
+    def _rest(self, proposal: Motion) -> Float[Tensor, "frames joints 3"]:
+        """By which turns the capture differs from the proposal."""
+        turned = rotations.multiply(rotations.inverse(proposal.local_quat_xyzw), self.shown.local_quat_xyzw)
+        return rotations.to_rotation_vector(turned)
+
+
+def _signed_like(motion: Motion, other: Motion) -> Motion:
+    """The same rotations with signs as the other's: frames that were not seen, and show anything, change none after."""
+    dots = (motion.local_quat_xyzw * other.local_quat_xyzw).sum(dim=-1, keepdim=True)
+    return replace(motion, local_quat_xyzw=torch.where(dots < 0, -1.0, 1.0) * motion.local_quat_xyzw)
+
+
+def _others_smoothed(examined: Examined, rig: Rig | None) -> Motion:
+    """The repaired capture; joints that the canonical skeleton lacks, as fingers, are smoothed as their noise asks."""
+    motion = examined.repaired()
+    used = set(retarget.map_rig(motion.skeleton, rig).joint_of)
+    others = [j for j in range(motion.num_joints) if j not in used and examined.noise[j] > 0]
+    if not others:
+        return motion
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, others] = smoothed_angles(quats[:, others], examined.noise[others])
+    return replace(motion, local_quat_xyzw=quats)
+
+
+def _on_canonical(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, "frames joints"]:
+    """A canonical joint is seen if its own joint of the rig is, and all that lie between it and the one above."""
+    parents = rigmap.rig_skeleton.parents
+    columns = []
+    for canonical, joint in enumerate(rigmap.joint_of):
+        above = rigmap.joint_of[CANONICAL.parents[canonical]] if canonical else None
+        column = torch.ones(len(seen), dtype=torch.bool)
+        while joint is not None and joint >= 0 and joint != above:
+            column = column & seen[:, joint]
+            joint = parents[joint]
+        columns.append(column)
+    return torch.stack(columns, dim=1)
+
+
+def _above_hips(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, " frames"]:
+    """Whether all joints above the hips were seen: they carry its place."""
+    column, joint = torch.ones(len(seen), dtype=torch.bool), rigmap.joint_of[0]
+    while joint is not None and (joint := rigmap.rig_skeleton.parents[joint]) >= 0:
+        column = column & seen[:, joint]
+    return column

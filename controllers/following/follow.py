@@ -1,0 +1,118 @@
+"""Walk a drawn curve (rnn paper, section 5.2): choose a start, then solve window after window."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.common.character import Stature
+from controllers.common.feasibility import after_the_fact, in_advance
+from controllers.common.initial_state import choose_start
+from mapctl.curves import Curve
+from mapctl.features import PRIOR_FPS, decode
+from mapctl.intent.path import Follow, SpeedProfile
+from mapctl.motion import Motion
+from mapctl.problem.receding_horizon import Committed, TermsOf, WindowSettings, WindowSolver
+from mapctl.problem.solution import Solution, Status
+from mapctl.problem.window_solvers import LatentMethod, Method
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.terms import Footing, Noise, Path, Term
+
+
+@dataclass(frozen=True)
+class FollowSettings:
+    """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
+
+    path_sigma_slow: float = Path.sigma_slow
+    """Sideways offset after its slow part is taken, metres."""
+    path_free_sway: float = Path.free_sway
+    """Sideways offset that is left to the walker, metres."""
+    path_sigma_raw: float = Path.sigma_raw
+    """Sideways offset beyond it, metres."""
+    path_sigma_progress: float = Path.sigma_progress
+    """Arc missing or too much, metres."""
+    footing: Footing = field(default_factory=Footing)
+    """Planted feet."""
+    noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
+    """The prior, in the latents of its rollout. A well trained prior's own spread is small: at sigma 1 the same walk
+    holds its path and its feet less well (docs/results.md)."""
+    window: WindowSettings = field(default_factory=WindowSettings)
+    """How windows are laid."""
+    method: Method = field(default_factory=LatentMethod)
+    """How one window is solved."""
+    extra: tuple[Term, ...] = ()
+    """Further terms, the same in every window (a likelihood for the method over states)."""
+    joint: str = "hips"
+    """Which joint follows the curve."""
+
+    def seen_by(self, person: Stature) -> "FollowSettings":
+        """The same sigmas for somebody of this size, in metres of the prior's size."""
+        if person.scale == 1.0:
+            return self
+        sigmas = {name: getattr(self, name) / person.scale for name in
+                  ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")}  # fmt: skip
+        return replace(self, footing=person.footing(self.footing), **sigmas)
+
+
+def follow(
+    prior: Any, curve: Curve, *, seconds: float | None = None, speed: float | SpeedProfile = 1.2,
+    generator: torch.Generator | None = None, settings: FollowSettings | None = None, skeleton: Skeleton = CANONICAL,
+    progress: Callable[[int, int], None] | None = None, deadline_seconds: float | None = None,
+) -> Solution:  # fmt: skip
+    """A character walks the curve from its first point, facing along it.
+
+    `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the
+    arc; without `seconds` the curve is walked once. On another `skeleton` (canonical names) strides are as long as its
+    legs, and the toes' rest height is that of `settings.footing`. The first frame is the start pose. The
+    motion is at PRIOR_FPS; `Motion.resample` gives other rates. After `deadline_seconds` of wall clock, and at
+    Ctrl-C, what is solved by then comes back and the status says so. RequestError for wishes that make no sense;
+    wishes that cannot hold are named with numbers in the status.
+    """
+    deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
+    profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
+    request, lowered = Follow(curve, profile, seconds).fitted(PRIOR_FPS)
+    settings = settings or FollowSettings()
+    person = Stature(skeleton, settings.footing.rest_height)
+    generator = generator or torch.Generator().manual_seed(0)
+    frames = request.frames(PRIOR_FPS)
+    # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
+    arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
+    seen, seen_arcs = person.curve(curve), arcs / person.scale
+    terms_of = follow_terms(seen, seen_arcs, settings.seen_by(person))
+    start = choose_start(prior, seen, seen_arcs, terms_of, skeleton=person.small, fps=PRIOR_FPS, generator=generator)
+    solver = WindowSolver(prior, settings.window, person.small, method=settings.method)
+    done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
+                                 deadline=deadline)  # fmt: skip
+    known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], person.abilities(prior.abilities)))
+    motion = person.motion(decode(done.features, start.before_first, skeleton=person.small))
+    done = replace(done, ledger=person.ledger(done.ledger))
+    return _solution(motion, done, Status(outcome), known, curve, settings.joint)
+
+
+def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
+    """The terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
+    path = Path(
+        curve,
+        arcs,
+        joint=settings.joint,
+        sigma_slow=settings.path_sigma_slow,
+        free_sway=settings.path_free_sway,
+        sigma_raw=settings.path_sigma_raw,
+        sigma_progress=settings.path_sigma_progress,
+    )
+
+    def terms(first: int, frames: int) -> Sequence[Term]:
+        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *settings.extra
+
+    return terms
+
+
+def _solution(
+    motion: Motion, done: Committed, status: Status, known: Sequence[str], curve: Curve, joint: str
+) -> Solution:
+    notes = (*known, *after_the_fact(motion, curve, joint))
+    return Solution(motion, status.with_notes(notes, infeasible=bool(notes)), done.ledger, done.windows, done.features)

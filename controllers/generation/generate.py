@@ -1,0 +1,168 @@
+"""Random generation of any length (rnn paper, sections 4.1.4, 4.2.3, 4.3 and 5.1).
+
+The prior is sampled frame after frame, a refiner makes the samples look captured, and a finishing pass makes the feet
+stand that the motion's own contact labels call planted. All three work piece by piece.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.common.character import Stature
+from controllers.generation.foot_cleanup import FinishSettings, finish
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS, Place, decode, encode, root_places
+from mapctl.motion import Motion
+from mapctl.protocols import Refiner
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+
+_CHUNK = 600
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+@dataclass(frozen=True)
+class GenerateSettings:
+    """How motion is drawn."""
+
+    temperature: float = 1.0
+    """Spread of the draws: 0 is the prior's mean, 1 the prior itself."""
+    start: int | None = None
+    """Which of the prior's starts; drawn by their weight if None."""
+    as_start: bool = True
+    """Whether the prior is told what its data say of the start's clip (gait, style), if it can be told: left to itself
+    it lets most runs fall into a walk within ten seconds, which no clip of the data does."""
+    finishing: FinishSettings | None = field(default_factory=FinishSettings)
+    """Of the pass that makes planted feet stand; None leaves it out."""
+
+    def __post_init__(self):
+        if not 0 <= self.temperature <= 2:
+            raise RequestError(f"the temperature must lie between 0 and 2, got {self.temperature:g}")
+
+    def person(self, skeleton: Skeleton) -> Stature:
+        """Whose bones move, whose toes rest as high as the finishing pass has it."""
+        return Stature(skeleton, self.finishing.footing.rest_height if self.finishing else TOE_REST_HEIGHT)
+
+
+def stream(
+    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None, skeleton: Skeleton = CANONICAL,
+) -> Iterator[Motion]:  # fmt: skip
+    """Consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its length.
+
+    Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the memory.
+    On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
+    `settings.finishing`. RequestError, at once, for a length or a start that cannot be.
+    """
+    settings = settings or GenerateSettings()
+    person = settings.person(skeleton)
+    return _decoded(*_begun(prior, seconds, generator, settings, start_clip, refiner, person), person)
+
+
+def stream_features(
+    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None,
+) -> Iterator[Float[Tensor, "_ size"]]:  # fmt: skip
+    """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
+    return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner, Stature())[0]
+
+
+def generate(
+    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None, refiner: Refiner | None = None, skeleton: Skeleton = CANONICAL,
+) -> Motion:  # fmt: skip
+    """The whole motion at once; see `stream`."""
+    pieces = stream(prior, seconds=seconds, generator=generator, settings=settings, start_clip=start_clip,
+                    refiner=refiner, skeleton=skeleton)  # fmt: skip
+    motion = next(pieces)
+    for piece in pieces:
+        motion = motion.join(piece)
+    return motion
+
+
+def begin(
+    prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
+) -> tuple[Any, Any, Place]:
+    """The prior as it is to be told, its state and the place (float64) before the first frame.
+
+    Begins at a start of its own, or at the end of a clip, of which nothing is told; the clip's lengths are divided by
+    `scale`, the size of its performer beside the prior's.
+    """
+    if clip is not None:
+        canonical, _ = retarget.to_canonical(clip)
+        if scale != 1.0:
+            bones = replace(canonical.skeleton, offsets=canonical.skeleton.offsets / scale)
+            canonical = replace(canonical, skeleton=bones, root_position=canonical.root_position / scale)
+        features, place = encode(canonical.resample(PRIOR_FPS))
+        ground, heading = root_places(features, place)
+        seen = features.float()
+        state = prior.advance(prior.initial_state(seen[:1]), seen[1:].unsqueeze(0))
+        return prior, state, Place(ground[-1], heading[-1])
+    count = len(prior.starts.speed)
+    if settings.start is not None and not 0 <= settings.start < count:
+        raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
+    drawn = int(torch.multinomial(prior.starts.weight, 1, generator=generator))
+    pick = drawn if settings.start is None else settings.start
+    state = prior.starts.state.pick(torch.tensor([pick]))
+    return prior.told_as_start(pick) if settings.as_start else prior, state, Place.origin(torch.float64)
+
+
+def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[int]:
+    """A start for each of several motions, which together begin as the data do: spread over the speeds by weight.
+
+    A golden-ratio sequence from a drawn beginning, so that a few motions are already spread, and the first of many are
+    those of a few.
+    """
+    slow_to_fast = torch.argsort(prior.starts.speed)
+    upto = prior.starts.weight[slow_to_fast].double().cumsum(0)
+    first = torch.rand((), generator=generator, dtype=torch.float64)
+    drawn = torch.remainder(first + _GOLDEN * torch.arange(count, dtype=torch.float64), 1.0) * upto[-1]
+    return slow_to_fast[torch.searchsorted(upto, drawn).clamp(max=len(upto) - 1)].tolist()
+
+
+def _begun(
+    prior: Any, seconds: float, generator: torch.Generator, settings: GenerateSettings, clip: Motion | None,
+    refiner: Refiner | None, person: Stature,
+) -> tuple[Iterator[Float[Tensor, "_ size"]], Place]:  # fmt: skip
+    """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
+    if not 0 < seconds < float("inf"):
+        raise RequestError(f"seconds must be positive, got {seconds:g}")
+    frames = max(2, round(seconds * PRIOR_FPS))
+    prior, state, place = begin(prior, settings, clip, generator, scale=person.scale)
+    pieces = _drawn(prior, state, generator, settings.temperature)
+    if refiner is not None:
+        pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
+    if settings.finishing is not None:
+        pieces = finish(prior, pieces, frames=frames, state=state, generator=generator,
+                        settings=settings.finishing.seen_by(person), skeleton=person.small)  # fmt: skip
+    return _in_chunks(pieces, frames), place
+
+
+def _drawn(prior: Any, state: Any, generator: torch.Generator, temperature: float) -> Iterator[Float[Tensor, "_ size"]]:
+    """Draws without end."""
+    while True:
+        features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
+        yield features[0]
+
+
+def _in_chunks(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:
+    """The first `frames` frames, _CHUNK at a time."""
+    held = None
+    for piece in pieces:
+        held = piece if held is None else torch.cat([held, piece])
+        while len(held) >= (count := min(frames, _CHUNK)):
+            yield held[:count]
+            held, frames = held[count:], frames - count
+            if frames == 0:
+                return
+
+
+def _decoded(pieces: Iterator[Float[Tensor, "_ size"]], place: Place, person: Stature) -> Iterator[Motion]:
+    for features in pieces:
+        yield person.motion(decode(features, place, skeleton=person.small))
+        ground, heading = root_places(features.double(), place)
+        place = Place(ground[-1], heading[-1])

@@ -1,0 +1,102 @@
+"""One long motion through short pieces of many clips, the gaps between them filled in (infilling paper, figure 1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from controllers.inbetweening.infill import infill
+from controllers.inbetweening.pipeline import Infilled, InfillSettings
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.recording.masks import ALL, Mask
+from mapctl.retarget.carry import Body, carry
+
+_END = 5  # frames over which the way on at a piece's end is told
+
+
+@dataclass(frozen=True)
+class ChainSettings:
+    """How long pieces and gaps are, frames at the prior's rate."""
+
+    piece: int = 40
+    """From the middle of every clip; a shorter one is taken whole."""
+    gap: tuple[int, int] = (50, 100)
+    """Between two pieces, drawn evenly from the first up to the second."""
+
+    def __post_init__(self):
+        if self.piece < 2 or not 1 <= self.gap[0] <= self.gap[1] <= 900:
+            raise RequestError(f"pieces need 2 frames or more and gaps 1 to 900, got {self.piece} and {self.gap}")
+
+
+def chain(
+    clips: Sequence[Motion], infiller: Inbetweener | None, *, generator: torch.Generator,
+    settings: ChainSettings | None = None, filling: InfillSettings | None = None, densities: Sequence[Any] = (),
+    extending: Sequence[Any] = (),
+) -> Infilled:  # fmt: skip
+    """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
+
+    Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's. In gaps
+    that the infiller does not know, one of the densities `extending` is rolled if it slides less.
+    """
+    settings = settings or ChainSettings()
+    if len(clips) < 2:
+        raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
+    body, notes = Body.of(clips[0])[1], []
+    whole: Motion | None = None
+    masks: list[Mask] = []
+    for clip in clips:
+        piece, missed = _piece(clip, body, settings.piece)
+        notes += missed
+        if whole is None:
+            whole = piece
+            continue
+        low, high = settings.gap
+        gap = int(torch.randint(low, high + 1, (), generator=generator))
+        masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
+        piece = _led_on(whole, piece, gap)
+        held = torch.full((gap,), whole.num_frames - 1)
+        whole = whole.join(replace(whole, root_position=whole.root_position[held],
+                                   local_quat_xyzw=whole.local_quat_xyzw[held])).join(piece)  # fmt: skip
+    assert whole is not None, "there are clips"
+    done = infill(body.on_rig(whole), infiller, masks, settings=filling, densities=densities, extending=extending)
+    return replace(done, notes=(*done.notes, *notes))
+
+
+def _piece(clip: Motion, body: Body, frames: int) -> tuple[Motion, tuple[str, ...]]:
+    """Frames from a clip's middle, on the bones of the body and on its floor, and what of them could not be kept."""
+    carried = carry(clip, body)
+    motion = carried.motion.resample(PRIOR_FPS)
+    count = min(frames, motion.num_frames)
+    start = (motion.num_frames - count) // 2
+    return replace(motion.slice(start, start + count), source=None), carried.notes
+
+
+def _led_on(before: Motion, piece: Motion, gap: int) -> Motion:
+    """The piece, moved and turned to where the motion before it comes after so many frames."""
+    facing = heading(before.local_quat_xyzw[-1:, 0])
+    turned = _turned(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
+    way = (gap + 1) / 2 * (_step(before.root_position[-_END:]) + _step(turned.root_position[:_END]))
+    aim = before.root_position[-1] + way
+    moved = aim - turned.root_position[0]
+    moved[1] = 0
+    return replace(turned, root_position=turned.root_position + moved)
+
+
+def _step(places: Tensor) -> Tensor:
+    """Mean way of a frame."""
+    return (places[-1] - places[0]) / max(1, len(places) - 1)
+
+
+def _turned(motion: Motion, angle: Tensor) -> Motion:
+    """About the vertical through the origin."""
+    turn = rotations.about_y(angle).expand(motion.num_frames, 4)
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
+    return replace(motion, local_quat_xyzw=quats, root_position=rotations.rotate(turn, motion.root_position))

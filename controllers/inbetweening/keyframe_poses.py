@@ -1,0 +1,156 @@
+"""What a key file asks for, as a motion on one body and the keys in it: poses are read, put in their places, turned,
+and brought to the body's rig where they come from another.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import reduce
+from pathlib import Path
+
+import torch
+
+from controllers.inbetweening.keyframes import Key, Keys, limb_end
+from mapctl import formats, rotations
+from mapctl.errors import MapctlError, RequestError
+from mapctl.inbetweening.missing import Lost, straight
+from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
+from mapctl.retarget import RigMap, from_canonical, settled
+from mapctl.retarget.carry import Body, carry
+from mapctl.retarget.rigs import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Keyed:
+    """Ready for `tween`."""
+
+    motion: Motion
+    """On the body's rig, at the wanted rate: the poses at their keys, straight lines between them."""
+    keys: Keys
+    """What counts of it."""
+    rig: Rig | None
+    """The body's, where it is known."""
+
+
+def keyed(request: KeyRequest, rig: Rig | None = None) -> Keyed:
+    """The motion and the keys that a request asks for. RequestError, which names the key, for poses and joints that are
+    not there; `rig` is the body's where it is not the one that would be recognised.
+    """
+    first = next((number for number, key in enumerate(request.key) if key.needs_pose), 0)
+    reader = _Reader(rig)
+    with _of("body" if request.body is not None else f"key[{first}].pose"):
+        body = reader.body(request.body or request.key[first].pose or "")
+    fps = Fraction(request.fps).limit_denominator(100_000)
+    keys, poses = {}, {}
+    for number, key in enumerate(request.key):
+        frame = request.frame_of(key)
+        keys[frame] = _key(key, frame, body.rigmap, number)
+        if key.needs_pose:
+            poses[frame] = replace(_pose(key, request, reader, body, number), fps=fps, source=body.clip.source)
+    return Keyed(_in_time(poses, max(keys) + 1), Keys(tuple(keys.values())), settled(body.rigmap))
+
+
+@dataclass(frozen=True, eq=False)
+class _Clip:
+    """A file that has been read."""
+
+    clip: Motion
+    """As it is."""
+    canonical: Motion
+    """On canonical joints, with the bones of the body and on its floor."""
+    whose: Body
+    """The body."""
+
+    @property
+    def rigmap(self) -> RigMap:
+        """The way back to the body's rig."""
+        return self.whose.rigmap
+
+
+@dataclass(eq=False)
+class _Reader:
+    """Reads every file once."""
+
+    rig: Rig | None
+    """Of the body."""
+    seen: dict[str, _Clip] = field(default_factory=dict)
+    """By path."""
+
+    def body(self, path: str) -> _Clip:
+        """The body's own file, by its rig where one is asked for."""
+        unit = None if self.rig is None else self.rig.metres_per_unit
+        clip = formats.load(Path(path), metres_per_unit=unit)
+        self.seen[path] = _Clip(clip, *Body.of(clip, self.rig))
+        return self.seen[path]
+
+    def pose(self, path: str, body: _Clip) -> _Clip:
+        """A clip, brought to the body; the rig of another skeleton must be recognised."""
+        if path not in self.seen:
+            clip = formats.load(Path(path))
+            self.seen[path] = _Clip(clip, carry(clip, body.whose).motion, body.whose)
+        return self.seen[path]
+
+
+def _key(key: PlacedKey, frame: int, rigmap: RigMap, number: int) -> Key:
+    for name, names in (("joints", key.joints), ("reach", tuple(key.reach))):
+        with _of(f"key[{number}].{name}"):
+            for joint in names:
+                limb_end(joint, rigmap)
+    return Key(frame, limbs=key.joints, places=key.reach, root_only=key.root_only)
+
+
+def _pose(key: PlacedKey, request: KeyRequest, reader: _Reader, body: _Clip, number: int) -> Motion:
+    """One frame on the body's rig, where it is wanted."""
+    with _of(f"key[{number}].pose"):
+        found = reader.pose(key.pose or request.body or "", body)
+    clip = found.clip
+    frame = key.pose_frame or 0
+    if key.pose_seconds is not None:
+        frame = round(key.pose_seconds * float(clip.fps))
+    if frame >= clip.num_frames:
+        name = "pose_frame" if key.pose_seconds is None else "pose_seconds"
+        raise RequestError(f"key[{number}].{name}: the frame {frame} is not one of the pose's 0:{clip.num_frames}")
+    own, canonical = clip.slice(frame, frame + 1), found.canonical.slice(frame, frame + 1)
+    same = clip.skeleton.matches(body.clip.skeleton)
+    if same and key.place is None and key.height is None and key.facing_deg is None:
+        return own
+    placed = _placed(replace(canonical, source=None), key)
+    return from_canonical(placed, body.rigmap, own if same else None)
+
+
+def _placed(pose: Motion, key: PlacedKey) -> Motion:
+    """A canonical pose at its place over the ground, at its height, turned to where it is to face."""
+    root, quats = pose.root_position.clone(), pose.local_quat_xyzw.clone()
+    if key.place is not None:
+        root[0, 0], root[0, 2] = key.place
+    if key.height is not None:
+        root[0, 1] = key.height
+    if key.facing_deg is not None:
+        turn = torch.deg2rad(torch.tensor([key.facing_deg], dtype=torch.float64)) - heading(quats[:, 0])
+        quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
+    return replace(pose, root_position=root, local_quat_xyzw=quats)
+
+
+def _in_time(poses: dict[int, Motion], frames: int) -> Motion:
+    """Poses at their frames, and straight lines between them."""
+    at = torch.tensor(sorted(poses))
+    joined = reduce(Motion.join, (poses[frame] for frame in sorted(poses)))
+    held = torch.searchsorted(at, torch.arange(frames), right=True) - 1
+    moving = {joint: values[held] for joint, values in joined.moving_offsets.items()}
+    motion = replace(joined, root_position=joined.root_position[held], moving_offsets=moving,
+                     local_quat_xyzw=rotations.sign_continuous(joined.local_quat_xyzw)[held])  # fmt: skip
+    free = torch.ones(frames, dtype=torch.bool)
+    free[at] = False
+    return straight(motion, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free))
+
+
+@contextmanager
+def _of(where: str) -> Iterator[None]:
+    """Errors within name the key of the request."""
+    try:
+        yield
+    except MapctlError as error:
+        raise RequestError(f"{where}: {error}") from error

@@ -1,0 +1,208 @@
+"""A proposal through keys that tell a part of a pose: the place of a hand or a foot, or of the hips.
+
+A network that is told the place of one hand in one frame keeps it there in that frame, and goes on beside it as if
+nothing had been told. So it is not told. It is asked twice: first for what there is without the part, which shows how
+the trajectory must lead for the part to come about; then along that trajectory. What is left to do in the frame of the
+key takes as little of the whole body as it can (see `mapctl.kinematics.whole_body`), and the body goes there and comes
+back in as long as it takes to go so far without haste.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.interpolate import PchipInterpolator
+from torch import Tensor
+
+from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.inbetweening.proposers.answers import Another, Answer
+from controllers.inbetweening.proposers.positions import proposed
+from mapctl import rotations
+from mapctl.inbetweening.effector_targets import LIMBS, Targets
+from mapctl.kinematics import heading
+from mapctl.kinematics.whole_body import bend_limbs, reach_with_body
+from mapctl.motion import Motion
+from mapctl.numerics.smooth_offsets import spread
+from mapctl.protocols import Inbetweener
+from mapctl.recording.artefacts import runs
+from mapctl.recording.recording import last_seen, next_seen
+from mapctl.skeleton import CANONICAL
+
+_SINGLE = 5  # frames at the prior's rate: hips that are known for longer, a network goes along with
+_STILL = 0.02  # metres by which somebody who stands may stand elsewhere
+_ASTRAY = 0.4  # of the way that is gone meanwhile: how far a trajectory may well lead elsewhere
+_STROLL = 0.2  # m/s from which a trajectory tells where somebody faces
+_STEP_SECONDS = 0.25
+_ARM_SECONDS, _ARM_CALM = 0.15, 15.0
+"""Least time over which a limb goes to its place, and the acceleration (m/s^2) at which it goes farther: a sixth of
+what hands and feet of walking people reach."""
+_TRUNK_SECONDS, _TRUNK_CALM = 0.25, 3.0
+"""The same of hips and trunk."""
+_ARMS = tuple(joint for name, limb in LIMBS.items() if name.endswith("Hand")
+              for joint in (CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end))  # fmt: skip
+_FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
+
+
+def propose_through(
+    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool, another: Another | None = None
+) -> tuple[Answer, Targets | None]:
+    """What an infiller, or `another` that starts from its proposal, makes of a gap (see
+    `controllers.inbetweening.proposers.positions`), with hands and feet at their places and the hips at theirs where
+    single frames tell no more; and the places, brought in reach where they are not.
+    """
+    hips = _hips_alone(gap)
+    wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
+    blind = replace(gap, turns=gap.turns.index_put((hips, torch.tensor(0)), torch.tensor(True)), root=gap.root | hips)
+    first, bits = proposed(blind, infiller, None, held=held)
+    if not bool((hips | wanted).any()):
+        return _asked(another, gap, Answer(first, bits), targets, hips), targets
+    led, second = blind, first
+    if bool(gap.root.any()):
+        led = _lead(gap, blind, first, targets, hips)
+        second, bits = proposed(led, infiller, None, held=True)
+    answer = _asked(another, led, Answer(second, bits), targets, hips)
+    second = answer.motion
+    posed = _under_hips(second, gap.motion, hips)
+    if targets is None:
+        return replace(answer, motion=_go_there(second, posed, hips, blind)), None
+    posed = reach_with_body(posed, targets, turning=gap.turns, moving=gap.root,
+                            stray=torch.full(hips.shape, _STILL))[0]  # fmt: skip
+    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
+    there = replace(answer, motion=_go_there(second, posed, hips | wanted, blind))
+    return there, Targets(reached, targets.wanted)
+
+
+def _asked(
+    another: Another | None, gap: CanonicalGap, answer: Answer, targets: Targets | None, hips: Bool[Tensor, " frames"]
+) -> Answer:
+    """What another makes of an answer, told where hands, feet and hips are wanted on the way."""
+    if another is None:
+        return answer
+    if bool(hips.any()):
+        places = gap.motion.joint_positions()
+        wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+        wanted[hips, 0] = True
+        if targets is not None:
+            places = torch.where(targets.wanted[..., None], targets.places, places)
+            wanted = wanted | targets.wanted
+        targets = Targets(places, wanted)
+    return another(gap, answer.motion, answer.odds, targets)
+
+
+def _hips_alone(gap: CanonicalGap) -> Bool[Tensor, " frames"]:
+    """Single frames, or a few, of which nothing is known but where the hips are and how they are turned."""
+    alone = ~gap.root & ~gap.turns[:, 0] & gap.turns[:, 1:].all(dim=1)
+    for _, start, stop in runs(alone[:, None].clone()):
+        alone[start:stop] = stop - start <= _SINGLE
+    return alone
+
+
+def _lead(
+    gap: CanonicalGap, blind: CanonicalGap, body: Motion, targets: Targets | None, hips: Bool[Tensor, " frames"]
+) -> CanonicalGap:
+    """The gap with its hips guessed along a trajectory through all that keys tell of it, facing as it leads."""
+    root, facing = body.root_position.clone(), rotations.unwrap_angle(heading(body.local_quat_xyzw[:, 0]))
+    knots = ~blind.root | hips
+    root[knots] = gap.motion.root_position[knots]
+    own = heading(gap.motion.local_quat_xyzw[:, 0])
+    facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
+    if targets is not None:
+        wanted = targets.wanted.any(dim=1) & blind.root & ~hips
+        root = root + reach_with_body(body, targets, turning=blind.turns, moving=blind.root,
+                                      stray=_stray(body, blind.root))[1]  # fmt: skip
+        places = _through(root, knots | wanted, gap.seconds)
+        facing = facing + torch.where(knots, 0.0, _turned_by(body.root_position, places, float(body.fps)))
+        knots = knots | wanted
+    places = _through(root, knots, gap.seconds)
+    turned = _through(facing[:, None], knots, gap.seconds)[:, 0]
+    shown = gap.motion
+    quats = shown.local_quat_xyzw.clone()
+    turn = torch.where(blind.root, turned - heading(quats[:, 0]), 0.0)
+    quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
+    led = torch.where(blind.root[:, None], places, shown.root_position)
+    return replace(blind, motion=replace(shown, root_position=led, local_quat_xyzw=quats))
+
+
+def _stray(body: Motion, lost: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """How far hips that are not known may well be from where they are proposed, metres: the farther, the faster they
+    go and the longer they are on their way from or to where they are known.
+    """
+    known, frame, fps = ~lost[None], torch.arange(len(lost)), float(body.fps)
+    before, after = last_seen(known)[0], next_seen(known)[0]
+    away = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
+    way = (body.root_position[after] - body.root_position[before])[:, ::2].norm(dim=-1)
+    return _STILL + _ASTRAY * away * way * fps / (after - before).clamp_min(1)
+
+
+def _through(
+    values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames width"]:
+    """The values at the knots, and monotone cubics in time between them; beyond the first and last, as these are."""
+    at, told = seconds[knots], values[knots]
+    if len(at) < 2:
+        return values
+    # Straight on beyond the ends: a monotone cubic's own guess of its slope there is up to half too fast.
+    at = torch.cat([2 * at[:1] - at[1:2], at, 2 * at[-1:] - at[-2:-1]])
+    told = torch.cat([2 * told[:1] - told[1:2], told, 2 * told[-1:] - told[-2:-1]])
+    curve = PchipInterpolator(at.numpy(), told.numpy())
+    return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
+
+
+def _turned_by(
+    before: Float[Tensor, "frames 3"], after: Float[Tensor, "frames 3"], fps: float
+) -> Float[Tensor, " frames"]:
+    """How much more one trajectory turns than another, radians; where either stands, neither tells."""
+    (one, pace), (other, pace_too) = _course(before[:, ::2], fps), _course(after[:, ::2], fps)
+    believed = torch.minimum(pace, pace_too).square()
+    return rotations.wrap_angle(other - one) * believed / (believed + _STROLL**2)
+
+
+def _course(ground: Float[Tensor, "frames 2"], fps: float) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
+    """Which way a trajectory leads, radians, and how fast, m/s, without the sway of single steps."""
+    reach, frame = max(1, round(_STEP_SECONDS * fps)), torch.arange(len(ground))
+    start, stop = (frame - reach).clamp_min(0), (frame + reach).clamp(max=len(ground) - 1)
+    way = (ground[stop] - ground[start]) * fps / (stop - start).clamp_min(1)[:, None]
+    return torch.atan2(way[:, 0], way[:, 1]), way.norm(dim=1)
+
+
+def _under_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
+    """The motion with the hips of `known` in these frames; it faces with them, and what they carry keeps its tilt."""
+    quats, root = body.local_quat_xyzw.clone(), body.root_position.clone()
+    facing = heading(known.local_quat_xyzw[:, 0]) - heading(quats[:, 0])
+    turned = rotations.multiply(rotations.about_y(facing), quats[:, 0])
+    tilted = rotations.multiply(rotations.inverse(known.local_quat_xyzw[:, 0]), turned)
+    for child in body.skeleton.children(0):
+        quats[:, child] = torch.where(frames[:, None], rotations.multiply(tilted, quats[:, child]), quats[:, child])
+    quats[frames, 0], root[frames] = known.local_quat_xyzw[frames, 0], known.root_position[frames]
+    return replace(body, local_quat_xyzw=quats, root_position=root)
+
+
+def _go_there(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], gap: CanonicalGap) -> Motion:
+    """`body` that goes to the poses `posed` in the frames of keys and comes back, feet staying on their own tracks."""
+    fps = float(body.fps)
+    turn = rotations.to_rotation_vector(
+        rotations.multiply(rotations.inverse(body.local_quat_xyzw), posed.local_quat_xyzw)
+    )
+    places, goals = body.joint_positions(), posed.joint_positions()
+    away = torch.where(keys[:, None], (goals - places).norm(dim=-1), 0.0)
+    limb = _duration(away[:, [limb.end for limb in LIMBS.values()]], _ARM_SECONDS, _ARM_CALM)
+    trunk = _duration(away[:, :1], _TRUNK_SECONDS, _TRUNK_CALM)
+    known = ~gap.turns | keys[:, None]
+    quats = body.local_quat_xyzw.clone()
+    for joint in range(body.num_joints):
+        seconds = limb if joint in _ARMS else trunk
+        turned = spread(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
+        quats[:, joint] = rotations.multiply(quats[:, joint], rotations.from_rotation_vector(turned))
+    moved = spread((posed.root_position - body.root_position) * keys[:, None], ~gap.root | keys, seconds=trunk, fps=fps)
+    made = replace(body, root_position=body.root_position + moved, local_quat_xyzw=quats)
+    ends, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
+    for foot in _FEET:
+        firm = keys | ~gap.turns[:, CANONICAL.parents[foot]]
+        ends[:, foot] = places[:, foot] + spread((goals - places)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps)
+    return bend_limbs(made, body, ends, wanted, gap.turns)
+
+
+def _duration(away: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
+    """Seconds over which the farthest goes to its place and back: a spring's, which is `calm` at its place."""
+    return max(least, math.sqrt(float(away.max()) / calm))

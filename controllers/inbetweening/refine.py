@@ -1,0 +1,63 @@
+"""The MAP stage of infilling: feet put down about what was proposed, gap by gap."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from controllers.common.map_refinement import StandingSettings, stand
+from controllers.inbetweening.canonical_gap import CanonicalGap
+from mapctl.inbetweening.effector_targets import Targets
+from mapctl.motion import Motion
+from mapctl.problem.solution import Ledger
+from mapctl.recording import Capture
+from mapctl.recording.artefacts import runs
+from mapctl.skeleton import CANONICAL
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.terms import Clearance, Footing, Seam
+
+_BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
+FINISHING = StandingSettings(
+    ease=8.0, unseen_deg=2.0, unseen_cm=2.0, seam=Seam(sigma=150.0, frames=96), clearance=Clearance(),
+    footing=Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05),
+    budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
+)  # fmt: skip
+"""Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
+network's, since styles differ in them, but for those of toes that skate; jerk costs something; and it may take twice
+the evaluations."""
+
+
+def stood(
+    proposal: Motion, bits: Tensor, gap: CanonicalGap, settings: StandingSettings, densities: Sequence[Any],
+    targets: Targets | None,
+) -> tuple[Motion, Ledger]:  # fmt: skip
+    """The proposal with its feet put down, gap by gap; and the ledger of these."""
+    quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
+    for first, last in _surroundings(gap.turns.any(dim=1) | gap.root):
+        if last - first < 2:
+            continue
+        part = slice(first, last)
+        capture = Capture.of_motion(
+            proposal.slice(first, last), seen=~gap.turns[part], seen_root=~gap.root[part],
+            sigma=torch.zeros(CANONICAL.num_joints), sigma_root=0.0,
+        )  # fmt: skip
+        wanted = None if targets is None else Targets(targets.places[part], targets.wanted[part])
+        standing = stand(
+            proposal.slice(first, last), bits[part], capture, settings, densities=densities, targets=wanted
+        )
+        quats[part] = torch.where(gap.turns[part, :, None], standing.motion.local_quat_xyzw, quats[part])
+        root[part] = torch.where(gap.root[part, None], standing.motion.root_position, root[part])
+        ledger = ledger.join(standing.ledger)
+    return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
+
+
+def _surroundings(lost: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+    """First frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
+    near = lost.clone()
+    for _, start, stop in runs(lost[:, None]):
+        near[max(0, start - _BESIDE) : stop + _BESIDE] = True
+    return [(start, stop) for _, start, stop in runs(near[:, None])]

@@ -1,0 +1,136 @@
+"""A character that is steered live in a process of its own.
+
+Neither a web server nor another character then holds up its steps: each has its own core as long as there are cores.
+Times cross between processes as values of time.perf_counter, which all processes of a machine share.
+"""
+
+import math
+import multiprocessing
+import queue
+import re
+import threading
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controllers.steering.process_worker import RemoteRequest, work
+from mapctl import curves
+from mapctl.errors import MapctlError, RequestError
+from mapctl.intent.steering import Command
+from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.processes import spawn
+from mapctl.skeleton import CANONICAL, Skeleton
+
+__all__ = ["Remote", "RemoteRequest"]
+
+_READY_SECONDS = 120.0
+_MOST_WAITING = 3000  # steps that are kept for somebody who does not look: five minutes
+_GONE = "a character's process ended by itself"
+
+
+class Remote:
+    """A LiveCharacter (mapctl.runtime.live_protocol) in a process of its own."""
+
+    skeleton: Skeleton = CANONICAL
+
+    def __init__(self, request: RemoteRequest):
+        """Start it; several start at once if all are made before the first is waited for."""
+        self._request = request
+        self._start()
+
+    def wait(self) -> None:
+        """Until it walks. RequestError where its prior cannot be loaded, or does not know what it is told."""
+        if not self._ready.wait(_READY_SECONDS):
+            self._failed = self._failed or "a character's process did not start"
+        if self._failed:
+            self.close()
+            raise RequestError(self._failed)
+
+    def command(self, command: Command) -> None:
+        """See LiveCharacter."""
+        self._send("command", command)
+
+    def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
+        """See LiveCharacter. RequestError where the points make no curve."""
+        places = np.array(points, dtype=np.float64).reshape(-1, 2)
+        curves.through(places)  # what is wrong with them is said here, not there
+        self._send("walk", places, speed)
+
+    def pause(self, paused: bool) -> None:
+        """See LiveCharacter."""
+        self._send("pause", paused)
+
+    def reset(self) -> None:
+        """See LiveCharacter. Who is no more is started again, which takes a while."""
+        if self._failed:
+            self.close()
+            self._start()
+        else:
+            self._send("reset")
+
+    def poll(self) -> list[Delivered]:
+        """See LiveCharacter."""
+        failed, found = self._failed, list[Delivered]()  # in this order: what came before the end is kept
+        while self._delivered:
+            found.append(self._delivered.popleft())
+        if failed and not found:
+            raise MapctlError(failed)
+        return found
+
+    def memory_mb(self) -> float:
+        """Of its process, resident; NaN where the system does not tell."""
+        status = Path(f"/proc/{self._process.pid}/status")
+        found = re.search(r"VmRSS:\s*(\d+) kB", status.read_text()) if status.exists() else None
+        return int(found[1]) / 1024 if found else math.nan
+
+    def close(self) -> None:
+        """See LiveCharacter."""
+        self._send("close")
+        self._process.join(2.0 if self._ready.is_set() else 0.1)  # who still loads does not listen yet
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._receiver.join(1.0)  # it reads to the end, which is now
+        self._orders.put(None)
+        self._ours.close()
+
+    def _start(self) -> None:
+        self._ours, theirs = multiprocessing.Pipe()
+        self._process = spawn(work, theirs, self._request)
+        theirs.close()
+        self._delivered: deque[Delivered] = deque(maxlen=_MOST_WAITING)
+        self._orders: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
+        self._ready, self._failed = threading.Event(), ""
+        # A full pipe would hold up the character, so it is emptied whether or not somebody looks; and whoever gives
+        # orders is not held up by a character that does not read them.
+        self._receiver = threading.Thread(target=self._receive, daemon=True)
+        self._receiver.start()
+        threading.Thread(target=_post, args=(self._ours, self._orders), daemon=True).start()
+
+    def _send(self, *message: Any) -> None:
+        self._orders.put(message)
+
+    def _receive(self) -> None:
+        try:
+            while True:
+                word, content = self._ours.recv()
+                if word == "frames":
+                    self._delivered.append(content)
+                elif word == "failed":
+                    self._failed = content
+                self._ready.set()
+        except (EOFError, OSError):
+            self._failed = self._failed or _GONE
+            self._ready.set()
+
+
+def _post(ours: Connection, orders: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
+    """Send what is ordered, until None or the end of the other side, which the receiver notices."""
+    with suppress(OSError):
+        while (message := orders.get()) is not None:
+            ours.send(message)

@@ -1,0 +1,300 @@
+"""Steer a character (rnn paper, section 5.3): a few frames at a time, a second ahead, from the last solution's tail.
+
+`step` is pure: a state and a command go in, the next state and its frames come out, and the same bits for the same
+evaluations. It knows no clock; who has a deadline gives the seconds that are left, and gets the best found by then.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.common.character import Stature
+from controllers.common.initial_state import standing
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
+from mapctl.intent.steering import Command, Limits, Wish
+from mapctl.motion import Motion
+from mapctl.problem.latent_noise import Context
+from mapctl.problem.receding_horizon import Committed, WindowSettings, WindowSolver
+from mapctl.problem.solution import Ledger, Outcome
+from mapctl.problem.warm_start import BestOf, SteeringKnots
+from mapctl.problem.window_solvers import LatentMethod, Method, SolvedWindow
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
+from mapctl.terms import Footing, Noise, Steps, Term, Travel
+
+_OWED = 60  # wishes of the past that are kept: more than the travel term looks back on
+_RECENT = 15  # frames of the half second whose wishes must not be missed by far
+_MOVING = 0.3  # m/s below which a direction of travel means nothing
+_KNOTS, _SPREAD = 7, 0.8  # of draws for who is stuck: noise of every feature, slow enough to make a step of it
+_NEAREST = 6  # starts nearest to the wanted speed, of which one is drawn
+
+
+@dataclass(frozen=True)
+class SteerSettings:
+    """Sigmas, lengths and effort."""
+
+    horizon: int = 34
+    """Frames of a window: what a command changes is found this far ahead."""
+    commit: int = 3
+    """Frames that a step delivers."""
+    evaluations: int = 14
+    """Of energy and gradient in a step, at most: what one core does in the time that three frames last."""
+    least_evaluations: int = 6
+    """In a step, however late it is: with fewer wishes are missed (docs/results.md). Never more than `evaluations`."""
+    limits: Limits = field(default_factory=Limits)
+    """How fast a wish may change."""
+    sigma_speed: float = Travel.sigma_speed
+    """Along the wanted velocity, m/s."""
+    sigma_direction: float = Travel.sigma_direction
+    """Across it, radians."""
+    sigma_facing: float = Travel.sigma_facing
+    """Of the hips' heading, radians."""
+    sigma_step: float = Steps.sigma
+    """Of a wanted step length, metres."""
+    stuck: float = 0.4
+    """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
+    draws: int = 12
+    """Random beginnings, tried all at once beside the evaluations, of which the best is searched from then."""
+    footing: Footing = field(default_factory=Footing)
+    """Planted feet."""
+    noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
+    """The prior, as in following a curve."""
+
+    def __post_init__(self):
+        if not 1 <= self.commit < self.horizon or self.evaluations < 1 or self.least_evaluations < 0:
+            raise RequestError(
+                f"steering needs 1 <= commit < horizon, evaluations >= 1 and least_evaluations >= 0, got {self}"
+            )
+
+    def seen_by(self, person: Stature) -> "SteerSettings":
+        """The same for somebody of this size, in metres of the prior's size."""
+        if person.scale == 1.0:
+            return self
+        sigmas = {name: getattr(self, name) / person.scale for name in ("sigma_speed", "sigma_step", "stuck")}
+        return replace(self, limits=person.limits(self.limits), footing=person.footing(self.footing), **sigmas)
+
+
+@dataclass(frozen=True, eq=False)
+class SteerState:
+    """Everything that the next step depends on; of a fixed size."""
+
+    prior: Any
+    """The density."""
+    settings: SteerSettings
+    """The same in every step, in metres of the prior's size."""
+    person: Stature
+    """Bones of the character, and how long its legs are beside the prior's."""
+    committed: Committed
+    """The end of what was delivered."""
+    wish: Wish
+    """Of the last delivered frame, in the prior's size."""
+    owed: Float[Tensor, "past 2"]
+    """Wanted velocities of the last delivered frames, oldest first, m/s in the prior's size."""
+    frames: int = 1
+    """Delivered so far, the first pose among them."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteerFrames:
+    """What a step delivers."""
+
+    motion: Motion
+    """The new frames, at PRIOR_FPS, where they are in the world."""
+    contacts: Float[Tensor, "frames 2"]
+    """Left and right toe planted, 1 or 0."""
+    wishes: tuple[Wish, ...]
+    """Of those frames."""
+    forecast: Float[Tensor, "ahead joints 3"]
+    """World joint positions of the frames that would come next, metres; what the next command changes."""
+    ledger: Ledger
+    """By term, of the new frames."""
+    evaluations: int = 0
+    """Spent."""
+    seconds: float = 0.0
+    """Of processor and waiting, by the wall."""
+    note: str = ""
+    """Why less was searched than the settings allow, if so."""
+
+
+def begin(
+    prior: Any, command: Command, *, generator: torch.Generator, at: tuple[float, float] = (0.0, 0.0),
+    settings: SteerSettings | None = None, skeleton: Skeleton = CANONICAL,
+) -> tuple[SteerState, SteerFrames]:  # fmt: skip
+    """A character at x and z (metres) that faces along the command, and its first pose.
+
+    It is one of the prior's starts near the wanted speed and of the labels it is told, drawn by the generator: the
+    data's slowest for a command to stand.
+    On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
+    `settings.footing`; commands, limits and what is delivered are in its metres.
+    """
+    chosen = settings or SteerSettings()
+    person = Stature(skeleton, chosen.footing.rest_height)
+    command = person.command(command)
+    starts = (_told(prior, command.told) if command.told else prior).starts
+    near = (starts.speed - command.speed).abs().argsort()[:_NEAREST]
+    pick = int(near[torch.randint(len(near), (1,), generator=generator)])
+    state = starts.state.pick(torch.tensor([pick]))
+    there = torch.tensor(at) if person.scale == 1.0 else torch.tensor(at) / person.scale
+    start = standing(state, Place(there, torch.tensor(command.heading)), person.small)
+    first = start.committed.features
+    motion = person.motion(decode(first, start.before_first, skeleton=person.small))
+    wish = Wish(float(ground_speed(first)[0]), command.heading, command.heading)
+    delivered = (_in_their_metres(wish, person),)
+    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), delivered, start.committed.joints_world[:0], Ledger())
+    settings = chosen.seen_by(person)
+    return SteerState(prior, settings, person, start.committed, wish, torch.tensor([wish.velocity])), frames
+
+
+def accept(prior: Any, command: Command) -> tuple[Command, list[str]]:
+    """The nearest command that the prior can hold, and a sentence for each number that was changed (Command.within).
+
+    RequestError where it tells the prior what it does not know.
+    """
+    if command.told:
+        _told(prior, command.told)
+    return command.within(prior.abilities.fastest_asked)
+
+
+def step(
+    state: SteerState, command: Command, *, seconds: float | None = None
+) -> tuple[SteerState, SteerFrames]:  # fmt: skip
+    """The next frames under a command. With `seconds`, the best found by then but for the least that the settings ask
+    for, and a note that says so.
+
+    RequestError where the command tells the prior what it does not know. The first step under new labels takes longer.
+    """
+    began = time.perf_counter()
+    settings, person = state.settings, state.person
+    command = person.command(command)
+    stuck = _behind(state) > settings.stuck
+    if stuck:
+        state = _from_here(state)
+    wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
+    told = replace(state, prior=_told(state.prior, command.told)) if command.told else state
+    terms = _terms(state, wishes, command.step_length)
+    done, outcome = _solve(told, terms, seconds, free=stuck)
+    if outcome is not Outcome.DONE:
+        unsearched = replace(settings, least_evaluations=0)
+        afresh = replace(told, settings=unsearched,
+                         committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))  # fmt: skip
+        done, _ = _solve(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
+    new = done.features[-settings.commit :]
+    motion = person.motion(decode(new, state.committed.place, skeleton=person.small))
+    record, own = done.windows[-1], tuple(wishes[: settings.commit])
+    short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
+    note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations" if short else ""
+    forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
+    forecast = forecast if person.scale == 1.0 else forecast * person.scale
+    delivered = tuple(_in_their_metres(wish, person) for wish in own)
+    frames = SteerFrames(motion, LAYOUT.pick(new, "contacts"), delivered, forecast, person.ledger(done.ledger),
+                         record.evaluations, time.perf_counter() - began, note)  # fmt: skip
+    owed = torch.cat([state.owed, torch.tensor([wish.velocity for wish in own])])[-_OWED:]
+    kept = replace(done, features=new, ledger=Ledger(), windows=())
+    following = replace(state, committed=kept, wish=own[-1], owed=owed, frames=state.frames + len(new))
+    return following, frames
+
+
+def _in_their_metres(wish: Wish, person: Stature) -> Wish:
+    return wish if person.scale == 1.0 else replace(wish, speed=wish.speed * person.scale)
+
+
+@lru_cache(maxsize=64)
+def _told(prior: Any, labels: tuple[str, ...]) -> Any:
+    """The prior that has been told; kept, since it takes as long to make as a step may last."""
+    return prior.told(labels)
+
+
+def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool) -> tuple[Committed, Outcome]:
+    settings = state.settings
+    method: Method = _bounded(settings.evaluations, settings.least_evaluations, seconds)
+    if free:
+        method = _step_first(state, terms, seconds)
+    window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
+    solver = WindowSolver(state.prior, window, state.person.small, method=method)
+    frames = len(state.committed.features) + settings.commit
+    return solver.solve(
+        state.committed, lambda first, count: terms, frames, generator=torch.Generator().manual_seed(state.frames)
+    )
+
+
+def _bounded(evaluations: int, least: int, seconds: float | None) -> LatentMethod:
+    """One round of so many evaluations at most, fewer by then, but the least in any case."""
+    most = max(1, evaluations)
+    budget = Budget(most, seconds, min(least, most))
+    return LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
+
+
+def _step_first(state: SteerState, terms: Sequence[Term], seconds: float | None) -> "_StepFirst":
+    """The search for who is stuck: the draws are looked at in any case, the evaluations are halved."""
+    settings, soon = state.settings, seconds and seconds / 2
+    half = _bounded(settings.evaluations // 2, max(1, settings.least_evaluations // 2), soon)
+    few, least = half.budget.evaluations or 1, half.budget.least
+    draws = BestOf(settings.draws, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _SPREAD))
+    bold = replace(half, proposal=draws, budget=Budget(settings.draws + few, soon, settings.draws + least))
+    return _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
+
+
+@dataclass(frozen=True)
+class _StepFirst:
+    """A Method that spends half on the wishes without footing, from the best of some draws, and half on all.
+
+    Who stands has both feet planted, by contact bits that stay while a window is solved: footing then holds what the
+    wish would move. The search without it finds a step, and along that step the prior says anew which feet stand.
+    """
+
+    bold: LatentMethod
+    half: LatentMethod
+    loose: Sequence[Term]
+
+    def __call__(
+        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:  # fmt: skip
+        first = self.bold(context, self.loose, tail, generator, seconds=seconds / 2)
+        second = self.half(context, terms, first.carry, generator, seconds=seconds / 2)
+        return replace(second, evaluations=first.evaluations + second.evaluations)
+
+
+def _behind(state: SteerState) -> float:
+    """How far the mean velocity of the last half second missed its wishes, m/s."""
+    if min(len(state.committed.joints_world) - 1, len(state.owed)) < _RECENT:
+        return 0.0
+    return float((_recent_velocity(state) - state.owed[-_RECENT:].mean(0)).norm())
+
+
+def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
+    """Of the hips over the ground, mean of the last half second, m/s."""
+    past = state.committed.joints_world[-_RECENT - 1 :, 0, ::2]
+    return (past[-1] - past[0]) * PRIOR_FPS / _RECENT
+
+
+def _from_here(state: SteerState) -> SteerState:
+    """The state with a wish that begins anew from how the character moves and faces, and nothing owed.
+
+    A wish that ran ahead (a walk off to the side of who stands and faces elsewhere) leads no search there.
+    """
+    velocity, facing = _recent_velocity(state), float(state.committed.place.heading)
+    speed = float(velocity.norm())
+    heading = math.atan2(*velocity.tolist()) if speed > _MOVING else facing
+    wish = Wish(speed, heading, facing)
+    return replace(state, wish=wish, owed=torch.tensor([wish.velocity]).expand(_RECENT, 2))
+
+
+def _terms(state: SteerState, wishes: Sequence[Wish], step_length: float | None) -> Sequence[Term]:
+    settings = state.settings
+    travel = Travel(
+        torch.tensor([wish.velocity for wish in wishes]), state.owed,
+        facing=torch.tensor([wish.facing for wish in wishes]), sigma_speed=settings.sigma_speed,
+        sigma_direction=settings.sigma_direction, sigma_facing=settings.sigma_facing,
+    )  # fmt: skip
+    terms = settings.noise, travel, settings.footing
+    return (*terms, Steps(step_length, sigma=settings.sigma_step)) if step_length else terms

@@ -1,0 +1,126 @@
+"""One walk along a curve with its measures and cost: what follow, run and demo have in common."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from mapctl.commands.shared.character import Wearer
+from mapctl.runtime.progress import Progress
+
+if TYPE_CHECKING:
+    from mapctl.curves.curve import Curve
+    from mapctl.intent.path import Follow
+    from mapctl.motion import Motion
+    from mapctl.problem.solution import Solution
+    from priors.lstm_gmm.density import LstmGmmDensity
+
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C; what was solved until then is written, films are not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """A solved walk."""
+
+    request: "Follow"
+    """What was asked for."""
+    prior: "LstmGmmDensity"
+    """What moved the character."""
+    seed: int
+    """Of everything random."""
+    solution: "Solution"
+    """What came out."""
+    seconds: float
+    """Wall clock of the solve."""
+    person: Wearer | None = None
+    """Who walks, where that is not the canonical body."""
+
+    @property
+    def on_rig(self) -> "Motion":
+        """The motion on the rig it was asked for."""
+        motion = self.solution.motion
+        return motion if self.person is None else self.person.on_rig(motion)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the solve, so that this is the first part of the walk."""
+        from mapctl.problem.solution import Outcome
+
+        return self.solution.status.outcome is Outcome.INTERRUPTED
+
+    @cached_property
+    def measures(self) -> Mapping[str, float]:
+        """Of the motion, against the curve and the wanted way along it."""
+        from mapctl import report
+
+        motion = self.solution.motion
+        wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
+        return report.path_measures(motion, self.request.curve, wanted_m=wanted)
+
+    def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """The report of this walk; `request` is what the user wrote."""
+        from mapctl import report
+
+        card = self.prior.card
+        prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
+        return report.build(self.solution, request=request, seed=self.seed, measures=self.measures,
+                            seconds=self.seconds, prior=prior)  # fmt: skip
+
+    def summary(self) -> list[str]:
+        """A few lines for people."""
+        from mapctl import report
+
+        m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
+        cost = report.timing(self.solution.windows, seconds=self.seconds)
+        motion, speed, planted = (
+            self.solution.motion,
+            self.measures["speed_m_s"],
+            self.measures["planted_share"],
+        )
+        return [
+            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
+            f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
+            f"progress  {m['travelled_m']} of {m['wanted_m']} m",
+            f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
+            f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+            f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}",
+            f"status    {self.solution.status.text}",
+        ]
+
+
+def walk(
+    prior: "LstmGmmDensity", request: "Follow", *, seed: int, progress: Progress | None = None,
+    person: Wearer | None = None,
+) -> Walk:  # fmt: skip
+    """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
+    import torch
+
+    from controllers.following.follow import FollowSettings, follow
+    from mapctl.skeleton import CANONICAL
+    from mapctl.terms import Footing
+
+    if prior.use_fast:
+        _ = prior.fast
+    bones = CANONICAL if person is None else person.skeleton
+    settings = None if person is None else FollowSettings(footing=Footing(rest_height=person.toe_rest_height))
+    began = time.perf_counter()
+    solution = follow(
+        prior, request.curve, seconds=request.seconds, speed=request.profile,
+        generator=torch.Generator().manual_seed(seed), progress=progress,
+        skeleton=bones, settings=settings,
+    )  # fmt: skip
+    return Walk(request, prior, seed, solution, time.perf_counter() - began, person)
+
+
+def as_follow(curve: "Curve", speed: str | float | None, seconds: float | None) -> "Follow":
+    """The wish, checked: RequestError for speeds and durations that make no sense or take too long."""
+    from mapctl.features import PRIOR_FPS
+    from mapctl.intent.path import Follow, SpeedProfile
+
+    profile = SpeedProfile.parse(str(1.2 if speed is None else speed))
+    request = Follow(curve, profile, seconds)
+    request.frames(PRIOR_FPS)
+    return request

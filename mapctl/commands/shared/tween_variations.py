@@ -1,0 +1,118 @@
+"""`mapctl tween --variations K`: several motions through the same keys, as OUT_000.bvh, OUT_001.bvh, ...; and
+`--best-of K`: one of several.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mapctl.commands.shared import options, results
+from mapctl.errors import RequestError
+from mapctl.runtime.progress import bar
+
+if TYPE_CHECKING:
+    from controllers.inbetweening.keyframe_poses import Keyed
+    from controllers.inbetweening.pipeline import Infilled, InfillSettings
+    from controllers.inbetweening.variations import Variations
+    from mapctl.commands.tween import Tween
+
+_MOST = 1000
+_FIRST_DRAWN = 3  # answers before it are the infiller's and slerp's
+
+
+def numbered(path: Path, count: int) -> list[Path]:
+    """walk_000.bvh, walk_001.bvh, ... of walk.bvh."""
+    return [path.with_name(f"{path.stem}_{number:03d}{path.suffix}") for number in range(count)]
+
+
+def check(command: "Tween", given: Sequence[Path]) -> None:
+    """RequestError for what several answers cannot be made of, and files that cannot be written."""
+    options.check_seed(command.seed)
+    for name, count in (("--variations", command.variations), ("--best-of", command.best_of)):
+        if not 1 <= count <= _MOST:
+            raise RequestError(f"{name} must be 1 to {_MOST}, got {count}")
+        if count > 1 and command.method == "slerp":
+            raise RequestError(f"--method slerp knows one answer only; leave {name} out")
+    if command.variations > 1 and command.best_of > 1:
+        raise RequestError("--variations keeps all answers and --best-of one; choose one")
+    if command.variations == 1:
+        if command.seed and command.best_of < _FIRST_DRAWN:
+            raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --best-of 3")
+        results.check(command.out, command.video, command.report, given=given)
+        return
+    if command.suggest_timing:
+        raise RequestError("--suggest-timing tells of one answer; leave --variations out")
+    if command.video is not None:
+        raise RequestError("--video shows one answer; leave it out, and film OUT_000 by `mapctl render`")
+    first, *others = numbered(command.out, command.variations)
+    results.check(first, None, *others, command.report, given=given)
+
+
+def best(command: "Tween", asked: "Keyed", infiller: Any, settings: "InfillSettings") -> "Infilled":
+    """The likeliest of several answers."""
+    from controllers.inbetweening.variations import best_of
+
+    with bar("answers", quiet=command.quiet) as progress:
+        return best_of(asked.motion, asked.keys, infiller, command.best_of, settings=settings,
+                       **_drawn(command, asked), progress=progress)  # fmt: skip
+
+
+def run(command: "Tween", asked: "Keyed") -> None:
+    """Make, write, tell; the report names every file with its energy."""
+    from mapctl import formats
+
+    found = _made(command, asked)
+    files = numbered(command.out, command.variations)
+    for one, file in zip(found.each, files, strict=True):
+        formats.save(one.infilled.motion, file)
+    if command.report is not None:
+        from mapctl import report
+
+        report.write(_as_report(command, asked, found, files), command.report)
+    if not command.quiet:
+        for one, file in zip(found.each, files, strict=True):
+            frames = one.infilled.motion.num_frames
+            ms = 1000 * one.infilled.seconds / frames
+            print(f"{file}: {frames} frames through {len(asked.keys.frames)} keys; energy {one.energy:.1f} nats a"
+                  f" frame; {ms:.1f} ms a frame")  # fmt: skip
+        print(f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
+              f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips")  # fmt: skip
+        first = found.each[0].infilled
+        for note in (*first.notes, *first.gap_notes):
+            print(note)
+
+
+def _made(command: "Tween", asked: "Keyed") -> "Variations":
+    import priors
+    from controllers.inbetweening.pipeline import InfillSettings
+    from controllers.inbetweening.variations import variations
+
+    settings = InfillSettings(method="infiller" if command.method == "infiller" else "map")
+    infiller = priors.load_infiller(command.infiller or "infiller")
+    with bar("variations", quiet=command.quiet) as progress:
+        return variations(asked.motion, asked.keys, infiller, command.variations, settings=settings,
+                          **_drawn(command, asked), progress=progress)  # fmt: skip
+
+
+def _drawn(command: "Tween", asked: "Keyed") -> dict[str, Any]:
+    """What rollouts are made by, and the rig."""
+    import torch
+
+    import priors
+
+    return {"rollable": priors.load_choice(command.prior or "auto"), "densities": priors.load_choice(command.prior),
+            "generator": torch.Generator().manual_seed(command.seed), "rig": asked.rig}  # fmt: skip
+
+
+def _as_report(command: "Tween", asked: "Keyed", found: "Variations", files: list[Path]) -> dict[str, Any]:
+    from controllers.inbetweening.tween import key_errors
+
+    rows = []
+    for one, file in zip(found.each, files, strict=True):
+        made = one.infilled
+        told = {"keys": key_errors(made.motion, asked.motion, asked.keys, asked.rig), **made.summary()}
+        rows.append({"file": str(file), "energy_nats": one.energy, "energy": one.ledger.summary(),
+                     **results.report("tween", command, made.motion, told)})  # fmt: skip
+    shared = ("mapctl", "request", "versions")
+    own = [{key: value for key, value in row.items() if key not in shared} for row in rows]
+    return {**{key: rows[0][key] for key in shared}, "diversity": found.diversity._asdict(), "variations": own}

@@ -1,0 +1,105 @@
+"""Making curves: built-in shapes, points, CSV and SVG files. `Curve` itself is in `mapctl.curves.curve`."""
+
+import os
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from mapctl.curves.curve import Curve
+from mapctl.curves.polyline import dense_polyline
+from mapctl.curves.shapes import SHAPES, parse_sizes, shape_points
+from mapctl.errors import FileFormatError, RequestError
+
+_FINE = 0.02  # metres between the points that a spline is drawn with
+_FILE_ENDINGS = (".csv", ".tsv", ".txt", ".svg")
+
+
+def from_points(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool | None = None) -> Curve:
+    """The curve through points (x, z) or (x, y, z) in metres: an array or tensor of shape (n, 2) or (n, 3).
+
+    `closed` None closes it where its ends meet (within 1 mm, or half the points' usual spacing). RequestError
+    for fewer than 2 distinct points, more than a million, values that are not finite, or lengths that are not
+    1 cm to 100 km.
+    """
+    return Curve(*dense_polyline(points, closed))
+
+
+def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
+    """A smooth open curve through a few points set by hand: a cubic spline over the square root of the chord length.
+
+    That parameter (as in centripetal Catmull-Rom splines) keeps loops out where far and near points follow each other.
+    Errors as of `from_points`, of which it is a finer case.
+    """
+    given = np.asarray(points, dtype=np.float64)
+    whole = from_points(given, closed=False)  # what is wrong with the points is said here
+    spans = np.sqrt(np.linalg.norm(np.diff(given, axis=0), axis=1))
+    kept = np.r_[True, spans > 1e-3]
+    if kept.sum() < 3:
+        return whole
+    at = np.r_[0.0, np.cumsum(spans[kept[1:]])]
+    fine = np.linspace(0.0, at[-1], max(2, round(whole.length / _FINE)))
+    return from_points(CubicSpline(at, given[kept], bc_type="natural")(fine), closed=False)
+
+
+def circle(*, radius: float) -> Curve:
+    """A circle to the left of its start, the origin, heading +Z; radius in metres (0.01 to 10,000)."""
+    return _shape("circle", {"radius": radius})
+
+
+def figure8(*, radius: float) -> Curve:
+    """Two circles that touch at the origin, the left one first, both along +Z there; radius in metres."""
+    return _shape("figure8", {"radius": radius})
+
+
+def s(*, length: float) -> Curve:
+    """An S: a half circle to the left, then one to the right; `length` metres from end to end, along +X."""
+    return _shape("s", {"length": length})
+
+
+def line(*, length: float) -> Curve:
+    """A straight line along +Z; length in metres."""
+    return _shape("line", {"length": length})
+
+
+def wave(*, amplitude: float, length: float) -> Curve:
+    """One period of a sine along +Z, first to the left; `amplitude` is half of peak to peak; metres."""
+    return _shape("wave", {"amplitude": amplitude, "length": length})
+
+
+def _shape(name: str, sizes: dict[str, float]) -> Curve:
+    return Curve(torch.from_numpy(shape_points(name, sizes)), SHAPES[name].closed)
+
+
+def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -> Curve:
+    """The curve that a shape (`circle:4`, `wave:1x8`), a CSV file or an SVG file (by its ending) describes.
+
+    `metres_per_unit` scales a file's numbers; by default a CSV is in metres and 100 SVG units are a metre.
+    RequestError for shapes and scales that cannot be; FileFormatError, with its line, for files.
+    """
+    text = os.fspath(source)
+    if metres_per_unit is not None and not 1e-9 <= metres_per_unit <= 1e9:
+        raise RequestError(f"metres per unit must be a positive number, got {metres_per_unit:g}")
+    if Path(text).suffix.lower() in _FILE_ENDINGS or (text and ":" not in text and Path(text).exists()):
+        return _read_file(text, metres_per_unit)
+    if metres_per_unit is not None:
+        raise RequestError(f"metres per unit is for files; the curve {text!r} is in metres")
+    return _shape(*parse_sizes(text))
+
+
+def _read_file(path: str, metres_per_unit: float | None) -> Curve:
+    from mapctl.curves import files  # file readers and the SVG parser are not needed for a shape
+
+    if path.lower().endswith(".svg"):
+        points = files.read_svg(path, metres_per_unit or files.SVG_METRES_PER_UNIT)
+    else:
+        points = files.read_csv(path) * (metres_per_unit or 1.0)
+    try:
+        return from_points(points)
+    except RequestError as error:
+        raise FileFormatError(path, str(error)) from error

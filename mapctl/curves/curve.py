@@ -1,0 +1,235 @@
+"""The curve a character follows: a polyline on the ground (x, z) or in space (x, y, z), by arc length.
+
+Positive turns, offsets and curvatures are to the left: +Z turns toward +X, as headings do everywhere.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from mapctl.curves import tracking
+from mapctl.curves.polyline import TANGENT_BASE
+from mapctl.rotations import unwrap_angle
+
+Arc = Float[Tensor, "*batch"] | float
+
+_NEIGHBOURS = 16  # vertices looked at around a point: enough to hold an end of the nearest segment (1 cm apart)
+_SEARCH_STEP = 0.04  # metres between the arcs that a local search tries first
+_REFINEMENT = 10  # a local search's second grid is this much finer
+_RUN_ON = 1.0  # metres of straight extension in the tables; beyond them the line goes on all the same
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A dense polyline. Build one with `curves.from_points`, `curves.read` or a shape function.
+
+    Arcs are metres along the curve, tensors of any shape or floats. They wrap on a closed curve; beyond the
+    ends of an open one the curve goes on straight. Results have the arcs' dtype and follow their gradients.
+    """
+
+    points: Float[Tensor, "points dims"]
+    """Vertices about 1 cm apart, float64, metres: (x, z) or (x, y, z). A closed curve ends with its first."""
+    closed: bool = False
+    """Whether the curve ends where it starts, so that arcs wrap."""
+
+    @cached_property
+    def _arcs(self) -> Float[Tensor, "points"]:
+        """Arc of every vertex, metres."""
+        return torch.cat([self.points.new_zeros(1), self.points.diff(dim=0).norm(dim=-1).cumsum(0)])
+
+    @cached_property
+    def _tables(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Arcs of the knots, knots, unit direction after each: the vertices, and a piece beyond open ends."""
+        arcs, points = self._arcs, self.points
+        if not self.closed:
+            base = min(TANGENT_BASE, self.length / 2)
+            inside = torch.searchsorted(arcs, arcs.new_tensor([base, self.length - base])).tolist()
+            ahead, behind = max(1, inside[0]), min(len(points) - 2, inside[1])
+            before = points[0] - _RUN_ON * _unit(points[ahead] - points[0])
+            beyond = points[-1] + _RUN_ON * _unit(points[-1] - points[behind])
+            points = torch.cat([before[None], points, beyond[None]])
+            arcs = torch.cat([arcs[:1] - _RUN_ON, arcs, arcs[-1:] + _RUN_ON])
+        return arcs, points, points.diff(dim=0) / arcs.diff().unsqueeze(-1)
+
+    @cached_property
+    def length(self) -> float:
+        """Metres from end to end, or once around."""
+        return float(self._arcs[-1])
+
+    @property
+    def dims(self) -> int:
+        """2 on the ground, 3 in space."""
+        return self.points.shape[-1]
+
+    @property
+    def start(self) -> Float[Tensor, "dims"]:
+        """The first point, metres."""
+        return self.points[0]
+
+    @cached_property
+    def start_heading(self) -> float:
+        """Direction of travel at the start, radians: 0 is +Z, +pi/2 is +X; what lies behind it has no say."""
+        # Chords centred a little ahead see only what follows; extrapolating is exact on circular arcs.
+        ahead = self._half_base * torch.tensor([1.0, 2.0], dtype=torch.float64)
+        near, far = unwrap_angle(_heading(self.tangent(ahead))).tolist()
+        return math.remainder(2 * near - far, 2 * math.pi)
+
+    @property
+    def _half_base(self) -> float:
+        return min(TANGENT_BASE, self.length / 8) / 2
+
+    def _segment(self, arc: Tensor) -> tuple[Tensor, Int[Tensor, "*batch"]]:
+        """The arc within the tables, float64, and the segment it lies on."""
+        arc = torch.remainder(arc.double(), self.length) if self.closed else arc.double()
+        return arc, _piece(self._tables[0], arc)
+
+    def _at(self, arc: Tensor) -> Tensor:
+        knots, points, directions = self._tables
+        arc, segment = self._segment(arc)
+        return points[segment] + (arc - knots[segment]).unsqueeze(-1) * directions[segment]
+
+    def point(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
+        """The place on the curve at an arc, metres."""
+        arc = _tensor(arc)
+        return self._at(arc).to(arc.dtype)
+
+    def tangent(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
+        """Unit direction of travel: a chord of 5 cm, so that the jitter of a drawing does not flip it."""
+        arc = _tensor(arc)
+        chord = self._at(arc.double() + self._half_base) - self._at(arc.double() - self._half_base)
+        # At the tip of a way back on itself the chord vanishes; the segment still has a direction.
+        gone = chord.detach().norm(dim=-1, keepdim=True) < 1e-6
+        chord = torch.where(gone, self._tables[2][self._segment(arc)[1]], chord)
+        return _unit(chord).to(arc.dtype)
+
+    def left(self, arc: Arc) -> Float[Tensor, "*batch 2"]:
+        """Unit ground vector (x, z) to the left of travel."""
+        tangent = self.tangent(arc)
+        across = torch.stack([tangent[..., -1], -tangent[..., 0]], dim=-1)
+        return across / across.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+
+    @cached_property
+    def _turning(self) -> tuple[Tensor, Tensor]:
+        """Unwrapped heading at every vertex, and its slope to the next."""
+        heading = unwrap_angle(_heading(self.tangent(self._arcs)))
+        return heading, heading.diff() / self._arcs.diff()
+
+    def _heading_at(self, arc: Tensor) -> Tensor:
+        heading, slope = self._turning
+        laps = torch.floor(arc.detach() / self.length) if self.closed else torch.zeros_like(arc)
+        within = torch.remainder(arc, self.length) if self.closed else arc.clamp(0, self.length)
+        vertex = _piece(self._arcs, within)
+        return heading[vertex] + (within - self._arcs[vertex]) * slope[vertex] + laps * (heading[-1] - heading[0])
+
+    def curvature(self, arc: Arc, *, base: float = 0.3) -> Float[Tensor, "*batch"]:
+        """Turn of the heading per metre, 1/m, over `base` metres around the arc; left is positive.
+
+        The base spans a few vertices of a coarse drawing, whose heading changes at vertices only, and gives a
+        sharp corner the finite curvature that a stride through it has.
+        """
+        arc = _tensor(arc)
+        ahead, behind = self._heading_at(arc.double() + base / 2), self._heading_at(arc.double() - base / 2)
+        return ((ahead - behind) / base).to(arc.dtype)
+
+    def _of_curve(self, points_world: Tensor) -> Tensor:
+        """Points in the curve's own coordinates: world points lose their height for a curve on the ground."""
+        return points_world[..., ::2] if points_world.shape[-1] > self.dims else points_world
+
+    def nearest(
+        self, points_world: Float[Tensor, "*batch axes"], around: Arc | None = None, *, reach: float = 0.5
+    ) -> Float[Tensor, "*batch"]:
+        """Arc of the point nearest to each given one: (x, y, z), or (x, z) for a curve on the ground.
+
+        With `around`, only arcs within `reach` metres of it are searched, so that a curve that crosses itself
+        is not left for its other branch; the result is not wrapped (it stays near `around`) and may lie
+        beyond the ends. Without, the whole curve is searched between its ends. Differentiable in the points.
+        """
+        points = self._of_curve(points_world)
+        if around is None:
+            return self._nearest_anywhere(points)
+        with torch.no_grad():
+            step = min(_SEARCH_STEP, reach / 4)
+            guess = self._closest_of(points, _tensor(around).double().expand(points.shape[:-1]), reach, step)
+            guess = self._closest_of(points, guess, step, step / _REFINEMENT)
+            within, segment = self._segment(guess)
+        segments = segment.unsqueeze(-1) + torch.tensor([-1, 0, 1])
+        return (guess + self._project(points, segments, within)).to(points.dtype)
+
+    def _project(self, points: Tensor, segments: Int[Tensor, "*batch tried"], within: Tensor | float) -> Tensor:
+        """Metres from the arc `within` to the nearest place on the best of each point's segments."""
+        knots, corners, directions = self._tables
+        last = len(directions) - 1
+        segments = segments % (last + 1) if self.closed else segments.clamp(0, last)
+        along = ((points.unsqueeze(-2) - corners[segments]) * directions[segments]).sum(-1)
+        stop = knots[segments + 1] - knots[segments]
+        if self.closed:
+            along = along.clamp_min(0).minimum(stop)
+        else:  # the pieces beyond the ends have no end
+            along = torch.where(segments == 0, along, along.clamp_min(0))
+            along = torch.where(segments == last, along, along.minimum(stop))
+        apart = corners[segments] + along.unsqueeze(-1) * directions[segments] - points.unsqueeze(-2)
+        best = apart.detach().square().sum(-1).argmin(-1, keepdim=True)
+        step = (knots[segments] + along).gather(-1, best).squeeze(-1) - within
+        return torch.remainder(step + self.length / 2, self.length) - self.length / 2 if self.closed else step
+
+    def _closest_of(self, points: Tensor, around: Tensor, reach: float, step: float) -> Tensor:
+        """The closest to each point of the arcs `around` - reach ... + reach, `step` apart."""
+        count = math.ceil(reach / step)
+        arcs = around.unsqueeze(-1) + torch.arange(-count, count + 1, dtype=torch.float64) * (reach / count)
+        best = (self._at(arcs) - points.unsqueeze(-2)).square().sum(-1).argmin(-1, keepdim=True)
+        return arcs.gather(-1, best).squeeze(-1)
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.points.numpy())
+
+    def _nearest_anywhere(self, points: Tensor) -> Tensor:
+        count = len(self.points)
+        vertices = self._tree.query(points.detach().double().numpy(), k=min(_NEIGHBOURS, count))[1]
+        vertices = torch.as_tensor(vertices, dtype=torch.long)
+        segments = torch.cat([vertices - 1, vertices], dim=-1).clamp(0, count - 2)
+        arc = self._project(points, segments if self.closed else segments + 1, 0.0)
+        arc = torch.remainder(arc, self.length) if self.closed else arc
+        return arc.to(points.dtype)
+
+    def signed_offset(self, points_world: Float[Tensor, "*batch axes"], arc: Arc) -> Float[Tensor, "*batch"]:
+        """Metres from the curve's place at `arc` to each point, sideways on the ground; left is positive."""
+        apart = self._of_curve(points_world) - self.point(arc)
+        return (apart[..., :: self.dims - 1] * self.left(arc)).sum(-1)
+
+    def track(
+        self, points_world: Float[Tensor, "frames axes"], *, start: float | None = None, reach: float = 0.5
+    ) -> Float[Tensor, "frames"]:
+        """Arcs of a walk, not wrapped: along the curve without a jump, and forward unless the walk goes back.
+
+        So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are told apart, and
+        laps of a closed one counted (see `mapctl.curves.tracking`). `start` is where to look first, within `reach`
+        metres; by default the curve's start if the walk begins within `reach` of it (where a figure-8 crosses, arcs
+        are ambiguous), else wherever the whole walk fits best.
+        """
+        points = self._of_curve(points_world).detach().double()
+        if start is None and bool((points[0] - self.start).norm() <= reach):
+            start = 0.0
+        return tracking.track(self, points, start=start, reach=reach)
+
+
+def _tensor(arc: Arc) -> Tensor:
+    return arc if torch.is_tensor(arc) else torch.tensor(arc, dtype=torch.float64)
+
+
+def _piece(knots: Tensor, arc: Tensor) -> Int[Tensor, "*batch"]:
+    """Index of the knot before each arc; the first or the last but one for arcs outside."""
+    return torch.searchsorted(knots, arc.detach().contiguous(), right=True).sub(1).clamp(0, len(knots) - 2)
+
+
+def _unit(vector: Tensor) -> Tensor:
+    return vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+def _heading(direction: Tensor) -> Tensor:
+    return torch.atan2(direction[..., 0], direction[..., -1])

@@ -1,0 +1,174 @@
+"""Curves in files: CSV tables of metres and SVG drawings, read as plain points."""
+
+import math
+import warnings
+from itertools import pairwise
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray
+
+from mapctl.curves.polyline import MAX_LENGTH, MAX_POINTS
+from mapctl.errors import FileFormatError
+from mapctl.formats.text import read_bytes, shorten
+
+MAX_CSV_BYTES = 64 * 2**20
+"""Largest table that is read."""
+MAX_SVG_BYTES, MAX_SVG_SEGMENTS = 2 * 2**20, 30_000
+"""Largest drawing that is read: its parser takes seconds for a megabyte."""
+SVG_METRES_PER_UNIT = 0.01
+"""Scale of a drawing unless asked otherwise: 100 SVG units are a metre."""
+
+_COLUMNS = (("x", "z"), ("x", "y", "z"))
+_EXPECTED = "expected columns x,z or x,y,z in metres"
+
+
+def read_csv(path: str | PathLike[str]) -> ndarray:
+    """Points (n, 2) as x, z or (n, 3) as x, y, z from a table, metres.
+
+    Delimiters: comma, semicolon (then a decimal comma is understood), tab or blanks. A header is optional and
+    may order the columns; blank lines and lines from `#` on are skipped. FileFormatError names file and line.
+    """
+    rows, order = [], None
+    for number, line in enumerate(_text(path, MAX_CSV_BYTES).splitlines(), start=1):
+        words = _words(line)
+        if not words:
+            continue
+        if order is None:
+            order = _header(path, words, number)
+            if order is not None:
+                continue
+            order = _plain_order(path, words, number)
+        if len(rows) == MAX_POINTS:
+            raise FileFormatError(path, f"more than {MAX_POINTS} points", number)
+        rows.append(_row(path, words, number, len(order)))
+    if not rows:
+        raise FileFormatError(path, f"holds no points; {_EXPECTED}")
+    return np.array(rows)[:, order]
+
+
+def _text(path: str | PathLike[str], limit: int) -> str:
+    if Path(path).is_file() and Path(path).stat().st_size > limit:
+        raise FileFormatError(path, f"is larger than {limit // 2**20} MiB, too large for a curve")
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise FileFormatError(path, f"is not a text file; {_EXPECTED}")
+    return text
+
+
+def _words(line: str) -> list[str]:
+    line = line.partition("#")[0].strip()
+    if ";" in line:
+        words = line.replace(",", ".").split(";")
+    elif "," in line:
+        words = line.split(",")
+    else:
+        words = line.split("\t") if "\t" in line else line.split()
+    return [word.strip().strip('"') for word in words] if line else []
+
+
+def _header(path: str | PathLike[str], words: list[str], number: int) -> list[int] | None:
+    """Where the header says that x, (y,) z are; None if the line is no header."""
+    if any(_is_number(word) for word in words):
+        return None
+    names = [word.lower() for word in words]
+    for columns in _COLUMNS:
+        if sorted(names) == list(columns):
+            return [names.index(column) for column in columns]
+    raise FileFormatError(path, f"found the columns {shorten(','.join(words))}, {_EXPECTED}", number)
+
+
+def _plain_order(path: str | PathLike[str], words: list[str], number: int) -> list[int]:
+    if len(words) not in map(len, _COLUMNS):
+        raise FileFormatError(path, f"found {len(words)} column{'s' * (len(words) != 1)}, {_EXPECTED}", number)
+    return list(range(len(words)))
+
+
+def _row(path: str | PathLike[str], words: list[str], number: int, columns: int) -> list[float]:
+    if len(words) != columns:
+        raise FileFormatError(path, f"found {len(words)} values where {columns} belong", number)
+    values = [float(word) if _is_number(word) else math.nan for word in words]
+    if all(abs(value) <= MAX_LENGTH for value in values):
+        return values
+    wrong = next(word for word in words if not (_is_number(word) and abs(float(word)) <= MAX_LENGTH))
+    expected = f"expected a number up to {MAX_LENGTH:g} (metres)"
+    raise FileFormatError(path, f"{expected}, got {shorten(wrong)}", number)
+
+
+def _is_number(word: str) -> bool:
+    """Whether the word is a number, nan and inf included: those are refused by their size. `1_000` is none."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return word.isascii() and "_" not in word
+
+
+def read_svg(path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_UNIT) -> ndarray:
+    """Points (n, 2) along a drawing, metres.
+
+    SVG x is world x and SVG y, which points down the page, is world z: the page is the ground from above. The
+    curve is the drawing's paths, which must touch end to start; without any <path>, its lines, polylines,
+    circles and the like. Transforms are applied. FileFormatError for a file that is no such drawing.
+    """
+    pieces = [_sampled(path, segment, metres_per_unit) for segment in _segments(path, metres_per_unit)]
+    points = np.concatenate(pieces)
+    if len(points) > MAX_POINTS:
+        raise FileFormatError(path, f"needs more than {MAX_POINTS} points; is --metres-per-unit right?")
+    return points
+
+
+def _segments(path: str | PathLike[str], metres_per_unit: float) -> list:
+    """Path segments in drawing order, each of which starts where the one before ended."""
+    segments = [segment for drawn in _drawn_paths(path) for segment in drawn]
+    if not segments:
+        raise FileFormatError(path, "holds no drawn path")
+    if len(segments) > MAX_SVG_SEGMENTS:
+        raise FileFormatError(path, f"holds {len(segments)} path segments, allowed are {MAX_SVG_SEGMENTS}")
+    for before, after in pairwise(segments):
+        gap = abs(after.start - before.end) * metres_per_unit
+        if gap > 1e-3:
+            raise FileFormatError(
+                path, f"holds paths that do not touch ({gap:.3g} m apart); join them or keep only one"
+            )
+    return segments
+
+
+def _drawn_paths(path: str | PathLike[str]) -> list:
+    from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document
+
+    text = _text(path, MAX_SVG_BYTES)
+    try:
+        document = Document.from_svg_string(text)
+        for element in document.tree.iter():
+            # A drawing without its xmlns is common and plain enough.
+            if not element.tag.startswith("{"):
+                element.tag = "{http://www.w3.org/2000/svg}" + element.tag
+        with warnings.catch_warnings(action="ignore"):
+            paths = document.paths(path_conversions=CONVERT_ONLY_PATHS)
+            return paths or document.paths(path_conversions=CONVERSIONS)
+    except Exception as error:  # the parsers raise whatever a malformed drawing leads them to
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise FileFormatError(path, f"cannot be read as an SVG drawing ({reason})") from error
+
+
+def _sampled(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
+    """A straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
+    from svgpathtools import Line
+
+    def places(count: int) -> ndarray:
+        with np.errstate(all="ignore"):
+            at = np.array([segment.point(t) for t in np.linspace(0, 1, count + 1)])
+        return np.stack([np.real(at), np.imag(at)], axis=1) * metres_per_unit
+
+    rough = places(1 if type(segment) is Line else 8)
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(np.diff(rough, axis=0), axis=1).sum()
+    if not (math.isfinite(length) and length <= MAX_LENGTH):
+        raise FileFormatError(path, f"a path is {length:.3g} m long, allowed are {MAX_LENGTH:g}")
+    wanted = min(math.ceil(length / 0.005), 100_000)
+    return rough if len(rough) == 2 or wanted <= 8 else places(wanted)

@@ -1,0 +1,58 @@
+"""Where walkers stand beside a curve: the nearest place of each and the curve's axes there, in one compiled pass.
+
+Same places and directions as `Curve.nearest`, `Curve.point`, `Curve.tangent` and `Curve.left`, which are the
+specification; a term that asks for all of them at every evaluation asks here.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.curves import Curve
+
+
+@dataclass(frozen=True, eq=False)
+class CurveAxes:
+    """The curve near each point; constants, without gradient."""
+
+    place: Float[Tensor, "batch frames dims"]
+    """The nearest place, metres."""
+    axes: Float[Tensor, "batch frames dims dims"]
+    """Unit rows: left on the ground, forward; in space a third, upward less what of it lies along the slope."""
+    straightened: Float[Tensor, "batch frames dims"]
+    """Where the arc looked around would lie if the curve went straight on from the nearest place, metres."""
+
+
+class _Tables(NamedTuple):
+    knots: np.ndarray
+    corners: np.ndarray
+    directions: np.ndarray
+    closed: bool
+    length: float
+    half_base: float
+
+
+def axes_near(
+    curve: Curve, points: Float[Tensor, "batch frames dims"], around: Float[Tensor, " frames"], *, reach: float
+) -> CurveAxes:
+    """The nearest places within `reach` metres of the arcs `around`; results have the points' dtype.
+
+    Points have the curve's dimensions. Arcs that are not finite give NaN.
+    """
+    from mapctl.curves import local_frame_kernels  # late: needs the compiler
+
+    arcs = around.detach().double().contiguous().numpy()
+    known = points.detach().contiguous()
+    near = CurveAxes(torch.empty_like(known), known.new_empty(*known.shape, curve.dims), torch.empty_like(known))
+    filled = (near.place.numpy(), near.axes.numpy(), near.straightened.numpy())
+    local_frame_kernels.axes_near(_tables(curve), known.numpy(), arcs, reach, *filled)
+    return near
+
+
+def _tables(curve: Curve) -> _Tables:
+    knots, corners, directions = (table.numpy() for table in curve._tables)
+    return _Tables(knots, corners, directions, curve.closed, curve.length, curve._half_base)

@@ -1,0 +1,92 @@
+"""Compiled search of a curve's nearest place, and its axes there (imported late: needs numba). Float64."""
+
+import math
+
+import numpy as np
+
+from mapctl.numerics.jit import compilers
+
+entry, inner = compilers("contract", "nsz")
+
+_FAR = 1e9  # metres; beyond it, and for arcs that are no numbers, there is no segment to count
+
+
+@inner
+def segment_of(curve, arc):
+    """The segment that an arc lies on, counted on through the laps of a closed curve, and the lap's first arc."""
+    count, lap = len(curve.directions), 0.0
+    if curve.closed:
+        lap = math.floor(arc / curve.length)
+    segment = np.searchsorted(curve.knots, arc - lap * curve.length, side="right") - 1
+    return np.int64(lap) * count + min(max(segment, 0), count - 1)
+
+
+@inner
+def place_at(curve, arc, place):
+    """The place on the curve at an arc: straight on beyond open ends."""
+    segment = segment_of(curve, arc)
+    lap, index = segment // len(curve.directions), segment % len(curve.directions)
+    along = arc - lap * curve.length - curve.knots[index]
+    for k in range(len(place)):
+        place[k] = curve.corners[index, k] + along * curve.directions[index, k]
+
+
+@inner
+def nearest_arc(curve, point, around, reach):
+    """Arc of the place nearest to a point on the segments within reach of `around`; NaN if the point is."""
+    best, found, count = math.inf, math.nan, len(curve.directions)
+    for segment in range(segment_of(curve, around - reach), segment_of(curve, around + reach) + 1):
+        lap, index = segment // count, segment % count
+        along, apart = 0.0, 0.0
+        for k in range(len(point)):
+            along += (point[k] - curve.corners[index, k]) * curve.directions[index, k]
+        if curve.closed or index > 0:  # the pieces beyond open ends have no end
+            along = max(along, 0.0)
+        if curve.closed or index < count - 1:
+            along = min(along, curve.knots[index + 1] - curve.knots[index])
+        for k in range(len(point)):
+            apart += (curve.corners[index, k] + along * curve.directions[index, k] - point[k]) ** 2
+        if apart < best:
+            best, found = apart, lap * curve.length + curve.knots[index] + along
+    return found
+
+
+@inner
+def axes_at(curve, arc, axes):
+    """Rows: left on the ground, forward (a chord's direction), and in space upward but for what lies forward."""
+    ahead, behind, last = np.empty(axes.shape[1]), np.empty(axes.shape[1]), axes.shape[1] - 1
+    place_at(curve, arc + curve.half_base, ahead)
+    place_at(curve, arc - curve.half_base, behind)
+    ahead -= behind
+    length = math.sqrt((ahead * ahead).sum())
+    if length < 1e-6:  # at the tip of a way back on itself the chord vanishes
+        ahead[:] = curve.directions[segment_of(curve, arc) % len(curve.directions)]
+        length = math.sqrt((ahead * ahead).sum())
+    ahead /= length
+    ground = max(math.sqrt(ahead[0] * ahead[0] + ahead[last] * ahead[last]), 1e-9)
+    axes[:] = 0.0
+    axes[0, 0], axes[0, last] = ahead[last] / ground, -ahead[0] / ground
+    axes[1] = ahead
+    if last == 2:
+        axes[2] = -ahead[1] * ahead
+        axes[2, 1] += 1.0
+
+
+@entry
+def axes_near(curve, points, around, reach, places, axes, straightened):
+    """For points (batch, frames, dims) and arcs `around` (frames), see `curve_axes.CurveAxes`."""
+    if curve.closed:
+        reach = min(reach, 0.5 * curve.length)  # a lap holds every place once
+    dims = points.shape[2]
+    place, frame = np.empty(dims), np.empty((dims, dims))
+    for b in range(len(points)):
+        for t in range(len(around)):
+            if not abs(around[t]) < _FAR:
+                places[b, t], axes[b, t], straightened[b, t] = math.nan, math.nan, math.nan
+                continue
+            arc = nearest_arc(curve, points[b, t], around[t], reach)
+            arc = arc if math.isfinite(arc) else around[t]
+            place_at(curve, arc, place)
+            axes_at(curve, arc, frame)
+            places[b, t], axes[b, t] = place, frame
+            straightened[b, t] = place + (around[t] - arc) * frame[1]

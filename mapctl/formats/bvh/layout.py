@@ -1,0 +1,133 @@
+"""How a BVH file lays out its skeleton and channels: as a motion came, or for those that came in none."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from os import PathLike
+
+import numpy as np
+
+from mapctl.errors import RequestError
+from mapctl.formats.bvh import euler
+from mapctl.formats.bvh.hierarchy import AXES, Hierarchy, Offset
+from mapctl.formats.frame_rate import LONGEST_FRAME, SHORTEST_FRAME
+from mapctl.formats.text import shorten
+from mapctl.motion import Motion
+from mapctl.skeleton import Skeleton
+
+POSITIONS = ("Xposition", "Yposition", "Zposition")
+ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
+"""Channels of motions that came in no layout; the order most tools write."""
+STILL_METRES = 1e-6
+"""What varies less than this needs no position channel."""
+
+
+@dataclass(frozen=True, eq=False)
+class BvhLayout:
+    """What `Motion.source` keeps of a BVH file, so that it is written as it came."""
+
+    hierarchy: Hierarchy
+    """Joints with their channels and OFFSET lines, in the file's unit."""
+    metres_per_unit: float
+    """Length of the file's unit, metres."""
+    fps: Fraction
+    """Frames per second that the frame time was read as."""
+    frame_time: str
+    """Frame time as printed, seconds."""
+    encoding: str = "utf-8"
+    """How names are encoded."""
+    values: np.ndarray | None = None
+    """(frames, channels) that were read, file unit and degrees, NaN where lost; what is unchanged is written so."""
+
+    @property
+    def decimals(self) -> int:
+        """Digits after the point that keep a chain of bones within 0.01 mm."""
+        return 6 if self.metres_per_unit < 0.02 else 8
+
+
+def of(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
+    """The layout to write a motion in; RequestError where BVH has no form for its names or frame rate."""
+    layout = _source(motion) or BvhLayout(_plain_hierarchy(motion), 0.01, motion.fps, "")
+    if layout.fps != motion.fps or not layout.frame_time:
+        layout = replace(layout, fps=motion.fps, frame_time=_frame_time(motion.fps, path))
+    _check_names(layout, path)
+    ends = {
+        joint: _in_unit(motion.skeleton.end_offsets[name], layout.metres_per_unit)
+        for joint, name in enumerate(layout.hierarchy.names)
+        if name in motion.skeleton.end_offsets
+    }
+    return replace(layout, hierarchy=replace(layout.hierarchy, end_offsets=ends))
+
+
+def _source(motion: Motion) -> BvhLayout | None:
+    """The layout the motion came in, if its skeleton still has the same joints."""
+    if not isinstance(motion.source, BvhLayout):
+        return None
+    tree, skeleton = motion.source.hierarchy, motion.skeleton
+    return motion.source if (tree.names, tree.parents) == (skeleton.names, skeleton.parents) else None
+
+
+def fitted(layout: BvhLayout, translations: np.ndarray, quat_xyzw: np.ndarray) -> Hierarchy:
+    """The layout's hierarchy for this motion, with channels added where a joint's own cannot hold it.
+
+    `translations` (frames, joints, 3) in the file's unit, `quat_xyzw` (frames, joints, 4), joints in file
+    order. OFFSET is the source's along axes with a channel, which replaces it, and the motion's along the
+    others.
+    """
+    tree, still = layout.hierarchy, STILL_METRES / layout.metres_per_unit
+    channels, offsets = [], []
+    travel = np.ptp(translations, axis=0) > still
+    for joint, columns in enumerate(tree.position_columns()):
+        lacks = any(travel[joint, axis] and axis not in columns for axis in range(3))
+        channels.append(_widened(tree.channels[joint], quat_xyzw[:, joint : joint + 1], add_positions=lacks))
+        axes = range(3) if lacks else columns
+        own, wanted = tree.offsets[joint], translations[0, joint]
+        offsets.append(tuple(own[axis] if axis in axes else float(wanted[axis]) for axis in range(3)))
+    return replace(tree, channels=tuple(channels), offsets=tuple(offsets))
+
+
+def _widened(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_positions: bool) -> tuple[str, ...]:
+    turns = tuple(c for c in channels if c.endswith("rotation"))
+    rotations = turns if euler.holds(quat_xyzw, [AXES[c[0]] for c in turns]) else ROTATIONS
+    if not add_positions and rotations == turns:
+        return channels
+    return (POSITIONS if add_positions else tuple(c for c in channels if c not in turns)) + rotations
+
+
+def _plain_hierarchy(motion: Motion) -> Hierarchy:
+    """Centimetres, root OFFSET 0, joints depth first as BVH nests them (the canonical order is not)."""
+    skeleton = motion.skeleton
+    order = _depth_first(skeleton)
+    channels = [(POSITIONS if j == 0 or j in motion.moving_offsets else ()) + ROTATIONS for j in order]
+    offsets = [_in_unit(skeleton.offsets[j].tolist(), 0.01) if j else (0.0, 0.0, 0.0) for j in order]
+    parents = [order.index(skeleton.parents[j]) if j else -1 for j in order]
+    names = tuple(skeleton.names[j] for j in order)
+    return Hierarchy(names, tuple(parents), tuple(offsets), tuple(channels), {})
+
+
+def _depth_first(skeleton: Skeleton) -> list[int]:
+    order, waiting = [], [0]
+    while waiting:
+        order.append(waiting.pop())
+        waiting += reversed(skeleton.children(order[-1]))
+    return order
+
+
+def _in_unit(offset: Sequence[float], metres_per_unit: float) -> Offset:
+    x, y, z = (value / metres_per_unit for value in offset)
+    return x, y, z
+
+
+def _frame_time(fps: Fraction, path: str | PathLike[str]) -> str:
+    if not SHORTEST_FRAME <= 1 / fps <= LONGEST_FRAME:
+        allowed = f"{1 / LONGEST_FRAME:g} to {1 / SHORTEST_FRAME:g}"
+        raise RequestError(f"cannot write {path}: {float(fps):g} frames per second, allowed are {allowed}")
+    return f"{float(1 / fps):.9f}"
+
+
+def _check_names(layout: BvhLayout, path: str | PathLike[str]) -> None:
+    """A name must come back as it is: it ends at a brace or a line's end and loses outer blanks."""
+    for name in layout.hierarchy.names:
+        broken = not name or name != name.strip() or any(mark in name for mark in "{}\r\n\0")
+        if broken or name.encode(layout.encoding, "replace").decode(layout.encoding) != name:
+            raise RequestError(f"cannot write {path}: BVH has no form for the joint name {shorten(name)}")

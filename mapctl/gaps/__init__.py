@@ -1,5 +1,0 @@
-"""Gaps in a motion: what is known of it, and what an in-betweener is shown and proposes."""
-
-from mapctl.gaps.image import PositionImage, Proposed
-
-__all__ = ["PositionImage", "Proposed"]

@@ -1,0 +1,87 @@
+"""Places that joints are to be at in frames that are otherwise free, and meeting them to the hair."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.kinematics import inverse
+from mapctl.kinematics.inverse import Limb
+from mapctl.motion import Motion
+from mapctl.numerics import smooth_offsets
+from mapctl.skeleton import CANONICAL
+
+_KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
+LIMBS = {
+    side + end: Limb(CANONICAL.index(side + upper), CANONICAL.index(side + lower), CANONICAL.index(side + end), bends)
+    for upper, lower, end, bends in (
+        ("UpperArm", "LowerArm", "Hand", _ELBOW), ("UpperLeg", "LowerLeg", "Foot", _KNEE),
+    )
+    for side in ("left", "right")
+}  # fmt: skip
+"""Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
+_REACH = 0.15  # seconds over which a limb goes to its place and back, at least
+_CALM = 15.0  # m/s^2 at which it goes farther
+_NOTHING = 1e-12  # metres
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Wanted places, by frame and canonical joint; limbs bend to those of `LIMBS`."""
+
+    places: Float[Tensor, "frames joints 3"]
+    """World, metres; anything finite where no place is wanted."""
+    wanted: Bool[Tensor, "frames joints"]
+    """Whether a place is."""
+
+    def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "Targets":
+        """At other moments, rising: every wanted place is one of the moment that is nearest to its own."""
+        own = torch.arange(len(self.places), dtype=seconds.dtype) / fps
+        after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
+        before = (after - 1).clamp_min(0)
+        nearest = torch.where((seconds[before] - own).abs() <= (seconds[after] - own).abs(), before, after)
+        joints = self.places.shape[1]
+        places, wanted = self.places.new_zeros(len(seconds), joints, 3), self.wanted.new_zeros(len(seconds), joints)
+        for frame, joint in self.wanted.nonzero().tolist():
+            places[nearest[frame], joint] = self.places[frame, joint]
+            wanted[nearest[frame], joint] = True
+        return Targets(places, wanted)
+
+
+def check_limbs(targets: Targets) -> None:
+    """RequestError unless only ends of limbs, which can be brought to a place, are wanted somewhere."""
+    other = [name for name, some in zip(CANONICAL.names, targets.wanted.any(dim=0).tolist(), strict=True)
+             if some and name not in LIMBS]  # fmt: skip
+    if other:
+        raise RequestError(f"places are for {', '.join(LIMBS)}; {other[0]} has none")
+
+
+def missed(places: Float[Tensor, "frames joints 3"], targets: Targets) -> Float[Tensor, " frames"]:
+    """By frame, how far the worst joint is from its place, metres."""
+    away = (places - targets.places).norm(dim=-1)
+    return (away * targets.wanted).amax(dim=1)
+
+
+def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> Motion:
+    """A canonical motion with limbs bent so that they are at their places, if these are in reach; they go there and
+    back smoothly within frames that are `free`. RequestError for wanted places of joints that end no limb.
+    """
+    check_limbs(targets)
+    for limb in LIMBS.values():
+        wanted = targets.wanted[:, limb.end] & free
+        if not bool(wanted.any()):
+            continue
+        places = motion.joint_positions().clone()
+        away = torch.where(wanted[:, None], targets.places[:, limb.end] - places[:, limb.end], 0.0)
+        seconds = max(_REACH, math.sqrt(float(away.norm(dim=-1).max()) / _CALM))
+        offset = smooth_offsets.spread(away, wanted | ~free, seconds=seconds, fps=float(motion.fps))
+        offset = torch.where(free[:, None], offset, 0.0)
+        places[:, limb.end] += offset
+        turning = torch.zeros(places.shape[:2], dtype=torch.bool)
+        turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NOTHING)[:, None]
+        quats = inverse.solve(places, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,))
+        motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
+    return motion

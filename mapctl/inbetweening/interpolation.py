@@ -1,0 +1,43 @@
+"""What a motion is guessed to be where it is not known: rotations go the short way between those that are known, the
+root and its heading straight.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.recording.recording import filled, filled_angle, last_seen, next_seen
+from mapctl.skeleton import CANONICAL
+
+
+def slerped(
+    places_world: Float[Tensor, "batch frames joints 3"], local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
+    known: Bool[Tensor, "batch frames joints"],
+) -> Float[Tensor, "batch frames joints 3"]:  # fmt: skip
+    """World places, metres, on canonical bones; known ones as they are. What is not known may hold anything finite.
+
+    A rotation is known while the joint and all that it carries next are.
+    """
+    shown = known.clone()
+    for joint, parent in enumerate(CANONICAL.parents):
+        if parent >= 0:
+            shown[..., parent] &= known[..., joint]
+    batch, _, joints = shown.shape
+    columns = shown.transpose(1, 2).flatten(0, 1)
+    before, after = last_seen(columns), next_seen(columns)
+    weight = (torch.arange(columns.shape[1]) - before).to(places_world) / (after - before).clamp_min(1)
+    quats = local_quat_xyzw.transpose(1, 2).flatten(0, 1)
+    lost = ~columns
+    row, frame = lost.nonzero(as_tuple=True)
+    between = rotations.slerp(quats[row, before[lost]], quats[row, after[lost]], weight[row, frame].clamp(0, 1))
+    quats = quats.index_put((row, frame), between)
+    turns = rotations.to_matrix(quats.unflatten(0, (batch, joints)).transpose(1, 2))
+    root = filled(places_world[:, :, 0], known[..., 0])
+    guess = kinematics.positions_from_matrices(CANONICAL, turns) + root[:, :, None]
+    return torch.where(known[..., None], places_world, guess)
+
+
+def led(heading: Float[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
+    """Headings, radians, straight and the short way between frames whose root is known."""
+    return filled_angle(heading, known[..., 0])

@@ -1,0 +1,78 @@
+"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, if wanted, facing_deg, turn_deg_s, step_m,
+gait and style.
+
+A line that leaves one of the wanted ones empty faces where it goes, goes straight, steps as it likes,
+and tells the prior nothing.
+"""
+
+import math
+from dataclasses import dataclass
+from os import PathLike
+
+from mapctl.errors import FileFormatError
+from mapctl.formats.text import finite_number, read_table, shorten
+from mapctl.intent.steering import Command, CommandTrack
+
+_NEEDED = ("time_s", "speed_mps", "heading_deg")
+_LABELS = ("gait", "style")
+_ALLOWED = (*_NEEDED, "facing_deg", "turn_deg_s", "step_m", *_LABELS)
+_MOST_SPEED, _MOST_TIME, _MOST = 1000.0, 1e6, 1e6
+
+
+def read_commands(path: str | PathLike[str]) -> CommandTrack:
+    """The commands of a file. FileFormatError names file and line, and what was expected there."""
+    lines = read_table(path, f"a CSV of the columns {','.join(_NEEDED)}")
+    header, names = (lines[0][0], [word.lower() for word in lines[0][1]]) if lines else (1, [])
+    missing = [name for name in _NEEDED if name not in names]
+    if missing:
+        raise FileFormatError(path, f"has no column {', '.join(missing)}; expected {','.join(_NEEDED)}", header)
+    unknown = [name for name in names if name not in _ALLOWED]
+    if unknown or len(set(names)) < len(names):
+        found = shorten(",".join(names))
+        raise FileFormatError(path, f"found the columns {found}, expected {','.join(_ALLOWED)}, each once", header)
+    if len(lines) < 2:
+        raise FileFormatError(path, "holds no commands")
+    times: list[float] = []
+    commands: list[Command] = []
+    for number, words in lines[1:]:
+        if len(words) != len(names):
+            raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
+        line = _Line(path, number, dict(zip(names, words, strict=True)))
+        time = line.within("time_s", 0, _MOST_TIME)
+        if times and time <= times[-1]:
+            raise FileFormatError(path, f"time_s must rise, got {time:g} after {times[-1]:g}", number)
+        times.append(time)
+        commands.append(line.command())
+    return CommandTrack(tuple(times), tuple(commands))
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One line of a script."""
+
+    path: str | PathLike[str]
+    number: int
+    words: dict[str, str]
+
+    def command(self) -> Command:
+        told = tuple(self.words[name] for name in _LABELS if self.words.get(name))
+        speed = self.within("speed_mps", 0, _MOST_SPEED)
+        return Command(speed, math.radians(self.value("heading_deg")), self.angle("facing_deg"),
+                       self.angle("turn_deg_s"),
+                       self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None, told)  # fmt: skip
+
+    def angle(self, name: str) -> float | None:
+        """Radians; None where the line leaves it open."""
+        return math.radians(self.value(name)) if self.words.get(name) else None
+
+    def within(self, name: str, low: float, high: float) -> float:
+        if not low <= (value := self.value(name)) <= high:
+            raise FileFormatError(self.path, f"{name} must lie between {low:g} and {high:g}, got {value:g}",
+                                  self.number)  # fmt: skip
+        return value
+
+    def value(self, name: str) -> float:
+        value = finite_number(self.words[name])
+        if value is None or abs(value) > _MOST:
+            raise FileFormatError(self.path, f"{name} must be a number, got {shorten(self.words[name])}", self.number)
+        return value

@@ -1,0 +1,124 @@
+"""Fast root integration and forward kinematics of a trial: compiled, with hand-written adjoints, on one core.
+
+Same mathematics as `features.root_places` and `kinematics.positions_from_matrices`, which remain the specification
+and serve every case but float32 on the CPU. Each is one node of torch's graph, differentiable once.
+"""
+
+from functools import cache
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mapctl.features import LAYOUT, Place
+from mapctl.skeleton import Skeleton
+
+
+class Columns(NamedTuple):
+    """Where a feature vector holds what kinematics needs."""
+
+    dx: int
+    dz: int
+    turn: int
+    height: int
+    tilt_x: int
+    tilt_z: int
+    joints: int
+
+
+def _columns() -> Columns:
+    first = {block: places.start for block, places in LAYOUT.slices.items()}
+    step, tilt = first["root_displacement_heading"], first["root_tilt"]
+    return Columns(step, step + 1, first["heading_change"], first["root_height"], tilt, tilt + 1,
+                   first["joint_rotations"])  # fmt: skip
+
+
+_COLUMNS = _columns()
+_JOINTS = 1 + (LAYOUT.slices["joint_rotations"].stop - LAYOUT.slices["joint_rotations"].start) // 3
+
+
+def serves(features: Tensor, start: Place, skeleton: Skeleton) -> bool:
+    """Whether the kernels take these: float32 batches on the CPU, and gradients to the features alone."""
+    known = (features, start.position_xz, start.heading)
+    plain = all(values.dtype == torch.float32 and values.device.type == "cpu" for values in known)
+    constant = not (start.position_xz.requires_grad or start.heading.requires_grad or skeleton.offsets.requires_grad)
+    shapes = (torch.Size(), torch.Size((1,)), features.shape[:1])
+    fits = features.ndim == 3 and start.heading.shape in shapes and start.position_xz.shape[:-1] in shapes
+    return plain and constant and fits and skeleton.num_joints == _JOINTS
+
+
+def root_places(
+    features: Float[Tensor, "batch frames size"], start: Place
+) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
+    """Root ground positions (metres) and headings (radians, not wrapped) by Eq. 4."""
+    batch = len(features)
+    return _Root.apply(
+        features, start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
+    )
+
+
+def joints_world(
+    features: Float[Tensor, "batch frames size"],
+    root_xz_world: Float[Tensor, "batch frames 2"],
+    heading: Float[Tensor, "batch frames"],
+    skeleton: Skeleton,
+) -> Float[Tensor, "batch frames joints 3"]:
+    """World joint positions, metres, of the root where `root_places` puts it."""
+    return _Body.apply(features, root_xz_world, heading, skeleton)
+
+
+@cache
+def _kernels() -> ModuleType:
+    """Late: the compiler takes a while to import, and what never solves does not need it."""
+    from mapctl.kinematics import fast_kernels
+
+    return fast_kernels
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    """Contiguous, so that every kernel is compiled once."""
+    return tensor.detach().contiguous().numpy()
+
+
+class _Root(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, start_xz: Tensor, start_heading: Tensor):
+        ground, heading = features.new_empty(*features.shape[:2], 2), features.new_empty(features.shape[:2])
+        known, at = _array(features), start_heading.numpy()
+        _kernels().root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
+        ctx.known = known, at
+        return ground, heading
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        features, start_heading = ctx.known
+        gradient = np.zeros(features.shape, np.float32)
+        _kernels().root_backward(features, _COLUMNS, start_heading, *map(_array, pulled), gradient)
+        return torch.from_numpy(gradient), None, None
+
+
+class _Body(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, ground: Tensor, heading: Tensor, skeleton: Skeleton):
+        parents, offsets = np.array(skeleton.parents), skeleton.offsets.double().numpy()
+        places = features.new_empty(*features.shape[:2], len(parents), 3)
+        world = np.empty((*places.shape, 3), np.float32)
+        known = _array(features)
+        _kernels().body_forward(known, _COLUMNS, _array(ground), _array(heading), parents, offsets,
+                                places.numpy(), world)  # fmt: skip
+        ctx.known = known, parents, offsets, world
+        return places
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        features, parents, offsets, world = ctx.known
+        gradient, shape = np.zeros(features.shape, np.float32), features.shape[:2]
+        ground, heading = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
+        _kernels().body_backward(features, _COLUMNS, parents, offsets, world, _array(pulled), gradient, ground, heading)
+        return *map(torch.from_numpy, (gradient, ground, heading)), None

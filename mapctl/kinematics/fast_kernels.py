@@ -1,0 +1,159 @@
+"""Compiled kernels of root integration and forward kinematics, and their adjoints (imported late: needs numba).
+
+Arithmetic is float64 throughout, whatever the arrays hold: a window's kinematics are too small for that to cost
+anything, and sums over frames stay exact.
+"""
+
+import math
+
+import numpy as np
+
+from mapctl.numerics.jit import compilers
+
+entry, inner = compilers("contract", "nsz")
+
+_SMALL = 1e-2  # squared radians below which the series are exact to 1e-10 and the quotients begin to cancel
+
+
+@entry
+def root_forward(features, columns, start_xz, start_heading, ground, headings):
+    """Eq. 4 for features (batch, frames, size); fills ground (batch, frames, 2) and headings (batch, frames)."""
+    dx, dz, turn = columns.dx, columns.dz, columns.turn
+    for b in range(len(features)):
+        x, z, heading = np.float64(start_xz[b, 0]), np.float64(start_xz[b, 1]), np.float64(start_heading[b])
+        for t in range(features.shape[1]):
+            now = features[b, t]
+            sine, cosine = math.sin(heading), math.cos(heading)
+            x += cosine * now[dx] + sine * now[dz]
+            z += cosine * now[dz] - sine * now[dx]
+            heading += now[turn]
+            ground[b, t, 0], ground[b, t, 1], headings[b, t] = x, z, heading
+
+
+@entry
+def root_backward(features, columns, start_heading, d_ground, d_headings, d_features):
+    """Adjoint of `root_forward`: fills the root's columns of d_features, which come in as zeros."""
+    dx, dz, turn = columns.dx, columns.dz, columns.turn
+    for b in range(len(features)):
+        heading = np.float64(start_heading[b])
+        for t in range(features.shape[1]):
+            heading += features[b, t, turn]
+        gx, gz, gh = 0.0, 0.0, 0.0  # on the place and the heading after the frame
+        for t in range(features.shape[1] - 1, -1, -1):
+            now, out = features[b, t], d_features[b, t]
+            gx, gz, gh = gx + d_ground[b, t, 0], gz + d_ground[b, t, 1], gh + d_headings[b, t]
+            heading -= now[turn]
+            sine, cosine = math.sin(heading), math.cos(heading)
+            out[dx], out[dz], out[turn] = cosine * gx - sine * gz, sine * gx + cosine * gz, gh
+            gh += gx * (cosine * now[dz] - sine * now[dx]) - gz * (sine * now[dz] + cosine * now[dx])
+
+
+@inner
+def rotation_series(square):
+    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of an angle a, from its square; smooth at 0."""
+    if square < _SMALL:
+        first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+        third = 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
+        return first, second, third
+    angle = math.sqrt(square)
+    first = math.sin(angle) / angle
+    return first, (1.0 - math.cos(angle)) / square, (1.0 - first) / square
+
+
+@inner
+def turn_by(world, above, x, y, z):
+    """world = above exp([x y z]): a frame turned by a rotation vector given in it (Rodrigues)."""
+    first, second, _ = rotation_series(x * x + y * y + z * z)
+    r00, r11, r22 = 1.0 - second * (y * y + z * z), 1.0 - second * (x * x + z * z), 1.0 - second * (x * x + y * y)
+    r01, r10 = second * x * y - first * z, second * x * y + first * z
+    r02, r20 = second * x * z + first * y, second * x * z - first * y
+    r12, r21 = second * y * z - first * x, second * y * z + first * x
+    for i in range(3):
+        a0, a1, a2 = above[i, 0], above[i, 1], above[i, 2]
+        world[i, 0] = a0 * r00 + a1 * r10 + a2 * r20
+        world[i, 1] = a0 * r01 + a1 * r11 + a2 * r21
+        world[i, 2] = a0 * r02 + a1 * r12 + a2 * r22
+
+
+@inner
+def about_y(turn, heading):
+    """Rotation matrix of a turn about +Y."""
+    sine, cosine = math.sin(heading), math.cos(heading)
+    turn[0, 0], turn[0, 1], turn[0, 2] = cosine, 0.0, sine
+    turn[1, 0], turn[1, 1], turn[1, 2] = 0.0, 1.0, 0.0
+    turn[2, 0], turn[2, 1], turn[2, 2] = -sine, 0.0, cosine
+
+
+@entry
+def body_forward(features, columns, ground, headings, parents, offsets, places, world):
+    """Places (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint."""
+    heading_frame = np.empty((3, 3))
+    for b in range(len(features)):
+        for t in range(features.shape[1]):
+            now, at, frames = features[b, t], places[b, t], world[b, t]
+            about_y(heading_frame, np.float64(headings[b, t]))
+            turn_by(frames[0], heading_frame, np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z]))
+            at[0, 0], at[0, 1], at[0, 2] = ground[b, t, 0], now[columns.height], ground[b, t, 1]
+            for joint in range(1, len(parents)):
+                above, bone, vector = frames[parents[joint]], offsets[joint], columns.joints + 3 * (joint - 1)
+                for i in range(3):
+                    step = above[i, 0] * bone[0] + above[i, 1] * bone[1] + above[i, 2] * bone[2]
+                    at[joint, i] = at[parents[joint], i] + step
+                turn_by(frames[joint], above, np.float64(now[vector]), np.float64(now[vector + 1]),
+                        np.float64(now[vector + 2]))  # fmt: skip
+
+
+@inner
+def vector_gradient(world, torque, x, y, z):
+    """Gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose, in its frame."""
+    ux = world[0, 0] * torque[0] + world[1, 0] * torque[1] + world[2, 0] * torque[2]
+    uy = world[0, 1] * torque[0] + world[1, 1] * torque[1] + world[2, 1] * torque[2]
+    uz = world[0, 2] * torque[0] + world[1, 2] * torque[1] + world[2, 2] * torque[2]
+    _, second, third = rotation_series(x * x + y * y + z * z)
+    cx, cy, cz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+    return (
+        ux + second * cx + third * (y * cz - z * cy),
+        uy + second * cy + third * (z * cx - x * cz),
+        uz + second * cz + third * (x * cy - y * cx),
+    )
+
+
+@entry
+def body_backward(features, columns, parents, offsets, world, d_places, d_features, d_ground, d_headings):
+    """Adjoint of `body_forward`, by forces and torques as in statics.
+
+    A gradient on a place is a force there. What a small turn of a joint does is the torque, about that joint, of the
+    forces on all that hangs from it; both are summed from the leaves to the root. Fills the body's columns of
+    d_features, which come in as zeros, d_ground and d_headings.
+    """
+    force, torque = np.empty((len(parents), 3)), np.empty((len(parents), 3))
+    for b in range(len(features)):
+        for t in range(features.shape[1]):
+            now, out, frames = features[b, t], d_features[b, t], world[b, t]
+            force[:], torque[:] = d_places[b, t], 0.0
+            for joint in range(len(parents) - 1, 0, -1):
+                v = columns.joints + 3 * (joint - 1)
+                out[v], out[v + 1], out[v + 2] = vector_gradient(
+                    frames[joint], torque[joint], np.float64(now[v]), np.float64(now[v + 1]), np.float64(now[v + 2])
+                )
+                hand_up(frames[parents[joint]], offsets[joint], force[joint], torque[joint],
+                        force[parents[joint]], torque[parents[joint]])  # fmt: skip
+            out[columns.tilt_x], _, out[columns.tilt_z] = vector_gradient(
+                frames[0], torque[0], np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
+            )
+            out[columns.height] = force[0, 1]
+            d_ground[b, t, 0], d_ground[b, t, 1], d_headings[b, t] = force[0, 0], force[0, 2], torque[0, 1]
+
+
+@inner
+def hand_up(above, bone, force, torque, force_above, torque_above):
+    """Add a joint's force and torque to its parent's; the force's lever is the bone between them."""
+    x = above[0, 0] * bone[0] + above[0, 1] * bone[1] + above[0, 2] * bone[2]
+    y = above[1, 0] * bone[0] + above[1, 1] * bone[1] + above[1, 2] * bone[2]
+    z = above[2, 0] * bone[0] + above[2, 1] * bone[1] + above[2, 2] * bone[2]
+    torque_above[0] += torque[0] + (y * force[2] - z * force[1])
+    torque_above[1] += torque[1] + (z * force[0] - x * force[2])
+    torque_above[2] += torque[2] + (x * force[1] - y * force[0])
+    for i in range(3):
+        force_above[i] += force[i]

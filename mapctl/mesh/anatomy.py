@@ -1,0 +1,189 @@
+"""Where a moving skeleton's hips, head and soles are, on any rig: by names, bones and how it moves."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.joint_parts import Part, Role, Side, roles
+from mapctl.joint_roles import find_hips
+from mapctl.mesh.primitives import Array, frame_along, unit
+from mapctl.motion import Motion
+
+_LEG = 0.80
+"""Hip to ankle of the person whose measures this package is written for, metres."""
+_TIP = {Part.HEAD: 0.17, Part.HAND: 0.14, Part.TOES: 0.07, Part.FOOT: 0.12, Part.FINGER: 0.02}
+"""How far a last bone reaches where the file does not say, metres."""
+_UP = np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Joints, and the far ends of last bones as further points behind them."""
+
+    parents: tuple[int, ...]
+    """Each point's parent; -1 for the root."""
+    roles: tuple[Role, ...]
+    """Each point's role; a far end has its joint's."""
+    world: Array
+    """(frames, points, 3) metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """One foot's own axes and heights, constant over the motion."""
+
+    side: Side
+    ankle: int
+    """Point index."""
+    ball: int
+    """Point index of the toe joint, or of the foot's far end."""
+    tip: int | None
+    """Point index of the toes' far end, if the rig has toes."""
+    axes: Array
+    """(3, 3) columns left, up from the sole and forward, in the ankle joint's frame."""
+    toe_axes: Array
+    """(3, 3) the same in the toe joint's frame."""
+    heights: tuple[float, float]
+    """Of ankle and ball over the sole, metres."""
+
+
+class Anatomy:
+    """What a body is built on. `motion` may be of any rig and length."""
+
+    def __init__(self, motion: Motion):
+        self.joints = motion.num_joints
+        self.rotations = rotations.to_matrix(motion.joint_rotations()).numpy()
+        joints, parents = motion.joint_positions().numpy(), motion.skeleton.parents
+        self.scale = _leg_length(joints[0], parents, roles(motion.skeleton)) / _LEG
+        self.points = _with_tips(motion, joints, self.rotations, self.scale)
+        self.hips = _hips(motion)
+
+    @property
+    def hips_world(self) -> Array:
+        """(frames, 3) metres."""
+        return self.points.world[:, self.hips]
+
+    @property
+    def seen(self) -> Array:
+        """(frames, n, 3) hips and all below, metres; a root on the floor is not part of the body."""
+        return self.points.world[:, self.hips :]
+
+    def find(self, part: Part, side: Side = Side.MIDDLE) -> int | None:
+        """The first joint of a part and side, None if the rig has none."""
+        wanted = Role(side, part)
+        return next((k for k in range(self.joints) if self.points.roles[k] == wanted), None)
+
+    def children(self, point: int) -> Iterator[int]:
+        """Points below a point, joints before far ends."""
+        return (k for k, parent in enumerate(self.points.parents) if parent == point)
+
+    def left(self, part: Part) -> Array:
+        """(frames, 3) unit vectors from a part's right joint to its left; the hips' x axis without such."""
+        pair = self.find(part, Side.LEFT), self.find(part, Side.RIGHT)
+        if None in pair:
+            return self.rotations[:, self.hips, :, 0]
+        return unit(self.points.world[:, pair[0]] - self.points.world[:, pair[1]])
+
+    @cached_property
+    def forward(self) -> Array:
+        """(frames, 3) where the body faces, level with the ground."""
+        return unit(np.cross(self.left(Part.UPPER_LEG), _UP))
+
+    @cached_property
+    def head_axes(self) -> Array:
+        """(3, 3) columns left, crown and face in the head joint's frame: on average it faces as the body."""
+        head = self.find(Part.HEAD)
+        if head is None:
+            return np.eye(3)
+        tip = next((k for k in self.children(head) if k >= self.joints), head)
+        crown = self._local(head, self.points.world[:, tip] - self.points.world[:, head])
+        return _axes(up=crown.mean(0), forward=self._local(head, self.forward).mean(0))
+
+    @cached_property
+    def feet(self) -> tuple[Foot, ...]:
+        """Left and right foot, as far as the rig has them."""
+        feet = (self._foot(side) for side in (Side.LEFT, Side.RIGHT))
+        return tuple(foot for foot in feet if foot is not None)
+
+    def _foot(self, side: Side) -> Foot | None:
+        ankle = self.find(Part.FOOT, side)
+        below = () if ankle is None else tuple(self.children(ankle))
+        if ankle is None or not below:
+            return None
+        ball = next((k for k in below if self.points.roles[k].part is Part.TOES), below[0])
+        tip = next(self.children(ball), None) if ball < self.joints else None
+        flat = self._flat(ankle, ball)
+        along = self.points.world[:, ball] - self.points.world[:, ankle]
+        axes = _axes(up=self._local(ankle, _UP)[flat].mean(0), forward=self._local(ankle, along)[flat].mean(0))
+        toe = ball if ball < self.joints else ankle
+        level = np.einsum("fij,j->fi", self.rotations[:, ankle], axes[:, 2])
+        toe_axes = _axes(up=self._local(toe, _UP)[flat].mean(0), forward=self._local(toe, level)[flat].mean(0))
+        heights = tuple(self._height(point, flat) for point in (ankle, ball))
+        return Foot(
+            side,
+            ankle,
+            ball,
+            tip,
+            axes,
+            toe_axes,
+            (max(heights[0], heights[1] + 0.02 * self.scale), heights[1]),
+        )
+
+    def _flat(self, ankle: int, ball: int) -> Array:
+        """Frames in which the foot most likely stands flat: ankle and ball together at their lowest."""
+        height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
+        return height <= np.quantile(height, 0.1)
+
+    def _height(self, point: int, flat: Array) -> float:
+        """Of a point over the ground y = 0 in the flat frames, kept to what a foot can have."""
+        low, high = 0.02 * self.scale, 0.14 * self.scale
+        return float(np.clip(np.median(self.points.world[flat, point, 1]), low, high))
+
+    def _local(self, joint: int, vector: Array) -> Array:
+        """World vectors (frames, 3) or (3,) in a joint's frame."""
+        every = np.broadcast_to(vector, (len(self.rotations), 3))
+        return np.einsum("fji,fj->fi", self.rotations[:, joint], every)
+
+
+def _axes(*, up: Array, forward: Array) -> Array:
+    """Columns left, up, forward; up is kept."""
+    across = np.cross(up, forward)
+    if np.linalg.norm(across) < 1e-6 * np.linalg.norm(forward) + 1e-12:
+        across = np.array([1.0, 0.0, 0.0])  # any will do where the motion does not tell
+    return frame_along(up, across)
+
+
+def _hips(motion: Motion) -> int:
+    try:
+        return find_hips(motion.skeleton)
+    except RequestError:
+        return 0  # of an unknown rig: its root
+
+
+def _leg_length(rest: Array, parents: tuple[int, ...], found: tuple[Role, ...]) -> float:
+    """Thigh plus shin, metres; a leg that cannot be found has the standard length."""
+    for foot, role in enumerate(found):
+        if role.part is Part.FOOT:
+            knee = parents[foot]
+            length = np.linalg.norm(rest[foot] - rest[knee]) + np.linalg.norm(rest[knee] - rest[parents[knee]])
+            return float(length) if length > 0.05 else _LEG
+    return _LEG
+
+
+def _with_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Points:
+    found, parents = list(roles(motion.skeleton)), list(motion.skeleton.parents)
+    extra = []
+    for joint, name in enumerate(motion.skeleton.names):
+        leaf, part = joint not in parents[: len(motion.skeleton.names)], found[joint].part
+        offset = np.array(motion.skeleton.end_offsets.get(name, (0.0, 0.0, 0.0)))
+        if np.linalg.norm(offset) > 0.01 * scale:
+            extra.append((joint, joints[:, joint] + turns[:, joint] @ offset))
+        elif part in _TIP and (leaf or part is Part.HEAD):  # eyes and the like say nothing of the crown
+            along = unit(joints[:, joint] - joints[:, parents[joint]])
+            extra.append((joint, joints[:, joint] + along * _TIP[part] * scale))
+    world = np.concatenate([joints, *(place[:, None] for _, place in extra)], axis=1)
+    return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)

@@ -1,0 +1,258 @@
+"""A mannequin for any skeleton: left limbs blue, right limbs orange, torso in the actor's colour."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mapctl.joint_parts import Part, Side
+from mapctl.mesh import colours
+from mapctl.mesh.anatomy import Anatomy, Foot
+from mapctl.mesh.primitives import Array, RoundedBoxes, Surface, frame_along
+from mapctl.motion import Motion
+
+# Radii at a bone's start and end in metres, for a leg of 80 cm; a bone belongs to the part it starts at.
+_RADII = {
+    Part.NECK: (0.050, 0.046), Part.SHOULDER: (0.052, 0.056), Part.UPPER_ARM: (0.047, 0.042),
+    Part.LOWER_ARM: (0.037, 0.026), Part.HAND: (0.033, 0.026), Part.FINGER: (0.009, 0.008),
+    Part.UPPER_LEG: (0.078, 0.057), Part.LOWER_LEG: (0.050, 0.034), Part.OTHER: (0.015, 0.012),
+}  # fmt: skip
+# Bones from the trunk to a limb, by the part they lead to.
+_LINKS = {Part.UPPER_LEG: (0.092, 0.081), Part.HIPS: (0.092, 0.084), Part.SHOULDER: (0.060, 0.056),
+          Part.UPPER_ARM: (0.060, 0.056), Part.OTHER: (0.015, 0.012)}  # fmt: skip
+_TRUNK = ((0.0, 0.35, 0.75, 1.0), (0.100, 0.096, 0.110, 0.060))
+"""Radius of the trunk at shares of the way from hips to neck, metres."""
+_OVERLAP = 0.93
+"""A trunk bone starts thinner than the one below ends, so that their skins cut cleanly."""
+_TRUNK_PARTS = (Part.HIPS, Part.TORSO)
+_TRUNK_SQUASH = (1.22, 1.0, 0.86)
+_HAND_SQUASH = (0.55, 1.0, 1.25)
+_SKULL = (0.082, 0.112, 0.098)
+_VISOR = (0.079, 0.046, 0.088)
+_EDGE = 0.022
+"""Rounding of the shoes' edges, metres."""
+_BOXED = (Part.HEAD, Part.FOOT, Part.TOES)
+"""Parts drawn as skull and shoes instead of one capsule a bone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bones:
+    """Capsules between two points each; arrays over bones."""
+
+    ends: Array
+    """(bones, 2) point indices."""
+    radius: Array
+    """(bones, 2) metres."""
+    squash: Array
+    """(bones, 3) factors of the rounding."""
+    rgb: Array
+    """(bones, 3) sRGB."""
+    height: Array
+    """(bones,) share of the way from hips to shoulders; decides which way a flattened bone lies."""
+
+
+class Body:
+    """The body of one actor over a whole motion."""
+
+    def __init__(self, motion: Motion, colour: Array):
+        self.anatomy = Anatomy(motion)
+        self.colour = colour
+        self.bones = _bones(self.anatomy, colour)
+        self._left = self.anatomy.left(Part.UPPER_LEG), self.anatomy.left(Part.UPPER_ARM)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of the motion."""
+        return len(self.anatomy.points.world)
+
+    def boxes(self, frame: int) -> list[RoundedBoxes]:
+        """Limbs and trunk, skull and shoes in one frame."""
+        feet = [_shoe(self.anatomy, foot, frame) for foot in self.anatomy.feet]
+        head = self.anatomy.find(Part.HEAD)
+        skull = [] if head is None else [_skull(self.anatomy, head, frame, self.colour)]
+        return [self._capsules(frame), *skull, *feet]
+
+    def joints(self) -> list[Array]:
+        """For each of `boxes`, the joint that carries each of its parts."""
+        anatomy = self.anatomy
+        head = anatomy.find(Part.HEAD)
+        skull = [] if head is None else [np.array([head, head])]
+        return [self.bones.ends[:, 0], *skull, *(np.array(_carriers(anatomy, foot)) for foot in anatomy.feet)]
+
+    def surface(self, frame: int) -> Surface:
+        """The whole body in one frame."""
+        boxes = self.boxes(frame)
+        names = ("centre", "frame", "half", "radius", "squash", "rgb")
+        return RoundedBoxes(*(np.concatenate([getattr(box, name) for box in boxes]) for name in names)).surface()
+
+    def sticks(self, frame: int) -> tuple[Array, Array, Array]:
+        """All bones with those of head and feet: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3)."""
+        ends, radius, rgb = self._sticks
+        return self.anatomy.points.world[frame, ends], radius, rgb
+
+    @cached_property
+    def _sticks(self) -> tuple[Array, Array, Array]:
+        anatomy, bones = self.anatomy, self.bones
+        shoes = [(joints, foot) for foot in anatomy.feet for joints in _bones_of(foot)]
+        head = anatomy.find(Part.HEAD)
+        crown = [(head, tip) for tip in anatomy.children(head) if tip >= anatomy.joints][:1] if head is not None else []
+        ends = np.array([*map(tuple, bones.ends), *(joints for joints, _ in shoes), *crown]).reshape(-1, 2)
+        wide = np.array([0.045] * len(shoes) + [0.09] * len(crown)) * anatomy.scale
+        rgb = [*bones.rgb, *(_limb(foot.side) for _, foot in shoes), *(self.colour for _ in crown)]
+        return (
+            ends,
+            np.concatenate([bones.radius.mean(axis=1) * bones.squash[:, 0], wide]),
+            np.array(rgb).reshape(-1, 3),
+        )
+
+    def _capsules(self, frame: int) -> RoundedBoxes:
+        bones, world = self.bones, self.anatomy.points.world[frame]
+        start, stop = world[bones.ends[:, 0]], world[bones.ends[:, 1]]
+        low, high = self._left[0][frame], self._left[1][frame]
+        across = low + (high - low) * bones.height[:, None]
+        half = np.linalg.norm(stop - start, axis=1) / 2
+        zero = np.zeros_like(half)
+        return RoundedBoxes(
+            centre=(start + stop) / 2,
+            frame=frame_along(stop - start, across),
+            half=np.stack([zero, half, zero], axis=1),
+            radius=bones.radius,
+            squash=bones.squash,
+            rgb=bones.rgb,
+        )
+
+
+def _bones(anatomy: Anatomy, colour: Array) -> Bones:
+    parents = anatomy.points.parents
+    pairs = [(parent, child) for child, parent in enumerate(parents) if _drawn(anatomy, child, parent)]
+    ends = pairs or [(anatomy.hips, anatomy.hips)]  # a lone joint is a ball
+    shares = _heights(anatomy)
+    return Bones(
+        ends=np.array(ends),
+        radius=np.array([_radii(anatomy, child, parent, shares) for parent, child in ends]) * anatomy.scale,
+        squash=np.array([_squash(anatomy, child, parent) for parent, child in ends]),
+        rgb=np.array([_colour(anatomy, parent, colour) for parent, _ in ends]),
+        height=shares[np.array(ends)].mean(axis=1),
+    )
+
+
+def _drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
+    """Not what leads from a floor root to the hips, not what skull and shoes show, nothing without length."""
+    if parent < 0 or child <= anatomy.hips or anatomy.points.roles[parent].part in _BOXED:
+        return False
+    length = np.linalg.norm(anatomy.points.world[0, child] - anatomy.points.world[0, parent])
+    return parent >= anatomy.hips and bool(length > 0.005 * anatomy.scale)
+
+
+def _heights(anatomy: Anatomy) -> Array:
+    """Every point's share of the way from hips to neck along the bones; 0 for legs, 1 for arms and head."""
+    points, top = anatomy.points, anatomy.find(Part.NECK)
+    top = anatomy.find(Part.HEAD) if top is None else top
+    way = np.zeros(len(points.parents))
+    for point, parent in enumerate(points.parents):
+        if point > anatomy.hips and parent >= 0:
+            way[point] = way[parent] + np.linalg.norm(points.world[0, point] - points.world[0, parent])
+    legs = (Part.UPPER_LEG, Part.LOWER_LEG, Part.FOOT, Part.TOES)
+    low = np.array([role.part in legs for role in points.roles])
+    whole = way[top] if top is not None and way[top] > 0 else 0.5 * anatomy.scale
+    return np.where(low, 0.0, np.clip(way / whole, 0.0, 1.0))
+
+
+def _is_link(anatomy: Anatomy, child: int, parent: int) -> bool:
+    """Whether a bone leads from the trunk to a limb."""
+    below, above = anatomy.points.roles[child], anatomy.points.roles[parent]
+    return above.part in _TRUNK_PARTS and (below.part in _LINKS) and below.side is not Side.MIDDLE
+
+
+def _radii(anatomy: Anatomy, child: int, parent: int, shares: Array) -> tuple[float, float]:
+    below, above = anatomy.points.roles[child].part, anatomy.points.roles[parent].part
+    if above is Part.HAND and below is Part.FINGER:
+        return 0.016, 0.013
+    if _is_link(anatomy, child, parent):
+        return _LINKS[below]
+    if above in _TRUNK_PARTS and anatomy.points.roles[parent].side is Side.MIDDLE:
+        start, stop = np.interp(shares[[parent, child]], *_TRUNK)
+        return float(start) * _OVERLAP, float(stop)
+    return _RADII.get(above, _LINKS[Part.UPPER_LEG])
+
+
+def _squash(anatomy: Anatomy, child: int, parent: int) -> tuple[float, float, float]:
+    above = anatomy.points.roles[parent]
+    if above.part in _TRUNK_PARTS and not _is_link(anatomy, child, parent):
+        return _TRUNK_SQUASH
+    return _HAND_SQUASH if above.part is Part.HAND else (1.0, 1.0, 1.0)
+
+
+def _colour(anatomy: Anatomy, parent: int, colour: Array) -> Array:
+    role = anatomy.points.roles[parent]
+    if role.part in (*_TRUNK_PARTS, Part.SHOULDER) or role.side is Side.MIDDLE:
+        return _pale(colour) if role.part is Part.NECK else colour
+    return _limb(role.side)
+
+
+def _limb(side: Side) -> Array:
+    return colours.rgb(colours.LEFT if side is Side.LEFT else colours.RIGHT)
+
+
+def _skull(anatomy: Anatomy, head: int, frame: int, colour: Array) -> RoundedBoxes:
+    """A head with a dark visor where it faces."""
+    scale, turn = anatomy.scale, anatomy.rotations[frame, head] @ anatomy.head_axes
+    middle = anatomy.points.world[frame, head] + turn @ np.array([0.0, 0.085, 0.012]) * scale
+    visor = middle + turn @ np.array([0.0, 0.014, 0.021]) * scale
+    return RoundedBoxes(
+        centre=np.stack([middle, visor]),
+        frame=np.stack([turn, turn]),
+        half=np.zeros((2, 3)),
+        radius=np.full((2, 2), scale),
+        squash=np.array([_SKULL, _VISOR]),
+        rgb=np.stack([_pale(colour), colours.rgb(colours.VISOR)]),
+    )
+
+
+def _pale(colour: Array) -> Array:
+    """Of the head and neck, a little lighter than the trunk."""
+    return colours.mix(colour, np.ones(3), 0.18)
+
+
+def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
+    """Heel to ball and, where there are toes, ball to tip; soles on the ground when the foot is flat."""
+    world, scale = anatomy.points.world[frame], anatomy.scale
+    turn, boxes = anatomy.rotations[frame, foot.ankle] @ foot.axes, []
+    reach = _ahead(turn, world[foot.ball] - world[foot.ankle]) + (0.03 if foot.tip is None else 0.01) * scale
+    boxes.append(_sole(world[foot.ankle], turn, -foot.heights[0], (-0.055 * scale, reach), 0.085, scale))
+    if foot.tip is not None:
+        turn = anatomy.rotations[frame, foot.ball] @ foot.toe_axes
+        reach = max(_ahead(turn, world[foot.tip] - world[foot.ball]), 0.04 * scale)
+        boxes.append(_sole(world[foot.ball], turn, -foot.heights[1], (-0.035 * scale, reach), 0.055, scale))
+    centre, frames, half = (np.stack(values) for values in zip(*boxes, strict=True))
+    many, leather = len(boxes), colours.mix(_limb(foot.side), np.zeros(3), 0.28)
+    return RoundedBoxes(
+        centre,
+        frames,
+        half,
+        np.full((many, 2), _EDGE * scale),
+        np.ones((many, 3)),
+        np.tile(leather, (many, 1)),
+    )
+
+
+def _ahead(turn: Array, vector: Array) -> float:
+    """How far a vector reaches along the foot, metres."""
+    return float(turn[:, 2] @ vector)
+
+
+def _sole(joint: Array, turn: Array, floor: float, along: tuple[float, float], thick: float, scale: float):
+    """Centre, frame and half extents of a box with its floor over a joint and its reach along it, metres."""
+    middle = np.array([0.0, floor + thick * scale / 2, sum(along) / 2])
+    half = np.array([0.045 * scale, thick * scale / 2, (along[1] - along[0]) / 2])
+    return joint + turn @ middle, turn, np.maximum(half - _EDGE * scale, 0.0)
+
+
+def _carriers(anatomy: Anatomy, foot: Foot) -> list[int]:
+    """The joints that carry the boxes of a shoe: ankle, and the toes if the rig has them."""
+    return [foot.ankle] if foot.tip is None else [foot.ankle, foot.ball if foot.ball < anatomy.joints else foot.ankle]
+
+
+def _bones_of(foot: Foot) -> list[tuple[int, int]]:
+    """Ankle to ball, and ball to tip if the rig has toes."""
+    return [(foot.ankle, foot.ball)] + ([] if foot.tip is None else [(foot.ball, foot.tip)])

@@ -1,0 +1,113 @@
+"""Look a recording over: which joints leap or stand still when they should not, and how noisy the rest is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.motion import Motion
+from mapctl.recording.masks import Mask, masked, traveller
+from mapctl.recording.noise_estimation import angle_noise, place_noise
+from mapctl.recording.recording import filled, last_seen
+from mapctl.recording.spike_detection import angle_spikes, place_spikes
+
+_FROZEN_SECONDS = 0.1  # that a joint which moves otherwise does not move at all
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """A recording on its own rig, and what of it is to be believed."""
+
+    motion: Motion
+    """The recording."""
+    spikes: Bool[Tensor, "frames joints"]
+    """Where a joint leaps."""
+    dropouts: Bool[Tensor, "frames joints"]
+    """Where a joint is masked, or stands perfectly still though it moves otherwise."""
+    spikes_root: Bool[Tensor, " frames"]
+    """Where the root's place leaps."""
+    dropouts_root: Bool[Tensor, " frames"]
+    """Where the root's place is masked."""
+    noise: Float[Tensor, " joints"]
+    """Of each of a joint's three angles, radians."""
+    noise_root: float
+    """Of each coordinate, metres."""
+    travels: int
+    """The joint whose place that is: the root, or the one below it that is moved instead."""
+
+    @property
+    def seen(self) -> Bool[Tensor, "frames joints"]:
+        """What is neither."""
+        return ~(self.spikes | self.dropouts)
+
+    @property
+    def seen_root(self) -> Bool[Tensor, " frames"]:
+        """What is neither, of the root's place."""
+        return ~(self.spikes_root | self.dropouts_root)
+
+    def place(self, motion: Motion) -> Float[Tensor, "frames 3"]:
+        """Of the joint that travels, in a motion of this rig, metres."""
+        return motion.moving_offsets[self.travels] if self.travels else motion.root_position
+
+    def slice(self, start: int, stop: int) -> "Examined":
+        """Frames start to stop; the noise stays that of the whole."""
+        part = slice(start, stop)
+        return replace(self, motion=self.motion.slice(start, stop), spikes=self.spikes[part],
+                       dropouts=self.dropouts[part], spikes_root=self.spikes_root[part],
+                       dropouts_root=self.dropouts_root[part])  # fmt: skip
+
+    def repaired(self) -> Motion:
+        """The recording with what is not to be believed filled in: straight between the frames around it."""
+        motion, seen = self.motion, self.seen
+        quats = rotations.sign_continuous(_only(motion.local_quat_xyzw, seen))
+        steps = filled(quats.transpose(0, 1), seen.T).transpose(0, 1)
+        root = filled(motion.root_position[None], self.seen_root[None])[0]
+        moving = {joint: filled(values[None], self.seen_root[None])[0] if joint == self.travels else values
+                  for joint, values in motion.moving_offsets.items()}  # fmt: skip
+        return replace(motion, root_position=root, moving_offsets=moving,
+                       local_quat_xyzw=torch.nn.functional.normalize(steps, dim=-1))  # fmt: skip
+
+
+def examine(motion: Motion, masks: Sequence[Mask] = ()) -> Examined:
+    """Look over a recording on any rig; RequestError for masks that name joints or frames it has not."""
+    quats = rotations.sign_continuous(motion.local_quat_xyzw)
+    hidden, hidden_root = masked(motion, masks)
+    travels = traveller(motion)
+    place = motion.moving_offsets[travels] if travels else motion.root_position
+    frozen = _frozen(quats, float(motion.fps))
+    dropouts, dropouts_root = hidden | frozen, hidden_root
+    noise, noise_root = angle_noise(quats, ~dropouts), place_noise(place, ~dropouts_root)
+    spikes = angle_spikes(quats, noise) & ~dropouts
+    spikes_root = place_spikes(place, noise_root) & ~dropouts_root
+    # Each spike spoils the differences of the frames around it.
+    noise = angle_noise(quats, ~(dropouts | spikes))
+    noise_root = place_noise(place, ~(dropouts_root | spikes_root))
+    return Examined(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
+
+
+def _frozen(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor, "frames joints"]:
+    """Runs in which nothing of a joint's rotation changes, not even by rounding, of joints that move most of the time.
+
+    A whole body that stands still is a paused recording, or a stand: it is left alone.
+    """
+    still = (quats[1:] == quats[:-1]).all(dim=-1)
+    if len(still) == 0:
+        return torch.zeros(quats.shape[:2], dtype=torch.bool)
+    moves = (~still).double().mean(dim=0) > 0.5
+    still = still & moves & (still.double().mean(dim=1, keepdim=True) < 0.8)
+    shortest = max(2, round(_FROZEN_SECONDS * fps))
+    if len(still) < shortest:
+        return torch.zeros(quats.shape[:2], dtype=torch.bool)
+    whole = still.T.unfold(-1, shortest, 1).all(dim=-1)
+    spread = torch.nn.functional.pad(whole, (shortest - 1, shortest - 1)).unfold(-1, shortest, 1).any(dim=-1).T
+    # The frame before the run is the last that was true.
+    return torch.cat([torch.zeros_like(spread[:1]), spread])
+
+
+def _only(quats: Tensor, seen: Tensor) -> Tensor:
+    """What was seen last, where nothing is seen: signs are then chosen between frames that count."""
+    nearest = last_seen(seen.T).T
+    return torch.take_along_dim(quats, nearest[..., None], dim=0)

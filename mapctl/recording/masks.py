@@ -1,0 +1,161 @@
+"""Masks: what of a recording its user says not to believe. CSV with the columns joint, start, stop."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from os import PathLike
+
+import torch
+from torch import Tensor
+
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.missing import Missing
+from mapctl.formats.text import read_table, shorten
+from mapctl.joint_names import canonical_joints, find_joint, nearest
+from mapctl.joint_parts import roles
+from mapctl.motion import Motion
+from mapctl.recording.artefacts import runs
+from mapctl.retarget.rigs import Rig
+
+_COLUMNS = ("joint", "start", "stop")
+_FRAME = re.compile(r"[+-]?[0-9]{1,12}")
+ALL, ROOT = "*", "root position"
+"""Names that stand for everything, and for the place of the root."""
+
+
+@dataclass(frozen=True)
+class Mask:
+    """Frames in which a joint is not to be believed."""
+
+    joint: str
+    """Of the recording's own rig or canonical, in any case; `*` for all of it, `root position` for where it is."""
+    start: int
+    """First frame, from 0."""
+    stop: int
+    """One past the last."""
+
+
+def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
+    """Read a CSV, its columns in any order; FileFormatError says which line is wrong. A header alone masks nothing."""
+    (line, names), *rows = read_table(path, f"a CSV of the columns {','.join(_COLUMNS)}") or [(1, [])]
+    if not set(_COLUMNS) <= set(names) or len(set(names)) < len(names):
+        found = shorten(",".join(names)) if names else "nothing"
+        raise FileFormatError(path, f"needs the columns {', '.join(_COLUMNS)}, each once; found {found}", line)
+    return tuple(_mask(path, line, names, words) for line, words in rows)
+
+
+def _mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Sequence[str]) -> Mask:
+    if len(words) != len(names):
+        raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", line)
+    row = dict(zip(names, words, strict=True))
+    numbers = [row[name] for name in ("start", "stop")]
+    if not row["joint"] or not all(_FRAME.fullmatch(number) for number in numbers):
+        got = shorten(",".join(words))
+        raise FileFormatError(path, f"expected a joint and two whole frames, got {got}", line)
+    start, stop = map(int, numbers)
+    if not 0 <= start < stop:
+        raise FileFormatError(path, f"needs 0 <= start < stop, got {start} and {stop}", line)
+    return Mask(row["joint"], start, stop)
+
+
+def of_missing(motion: Motion, missing: Missing) -> tuple[Mask, ...]:
+    """What a file marks as lost. A joint that travels beside the body's own travel is lost with its place."""
+    travels, joints = traveller(motion), missing.rotations.clone()
+    below = motion.skeleton.children(0)
+    if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
+        travels = below[0]  # hips under a root that stays on the ground: the body's way is not known anywhere
+    for joint in motion.moving_offsets:
+        if joint != travels:
+            joints[:, joint] |= missing.places[:, joint]
+    lost = [Mask(motion.skeleton.names[joint], start, stop) for joint, start, stop in runs(joints)]
+    return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in runs(missing.places[:, travels, None])))
+
+
+def traveller(motion: Motion) -> int:
+    """The joint whose place is that of the body: the root, or the first below a root that stays where it is."""
+    moving = [joint for joint, values in motion.moving_offsets.items() if bool((values != values[0]).any())]
+    stays = bool((motion.root_position == motion.root_position[0]).all())
+    return min(moving) if stays and moving else 0
+
+
+def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
+    """Which joints (frames, joints) and root places (frames,) are masked.
+
+    RequestError for joints that the rig has not (with the nearest that it has), frames beyond the end, and joints of
+    which nothing would be left.
+    """
+    for mask in masks:
+        if mask.stop > motion.num_frames:
+            raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
+    joints, root = hidden(motion, masks)
+    if root.all() or joints.all(dim=0).any():
+        gone = "root position" if root.all() else motion.skeleton.names[int(joints.all(dim=0).nonzero()[0])]
+        raise RequestError(f"the masks leave nothing of {gone} in {motion.num_frames} frames")
+    return joints, root
+
+
+def hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
+    """Masked joints (frames, joints) and root places (frames,)."""
+    names = motion.skeleton.names
+    masks = by_own_names(motion, masks)
+    joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
+    root = torch.zeros(motion.num_frames, dtype=torch.bool)
+    for mask in masks:
+        if mask.joint in (ALL, ROOT):
+            root[mask.start : mask.stop] = True
+        if mask.joint == ALL:
+            joints[mask.start : mask.stop] = True
+        elif mask.joint != ROOT:
+            joints[mask.start : mask.stop, names.index(mask.joint)] = True
+    return joints, root
+
+
+def by_own_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None = None) -> tuple[Mask, ...]:
+    """The masks with every joint by the name that the motion's own rig has for it.
+
+    `rig` wins over what would be recognised. RequestError, with the nearest names, for joints that it has not.
+    """
+    known = cache(lambda: canonical_joints(motion, rig))
+    own = {name: _own_name(motion, name, known) for name in {mask.joint for mask in masks} - {ALL, ROOT}}
+    return tuple(replace(mask, joint=own.get(mask.joint, mask.joint)) for mask in masks)
+
+
+def part_of(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
+    """The masks of frames start to stop, counted from there."""
+    clipped = [Mask(m.joint, max(m.start, start) - start, min(m.stop, stop) - start) for m in masks]
+    return tuple(mask for mask in clipped if mask.start < mask.stop)
+
+
+def after(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
+    """The masks as far as they hold from that frame on."""
+    cut = [Mask(m.joint, max(m.start, frame), m.stop) for m in masks]
+    return tuple(mask for mask in cut if mask.start < mask.stop)
+
+
+def written_back(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
+    """The motion with what is masked of its first frames taken from a clean version of them.
+
+    So that a joint which is lost for long is known by what was made of it before.
+    """
+    shared = clean.num_frames
+    joints, root = hidden(motion, masks)
+    joints, root = joints[:shared], root[:shared]
+    if not bool(joints.any() | root.any()):
+        return motion
+    quats, place = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    quats[:shared] = torch.where(joints[..., None], clean.local_quat_xyzw, quats[:shared])
+    place[:shared] = torch.where(root[:, None], clean.root_position, place[:shared])
+    moving = dict(motion.moving_offsets)
+    for joint, values in moving.items():
+        kept = torch.where(root[:, None], clean.moving_offsets[joint], values[:shared])
+        moving[joint] = torch.cat([kept, values[shared:]])
+    return replace(motion, local_quat_xyzw=quats, root_position=place, moving_offsets=moving)
+
+
+def _own_name(motion: Motion, wanted: str, known: Callable[[], Mapping[str, int]]) -> str:
+    names = motion.skeleton.names
+    joint = find_joint(wanted, names, known)
+    if joint is None:
+        raise RequestError(f"no joint {wanted!r} to mask; {nearest(wanted, names, roles(motion.skeleton))}")
+    return names[joint]

@@ -1,0 +1,267 @@
+"""Between a rig's own joint frames and the canonical ones, both ways and without loss.
+
+In the T-pose every canonical joint frame is aligned with the world. A rig's joint j then has some world rotation B_j,
+and at any time: canonical world rotation = U * rig's world rotation * inverse(B_j), where U turns the file's world so
+that Y is up. The canonical motion keeps the performer's own bone lengths; only the frames change.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.retarget import bone_offsets
+from mapctl.retarget.joint_matching import Match, match, with_sides_checked
+from mapctl.retarget.pose_axes import Poses, up_axis
+from mapctl.retarget.reference_pose import TPose, find, kind, rest_facing, upright_of
+from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL, Skeleton
+
+_FITS = math.radians(60)  # between a limb's bone in a table's T-pose and its canonical direction
+
+
+@dataclass(frozen=True, eq=False)
+class RigMap:
+    """How one skeleton of a rig maps to canonical joints."""
+
+    rig: Rig
+    """The rig's names and T-pose."""
+    rig_skeleton: Skeleton
+    """The rig's own skeleton."""
+    joint_of: tuple[int | None, ...]
+    """For each canonical joint the rig's joint, None where the rig has only an End Site or nothing."""
+    tpose_quat_xyzw: Float[Tensor, "joints 4"]
+    """B: world rotation of each canonical joint's rig joint in the T-pose, in a world with Y up."""
+    skeleton: Skeleton
+    """Canonical names and tree with this performer's bones."""
+    upright_quat_xyzw: Float[Tensor, "4"] | None = None
+    """U: turns the file's world so that Y is up; None where it is."""
+    idle_quat_xyzw: Float[Tensor, "rigged 4"] | None = None
+    """Local rotations at rest of joints that are no canonical one; None where they are all zero."""
+    match: Match | None = None
+    """How the joints were told, and how sure that is."""
+    up: str = "y"
+    """Axis of the file's world that points up."""
+    facing: str = "z"
+    """Axis of the file that the pose with all rotations zero faces; `unknown` where it is along none."""
+    rest: str = "neither"
+    """What the pose with all rotations zero is: T, A or neither."""
+    tpose_from: str = "table"
+    """Where the T-pose was found: table, rest pose, or frame 0."""
+    hips_travel: bool = True
+    """Whether hips below the root have an animated offset; else the root carries them."""
+
+
+def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
+    """Tell the rig's joints, find its T-pose and measure its bones; RequestError where its joints cannot be told.
+
+    What `rig` says is taken as it is; else presets are tried, and then names, tree and places (see
+    mapctl.retarget.joint_matching). A `motion` of the skeleton shows which way is up, how knees bend, and whether it
+    begins with a T-pose, where the pose with all rotations zero does not.
+    """
+    found = match(skeleton, rig)
+    told = _by_table(found, skeleton, motion)
+    if told is not None:
+        return _with_travel(told, motion)
+    found = with_sides_checked(found, skeleton, motion)
+    zero = Poses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else Poses.of(motion, found.joint_of)
+    return _with_travel(_map(found, skeleton, find(zero, clip, rig=found.rig)), motion)
+
+
+def settled(rigmap: RigMap) -> Rig:
+    """The rig as it was found, so that parts of a clip are converted as the whole was.
+
+    A part may lack the first frame that showed the T-pose, or the steps that showed how knees bend.
+    """
+    names = rigmap.rig_skeleton.names
+    pairs = list(zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
+    axes = {c: rotations.to_matrix(quat).T.tolist() for c, joint, quat in pairs if joint is not None}
+    return replace(
+        rigmap.rig, joints={c: names[joint] for c, joint, _ in pairs if joint is not None}, aliases={}, straighten=(),
+        tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()}, up=rigmap.up, rest="tpose",
+    )  # fmt: skip
+
+
+def _with_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
+    """The map, told whether the hips travel below the root; without a motion they may."""
+    return rigmap if motion is None else replace(rigmap, hips_travel=_hips(rigmap) in motion.moving_offsets)
+
+
+def _by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
+    """By the T-pose that the rig's table tells; None where it tells none, or its limbs would not lie as in one."""
+    rig, joint_of = found.rig, found.joint_of
+    if not rig.has_tpose:
+        return None
+    quats = _tpose(rig, skeleton, joint_of)
+    zero = Poses.zero(skeleton, joint_of)
+    clip = None if motion is None else Poses.of(motion, joint_of)
+    up = up_axis(zero, clip) if rig.up == "auto" else rig.up
+    idle = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(skeleton.num_joints, 4)
+    rest = kind(zero, torch.eye(3, dtype=torch.float64))
+    told = _map(found, skeleton, TPose(quats, idle, upright_of(up), up, rest_facing(zero), rest, "table"))
+    if rig.rest == "tpose" and rig.name != "canonical":  # what a user asks for is done
+        return told
+    return told if (rest == "T" or not rig.straighten) and _lies_as_canonical(told.skeleton) else None
+
+
+def _map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
+    measured = bone_offsets.measure(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw)
+    return RigMap(found.rig, skeleton, found.joint_of, tpose.quat_xyzw, measured, tpose.upright_quat_xyzw,
+                  tpose.idle_quat_xyzw, found, tpose.up, tpose.facing, tpose.rest, tpose.found)  # fmt: skip
+
+
+def _lies_as_canonical(skeleton: Skeleton) -> bool:
+    """Whether limbs lie about as they do in the T-pose, and hang from their own side of a trunk that stands."""
+    names = [side + part for side in ("left", "right") for part in ("LowerArm", "Hand", "LowerLeg", "Foot")]
+    own, usual = skeleton.offsets, CANONICAL.offsets
+    pairs = [(own[CANONICAL.index(name)], usual[CANONICAL.index(name)]) for name in names]
+    trunk = [CANONICAL.index(name) for name in ("spine", "chest", "neck")]
+    pairs.append((own[trunk].sum(0), usual[trunk].sum(0)))
+    legs = [CANONICAL.index(side + "UpperLeg") for side in ("left", "right")]
+    pairs.append((own[legs[0]] - own[legs[1]], usual[legs[0]] - usual[legs[1]]))
+    return all(float(bone @ wanted) >= math.cos(_FITS) * float(bone.norm() * wanted.norm()) for bone, wanted in pairs)
+
+
+def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap]:
+    """The motion in canonical joint frames with the performer's own bones, and the map that leads back.
+
+    `rig` wins over what would be recognised (see `map_rig`).
+    """
+    rigmap = map_rig(motion.skeleton, rig, motion=motion)
+    world = motion.joint_rotations()
+    picked = []
+    for name, joint, tpose in zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True):
+        if joint is None:  # an End Site turns with its parent
+            picked.append(picked[CANONICAL.parents[CANONICAL.index(name)]])
+        else:
+            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
+    local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
+    hips = motion.joint_positions()[:, _hips(rigmap)]
+    upright = rigmap.upright_quat_xyzw
+    if upright is not None:  # all other joints turn with the hips
+        local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
+        hips = rotations.rotate(upright.expand(len(world), 4), hips)
+    return Motion(rigmap.skeleton, motion.fps, hips, rotations.sign_continuous(local)), rigmap
+
+
+def places_on_rig(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:
+    """Where the rig's own joints are, by canonical joint, in a world that stands along Y; 0 for joints it lacks.
+
+    Joints that only the rig has, as those of twist, carry them elsewhere than the canonical motion tells.
+    """
+    places = motion.joint_positions()
+    picked = [torch.zeros_like(places[:, 0]) if joint is None else places[:, joint] for joint in rigmap.joint_of]
+    found = torch.stack(picked, dim=1)
+    upright = rigmap.upright_quat_xyzw
+    return found if upright is None else rotations.rotate(upright.expand(*found.shape[:2], 4), found)
+
+
+def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = None) -> Motion:
+    """The canonical motion on the rig. Joints the canonical skeleton lacks keep the original's rotation.
+
+    Without an original of the same length they rest (fingers straight). The result carries the original's file layout.
+    """
+    skeleton, frames = rigmap.rig_skeleton, motion.num_frames
+    kept = original is not None and original.num_frames == frames
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    rest = still.expand(frames, skeleton.num_joints, 4)
+    if rigmap.idle_quat_xyzw is not None:
+        rest = rigmap.idle_quat_xyzw.expand(frames, skeleton.num_joints, 4)
+    own = original.local_quat_xyzw if original is not None and kept else rest
+    hips, wanted = _in_the_files_world(motion, rigmap)
+    local, world = [], []
+    for joint, parent in enumerate(skeleton.parents):
+        above = world[parent] if parent >= 0 else None
+        turn = own[:, joint] if joint not in wanted else wanted[joint]
+        if joint in wanted and above is not None:
+            turn = rotations.multiply(rotations.inverse(above), wanted[joint])
+        local.append(turn)
+        world.append(turn if above is None else rotations.multiply(above, turn))
+    on_rig = Motion(skeleton, motion.fps, torch.zeros(frames, 3, dtype=torch.float64),
+                    rotations.sign_continuous(torch.stack(local, 1)),
+                    source=original.source if original is not None else None)  # fmt: skip
+    return _place_hips(on_rig, rigmap, hips, original if kept else None)
+
+
+def _in_the_files_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
+    """Where the hips are to be, and which world rotation each joint of the rig is to have."""
+    world, hips = motion.joint_rotations(), motion.root_position
+    if rigmap.upright_quat_xyzw is not None:
+        back = rotations.inverse(rigmap.upright_quat_xyzw)
+        world = rotations.multiply(back.expand(world.shape), world)
+        hips = rotations.rotate(back.expand(len(world), 4), hips)
+    pairs = enumerate(zip(rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
+    turns = {j: rotations.multiply(world[:, c], b.expand(len(world), 4)) for c, (j, b) in pairs if j is not None}
+    return hips, turns
+
+
+def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion | None) -> Motion:
+    """Put the hips where they belong: by the root itself, or by their offset below it where that is animated."""
+    joint = _hips(rigmap)
+    if joint == 0:
+        moving = original.moving_offsets if original is not None else {}
+        return replace(on_rig, root_position=hips, moving_offsets=moving)
+    if original is not None:
+        on_rig = replace(on_rig, root_position=original.root_position, moving_offsets=original.moving_offsets)
+    travel = rigmap.hips_travel if original is None else joint in original.moving_offsets
+    if not travel:
+        missed = hips - on_rig.joint_positions()[:, joint]
+        return replace(on_rig, root_position=on_rig.root_position + missed)
+    parent = on_rig.skeleton.parents[joint]
+    turn, place = on_rig.joint_rotations()[:, parent], on_rig.joint_positions()[:, parent]
+    offset = rotations.rotate(rotations.inverse(turn), hips - place)
+    return replace(on_rig, moving_offsets={**on_rig.moving_offsets, joint: offset})
+
+
+def _hips(rigmap: RigMap) -> int:
+    joint = rigmap.joint_of[0]
+    if joint is None:
+        raise RequestError(f"the rig {rigmap.rig.name} names no hips")
+    return joint
+
+
+def _tpose(rig: Rig, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
+    quats = []
+    for index, name in enumerate(CANONICAL.names):
+        axes = rig.tpose.get(name)
+        matrix = frame_of(axes["x"], axes["y"]) if axes else torch.eye(3, dtype=torch.float64)
+        if name in rig.straighten:
+            matrix = _straightened(index, skeleton, joint_of)
+        quats.append(rotations.from_matrix(matrix))
+    return torch.stack(quats)
+
+
+def frame_of(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
+    """Rotation whose first two columns point along x and (as nearly as they are square) y."""
+    first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
+    second = torch.tensor(y, dtype=torch.float64)
+    second = torch.nn.functional.normalize(second - first * (first @ second), dim=0)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=1)
+
+
+def _straightened(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
+    """The smallest rotation that lays the joint's bone along its canonical direction."""
+    child = CANONICAL.children(index)[0]
+    rig_child = joint_of[child]
+    if rig_child is None:
+        raise RequestError(f"cannot straighten {CANONICAL.names[index]}: the rig has no joint after it")
+    bone = torch.nn.functional.normalize(skeleton.offsets[rig_child], dim=0)
+    aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
+    return _shortest_turn(bone, aim)
+
+
+def _shortest_turn(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation from one unit vector to another; of opposite ones, one of the half turns."""
+    axis, cosine = torch.linalg.cross(start, stop), start @ stop
+    if cosine < 0 and axis.norm() < 1e-9:
+        across = torch.nn.functional.one_hot(start.abs().argmin(), 3).to(start.dtype)
+        axis = torch.linalg.cross(start, across)
+        return rotations.rotation_vector_to_matrix(axis / axis.norm() * torch.pi)
+    sine = axis.norm().clamp_min(1e-12)
+    return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))

@@ -1,0 +1,75 @@
+"""A performer's bones on the canonical skeleton: the rig put into its T-pose, joint by joint."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.retarget.pose_axes import JointOf, next_of
+from mapctl.skeleton import CANONICAL, Skeleton
+
+_END_SITES = ("Toes", "Hand", "head")  # what an End Site of the joint above may stand for
+
+
+def measure(
+    skeleton: Skeleton, joint_of: JointOf, tpose: Float[Tensor, "joints 4"], idle: Float[Tensor, "rigged 4"]
+) -> Skeleton:
+    """The canonical skeleton with a rig's bones, metres.
+
+    `tpose` holds world rotations by canonical joint, `idle` the local ones of joints that are no canonical one. A joint
+    that the rig lacks is put where the End Site of the joint above is, between its neighbours, or, at the end of a
+    limb, as far on as the canonical one in scale.
+    """
+    canonical_of = {joint: c for c, joint in enumerate(joint_of) if joint is not None}
+    place, turn = [torch.zeros(3, dtype=torch.float64)], []
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            place.append(place[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
+        if joint in canonical_of:
+            turn.append(tpose[canonical_of[joint]])
+        else:
+            turn.append(rotations.multiply(turn[parent], idle[joint]) if parent >= 0 else idle[joint])
+    ends = {}
+    for name, site in skeleton.end_offsets.items():
+        joint = skeleton.index(name)
+        ends[joint] = rotations.rotate(turn[joint], torch.tensor(site, dtype=torch.float64))
+    known = {c: place[joint] for c, joint in enumerate(joint_of) if joint is not None}
+    spots: list[Tensor] = []
+    for c in range(CANONICAL.num_joints):
+        spots.append(known[c] if c in known else _put(c, joint_of, spots, known, ends))
+    places = torch.stack(spots)
+    offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
+    tips = {CANONICAL.names[c]: _triple(ends[j]) for c, j in enumerate(joint_of)
+            if j is not None and j in ends and not CANONICAL.children(c)}  # fmt: skip
+    return Skeleton(CANONICAL.names, CANONICAL.parents, offsets, tips)
+
+
+def _put(
+    c: int, joint_of: JointOf, spots: list[Tensor], known: Mapping[int, Tensor], ends: Mapping[int, Tensor]
+) -> Float[Tensor, "3"]:
+    """A place for a joint that the rig lacks."""
+    name, parent = CANONICAL.names[c], CANONICAL.parents[c]
+    above, own = joint_of[parent], float(CANONICAL.offsets[c].norm())
+    if name.endswith(_END_SITES) and above is not None and above in ends:
+        return spots[parent] + ends[above]
+    length, following = own, next_of(name)
+    while following is not None:
+        length += float(CANONICAL.offsets[CANONICAL.index(following)].norm())
+        if CANONICAL.index(following) in known:
+            return spots[parent] + (known[CANONICAL.index(following)] - spots[parent]) * (own / length)
+        following = next_of(following)
+    return spots[parent] + CANONICAL.offsets[c] * _scale(spots)
+
+
+def _scale(spots: list[Tensor]) -> float:
+    """Of the performer to the canonical one: by how far the joints so far reach."""
+    own = sum(float((spot - spots[CANONICAL.parents[c]]).norm()) for c, spot in enumerate(spots) if c)
+    usual = float(CANONICAL.offsets[1 : len(spots)].norm(dim=-1).sum())
+    return own / usual if own > 0 and usual > 0 else 1.0
+
+
+def _triple(vector: Tensor) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z

@@ -1,0 +1,103 @@
+"""Somebody who stands on a rig that only its names and T-pose tell of: the canonical body, under the rig's names."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import kinematics, retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.formats.bvh import layout as bvh_layout
+from mapctl.motion import Motion
+from mapctl.retarget.joint_matching import REQUIRED
+from mapctl.retarget.reference_pose import upright_of, vector
+from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+
+_FPS, _FRAMES = Fraction(30), 30
+
+
+def stand(rig: Rig) -> Motion:
+    """A second of standing in the T-pose on the rig's joints, in its world and unit; toes on the floor.
+
+    Bones are the canonical body's, since a rig tells names and no lengths. RequestError where it does not name all that
+    a rig must have.
+    """
+    missing = [name for name in REQUIRED if name not in rig.joints]
+    if missing:
+        raise RequestError(f"rig {rig.name} names no joint for {', '.join(missing)}: a skeleton cannot be made of it; "
+                           "name them, or a clip")  # fmt: skip
+    skeleton = _skeleton(rig)
+    standing = retarget.from_canonical(_tpose(), retarget.map_rig(skeleton, rig))
+    if rig.metres_per_unit is None:
+        return standing
+    layout = bvh_layout.of(standing, rig.name)
+    return replace(standing, source=replace(layout, metres_per_unit=rig.metres_per_unit))
+
+
+def _tpose() -> Motion:
+    places = _places()
+    root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
+    root[:, 1] = TOE_REST_HEIGHT - places[CANONICAL.index("leftToes"), 1]
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    return Motion(CANONICAL, _FPS, root, still.expand(_FRAMES, CANONICAL.num_joints, 4).clone())
+
+
+def _places() -> Float[Tensor, "joints 3"]:
+    """Of the canonical joints in the T-pose, from the hips."""
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)
+    root = torch.zeros(1, 3, dtype=torch.float64)
+    return kinematics.forward_kinematics(CANONICAL.offsets, CANONICAL.parents, root, still)[0][0]
+
+
+def _skeleton(rig: Rig) -> Skeleton:
+    """The joints that the rig names, depth first, as files nest them."""
+    places, order = _places(), [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
+    frames = {joint: _frame(rig, CANONICAL.names[joint]) for joint in order}
+    above = {joint: _above(joint, rig) for joint in order}
+    offsets = [places[0] if p is None else frames[p].T @ (places[j] - places[p]) for j, p in above.items()]
+    own = [rig.joints[CANONICAL.names[joint]] for joint in order]
+    ends: dict[str, Tensor] = {}
+    for joint, name in zip(order, own, strict=True):
+        below = CANONICAL.children(joint)
+        if not below:
+            ends[name] = frames[joint].T @ torch.tensor(CANONICAL.end_offsets[CANONICAL.names[joint]]).double()
+        elif all(CANONICAL.names[child] not in rig.joints for child in below):
+            ends[name] = frames[joint].T @ (places[below[0]] - places[joint])
+    parents = tuple(-1 if p is None else order.index(p) for p in above.values())
+    tips = {name: (float(x), float(y), float(z)) for name, (x, y, z) in ends.items()}
+    return Skeleton(tuple(own), parents, torch.stack(offsets), tips)
+
+
+def _depth_first(joint: int) -> list[int]:
+    return [joint, *(below for child in CANONICAL.children(joint) for below in _depth_first(child))]
+
+
+def _above(joint: int, rig: Rig) -> int | None:
+    """The nearest canonical joint above that the rig names."""
+    parent = CANONICAL.parents[joint]
+    while parent >= 0 and CANONICAL.names[parent] not in rig.joints:
+        parent = CANONICAL.parents[parent]
+    return None if parent < 0 else parent
+
+
+def _frame(rig: Rig, name: str) -> Float[Tensor, "3 3"]:
+    """How a joint's frame is turned in the T-pose, in a world with Y up: as the table tells it, or as the file's axes
+    lie."""
+    axes = rig.tpose.get(name)
+    if axes:
+        return retarget.frame_of(axes["x"], axes["y"])
+    if rig.tpose:
+        return torch.eye(3, dtype=torch.float64)
+    return _file_to_world(rig)
+
+
+def _file_to_world(rig: Rig) -> Float[Tensor, "3 3"]:
+    up = vector("y" if rig.up == "auto" else rig.up)
+    upright = upright_of(rig.up) if rig.up not in ("auto", "y") else None
+    front = vector("z") if upright is None else rotations.rotate(rotations.inverse(upright), vector("z"))
+    if rig.facing != "auto" and abs(float(vector(rig.facing) @ up)) < 0.5:
+        front = vector(rig.facing)
+    return torch.stack([torch.linalg.cross(up, front), up, front])

@@ -1,0 +1,238 @@
+"""Which joint of any rig is which canonical one: by listed names, by the words in names, and by the tree.
+
+Sides are checked by the places of the joints where toes tell which way the body faces.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from mapctl.errors import RequestError
+from mapctl.joint_names import nearest, shorten
+from mapctl.joint_parts import Part, Role, Side, roles
+from mapctl.joint_roles import find_hips, plain_name
+from mapctl.motion import Motion
+from mapctl.retarget import topology
+from mapctl.retarget.pose_axes import Poses, swapped
+from mapctl.retarget.rigs import Rig, known
+from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+
+ACCEPTED = 0.6
+"""Score below which a rig is not believed to be understood."""
+REQUIRED = ("hips", "spine", *(side + part for side in ("left", "right") for part in
+            ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg", "Foot")))  # fmt: skip
+"""Canonical joints that a rig must have; the others are put in between or at the end where it lacks them."""
+
+_BY_NAME, _BY_PLACE, _ABSENT, _SWAPPED = 1.0, 0.7, 0.4, 0.9
+_NO_BODY = re.compile(r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
+                      r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust", re.IGNORECASE)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Match:
+    """Which joint of a skeleton is which canonical one, and how sure that is."""
+
+    rig: Rig
+    """The preset that fits or what the user gave; for others a rig by the name of `unlisted` with what was found."""
+    joint_of: tuple[int | None, ...]
+    """For each canonical joint the rig's joint, None where it has none."""
+    score: float
+    """Mean over the canonical joints: 1 for one known by name, 0.7 by its place in the tree alone, 0.4 for one that a
+    rig may lack and this one does, 0 for one that it must have; times 0.9 where left and right are exchanged."""
+    unmapped: tuple[str, ...]
+    """Joints of the rig that are no canonical one, as fingers, twists and props."""
+    sides_exchanged: bool = False
+    """Whether the rig's names say left for what lies on the right."""
+
+
+def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
+    """Match a skeleton by a given rig, by the presets, or by what it looks like; sides are as names tell them.
+
+    RequestError where a score of ACCEPTED is not reached or a joint of REQUIRED is not found, naming what is missing.
+    """
+    chosen, found = _preset(skeleton) if rig is None else (rig, _given(rig, skeleton))
+    if rig is not None:
+        _check_given(rig, found, skeleton)
+    credit = dict.fromkeys(found, _BY_NAME)
+    complete = all(name in found for name in REQUIRED)
+    if chosen is None or not complete or (rig is None and not chosen.fits(skeleton)):
+        found, credit = _looked_up(skeleton, found)
+    absent = _ABSENT if all(name in found for name in REQUIRED) else 0.0
+    worth = [credit.get(name, 0.0 if name in REQUIRED else absent) for name in CANONICAL.names]
+    score = sum(worth) / len(worth)
+    _check(skeleton, found, score)
+    if chosen is None:
+        chosen = Rig("unlisted", {name: skeleton.names[joint] for name, joint in found.items()})
+    return Match(chosen, tuple(found.get(name) for name in CANONICAL.names), score, _unmapped(skeleton, found))
+
+
+def with_sides_checked(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
+    """The match with left and right exchanged if the rig's names contradict the places of its joints."""
+    zero = Poses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else Poses.of(motion, found.joint_of)
+    if not swapped(zero, clip):
+        return found
+    partner = [CANONICAL.index(mirrored_name(name)) for name in CANONICAL.names]
+    joint_of = tuple(found.joint_of[other] for other in partner)
+    named = any(r.side is not Side.MIDDLE for j, r in enumerate(roles(skeleton)) if j in found.joint_of)
+    return replace(found, joint_of=joint_of, score=found.score * (_SWAPPED if named else 1.0), sides_exchanged=named)
+
+
+def _given(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
+    """Joints by a rig's names, in the version that fits best; spelling counts only where it must."""
+    exact = {name: joint for joint, name in enumerate(skeleton.names)}
+    plain = {plain_name(name): joint for joint, name in reversed(list(enumerate(skeleton.names)))}
+    listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
+    joint_of = {name: exact.get(name, plain.get(plain_name(name))) for names in listed.values() for name in names}
+
+    best: dict[str, int] = {}
+    versions = 1 + max((len(others) for others in rig.aliases.values()), default=0)
+    for version in range(versions):
+        found: dict[str, int] = {}
+        for first in (True, False):
+            for canonical, names in listed.items():
+                tried = [names[min(version, len(names) - 1)]] if first else names
+                hits = [hit for hit in map(joint_of.get, tried) if hit is not None and hit not in found.values()]
+                if hits and canonical not in found:
+                    found[canonical] = hits[0]
+        if len(found) > len(best):
+            best = found
+    return best
+
+
+def _preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
+    """The listed rig that explains most of the skeleton, if one has all that is required."""
+    best, chosen, joints = 0.0, None, {}
+    plain = {plain_name(name) for name in skeleton.names}
+    for rig in known():
+        found = _given(rig, skeleton)
+        if any(name not in found for name in REQUIRED) or (rig.name == "canonical" and not rig.fits(skeleton)):
+            continue
+        extra = {plain_name(name) for name in rig.also}
+        explained = len(found) + len(extra & plain - {plain_name(skeleton.names[j]) for j in found.values()})
+        lacking = len(rig.joints) - len(found) + len(extra - plain)
+        # Fingers and props beyond what a list knows say nothing against it; what a list has and a rig lacks does.
+        spelled = sum(skeleton.names[joint] in (rig.joints[c], *rig.aliases.get(c, ())) for c, joint in found.items())
+        fit = len(found) + explained / (explained + lacking) + spelled / len(found)
+        if fit > best:
+            best, chosen, joints = fit, rig, found
+    return chosen, joints
+
+
+def _looked_up(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, float]]:
+    """Joints by the words in their names, completed by the tree; and what each is worth."""
+    found = dict(given)
+    for name, joint in _by_words(skeleton, given.get("hips")).items():
+        if joint not in found.values():
+            found.setdefault(name, joint)
+    credit = dict.fromkeys(found, _BY_NAME)
+    placed = _sided(topology.find(skeleton), roles(skeleton), skeleton)
+    for name, joint in placed.items():
+        helper = _NO_BODY.search(skeleton.names[joint])
+        if name not in found and joint not in found.values() and not helper:
+            found[name], credit[name] = joint, _BY_PLACE
+    return found, credit
+
+
+def _by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
+    """Canonical joint by side and part that names tell, below the hips, top down."""
+    if hips is None:
+        try:
+            hips = find_hips(skeleton)
+        except RequestError:
+            return {}
+    found = {"hips": hips}
+    inside = _below(skeleton, hips)
+    told = [r if j in inside and not _NO_BODY.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
+            for j, r in enumerate(roles(skeleton))]  # fmt: skip
+    for side in (Side.LEFT, Side.RIGHT):
+        found |= _limb_by_words(told, side)
+    arms = [found[name] for name in ("leftUpperArm", "rightUpperArm") if name in found]
+    trunk = [j for j, r in enumerate(told) if r == Role(Side.MIDDLE, Part.TORSO)]
+    holding = [j for j in trunk if arms and all(arm in _below(skeleton, j) for arm in arms)] or trunk
+    if holding:
+        found["spine"] = holding[0]
+    if len(holding) > 1:
+        found["chest"] = holding[-1]
+    for name, part in (("neck", Part.NECK), ("head", Part.HEAD)):
+        named = [j for j, r in enumerate(told) if r == Role(Side.MIDDLE, part)]
+        if named:
+            found[name] = named[0]
+    return found
+
+
+def _limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
+    def named(part: Part) -> list[int]:
+        return [joint for joint, role in enumerate(told) if role == Role(side, part)]
+
+    upper, lower = named(Part.UPPER_LEG), named(Part.LOWER_LEG)
+    if not upper and len(lower) > 1:
+        upper, lower = lower[:1], lower[1:]
+    if not lower and len(upper) > 1:
+        upper, lower = upper[:1], upper[1:]
+    foot, toes = named(Part.FOOT), named(Part.TOES)
+    toes = toes or foot[1:]  # an ankle and a foot
+    shoulder, arm, elbow = named(Part.SHOULDER), named(Part.UPPER_ARM), named(Part.LOWER_ARM)
+    if not elbow and len(arm) > 1:
+        arm, elbow = arm[:1], arm[1:]
+    if not arm and shoulder:
+        shoulder, arm = shoulder[:-1], shoulder[-1:]  # a shoulder, an elbow and a wrist
+    parts = {"UpperLeg": upper, "LowerLeg": lower, "Foot": foot, "Toes": toes, "Shoulder": shoulder, "UpperArm": arm,
+             "LowerArm": elbow, "Hand": named(Part.HAND)}  # fmt: skip
+    return {side.value + part: joints[0] for part, joints in parts.items() if joints}
+
+
+def _sided(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
+    """Limbs found by the tree alone, put on the side that their joints' names or else their places tell.
+
+    Without names, left is +X: where the rest pose faces elsewhere, the toes tell it (see `with_sides_checked`).
+    """
+    if not placed:
+        return placed
+    places = Poses.zero(skeleton, (None,) * CANONICAL.num_joints).places[0]
+    left = None
+    for limb in (("UpperLeg", "LowerLeg", "Foot", "Toes"), ("UpperArm", "LowerArm", "Hand", "Shoulder")):
+        votes = 0
+        for side, other in (("left", "right"), ("right", "left")):
+            said = [told[placed[side + part]].side.value for part in limb if side + part in placed]
+            votes += said.count(side) - said.count(other)
+        across = places[placed["left" + limb[0]]] - places[placed["right" + limb[0]]]
+        if left is None:
+            left = across * across[across.abs().argmax()].sign()
+        if votes < 0 or (votes == 0 and float(across @ left) < 0):
+            names = {side + part for side in ("left", "right") for part in limb}
+            placed = {mirrored_name(name) if name in names else name: joint for name, joint in placed.items()}
+            across = -across
+        left = across
+    return placed
+
+
+def _below(skeleton: Skeleton, joint: int) -> set[int]:
+    """The joint and all below it."""
+    found = {joint}
+    for child, parent in enumerate(skeleton.parents):
+        if parent in found:
+            found.add(child)
+    return found
+
+
+def _unmapped(skeleton: Skeleton, found: Mapping[str, int]) -> tuple[str, ...]:
+    used = set(found.values())
+    return tuple(name for joint, name in enumerate(skeleton.names) if joint not in used)
+
+
+def _check_given(rig: Rig, found: Mapping[str, int], skeleton: Skeleton) -> None:
+    for canonical in REQUIRED:
+        if canonical in rig.joints and canonical not in found:
+            near = nearest(rig.joints[canonical], skeleton.names, roles(skeleton))
+            raise RequestError(f"rig {rig.name}: no joint {rig.joints[canonical]!r} for {canonical}; {near}")
+
+
+def _check(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
+    missing = [name for name in REQUIRED if name not in found]
+    if not missing and score >= ACCEPTED:
+        return
+    what = f"no joint for {', '.join(missing)}" if missing else "too few joints are known by name"
+    names, rigs = shorten(skeleton.names), ", ".join(rig.name for rig in known())
+    raise RequestError(f"cannot tell this rig: {what} (score {score:.2f}, {ACCEPTED} is needed); "
+                       f"its joints are {names}; known rigs: {rigs}; a TOML file can name its joints")  # fmt: skip

@@ -1,0 +1,149 @@
+"""Known rigs, one TOML each: which of their joints is which canonical one, and how they stand in a T-pose."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.joint_names import nearest
+from mapctl.skeleton import CANONICAL, Skeleton
+
+AXES = ("x", "y", "z", "-x", "-y", "-z")
+RESTS = ("auto", "tpose", "straighten", "frame0")
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Names of length units that a rig's TOML may use, in metres."""
+_KEYS = {"name", "about", "also", "joints", "tpose", "straighten", "end_sites", "up", "facing", "rest", "unit"}
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What is known of a rig before a file of it is opened."""
+
+    name: str
+    """How users call it."""
+    joints: Mapping[str, str]
+    """Canonical joint name to the rig's own."""
+    tpose: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)
+    """Canonical joint name to where the joint's local x and y axes point in the T-pose; the zero pose if absent."""
+    straighten: tuple[str, ...] = ()
+    """Canonical joints whose bone is turned to its canonical direction in the T-pose."""
+    end_sites: tuple[str, ...] = ()
+    """Canonical joints that the rig has only as the End Site of their canonical parent."""
+    about: str = ""
+    """What the rig is, one line."""
+    aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Canonical joint name to the other names that versions of the rig use, one place a version."""
+    also: tuple[str, ...] = ()
+    """Further joints of the rig, by which it is told from its relatives."""
+    up: str = "auto"
+    """Axis of the file's world that points up: one of AXES; `auto` to find it."""
+    facing: str = "auto"
+    """Axis of the file that the rest pose faces: one of AXES; `auto` to find it."""
+    rest: str = "auto"
+    """Where the T-pose comes from: `tpose` (all rotations zero is one, as it is), `straighten` (all zero, with the
+    limbs straightened), `frame0` (the clip begins with one), or `auto` (a table or list above, else what fits)."""
+    metres_per_unit: float | None = None
+    """Length of the file's unit, metres; None to find it by the size of the body."""
+
+    def __post_init__(self):
+        for key, value, allowed in (("up", self.up, AXES), ("facing", self.facing, AXES), ("rest", self.rest, RESTS)):
+            if value not in {"auto", *allowed}:
+                raise RequestError(f"rig {self.name}: {key} is one of auto, {', '.join(allowed)}, got {value!r}")
+        strange = [name for name in (*self.joints, *self.tpose, *self.straighten) if name not in CANONICAL.names]
+        if strange:
+            near = nearest(strange[0], CANONICAL.names)
+            raise RequestError(f"rig {self.name}: no canonical joint {strange[0]!r}; {near}")
+
+    @property
+    def has_tpose(self) -> bool:
+        """Whether the T-pose is told, so that it need not be found."""
+        return bool(self.tpose or self.straighten or self.rest == "tpose") and self.rest in ("auto", "tpose")
+
+    def fits(self, skeleton: Skeleton) -> bool:
+        """Whether the skeleton has every joint that the rig names, spelled as the rig does."""
+        return set(self.joints.values()) <= set(skeleton.names)
+
+
+@cache
+def known() -> tuple[Rig, ...]:
+    """Every rig in this folder, the canonical one first."""
+    canonical = Rig("canonical", {name: name for name in CANONICAL.names}, rest="tpose",
+                    about="The canonical skeleton: VRM names, a T-pose with all rotations zero.")  # fmt: skip
+    paths = sorted(
+        (p for p in files(__package__).joinpath("presets").iterdir() if p.name.endswith(".toml")), key=lambda p: p.name
+    )
+    return canonical, *(_rig(tomllib.loads(path.read_text("utf-8"))) for path in paths)
+
+
+def recognise(skeleton: Skeleton) -> Rig:
+    """The rig of a skeleton, listed or not; RequestError tells which canonical joints cannot be found."""
+    from mapctl.retarget.joint_matching import match
+
+    return match(skeleton).rig
+
+
+def read(name_or_path: str | PathLike[str]) -> Rig:
+    """A preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
+    text, path = str(name_or_path), Path(name_or_path)
+    for rig in known():
+        if rig.name == text.lower():
+            return rig
+    if path.suffix.lower() == ".toml":
+        return _read_toml(path)
+    names = ", ".join(rig.name for rig in known())
+    if not path.suffix:
+        raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
+    from mapctl import formats, retarget
+
+    found = retarget.to_canonical(formats.load(path))[1]
+    joints = {c: found.rig_skeleton.names[j] for c, j in zip(CANONICAL.names, found.joint_of, strict=True)
+              if j is not None}  # fmt: skip
+    return replace(found.rig, joints=joints, aliases={})
+
+
+def _read_toml(path: Path) -> Rig:
+    from mapctl.formats.text import read_bytes
+
+    try:
+        return _rig({"name": path.stem, **tomllib.loads(read_bytes(path).decode("utf-8"))})
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(path, f"is no TOML: {error}") from None
+    except RequestError as error:
+        raise FileFormatError(path, str(error)) from None
+
+
+def _rig(table: Mapping[str, Any]) -> Rig:
+    strange = sorted(table.keys() - _KEYS)
+    if strange:
+        raise RequestError(f"a rig has no {strange[0]!r}; it may have {', '.join(sorted(_KEYS))}")
+    joints = table.get("joints", {})
+    if not isinstance(joints, dict):
+        raise RequestError("a rig's joints are a table of canonical names and the rig's own")
+    names = {canonical: _names(canonical, own) for canonical, own in joints.items()}
+    return Rig(
+        table["name"], {canonical: own[0] for canonical, own in names.items()}, table.get("tpose", {}),
+        tuple(table.get("straighten", ())), tuple(table.get("end_sites", ())), table.get("about", ""),
+        {canonical: own[1:] for canonical, own in names.items() if len(own) > 1}, tuple(table.get("also", ())),
+        table.get("up", "auto"), table.get("facing", "auto"), table.get("rest", "auto"), _unit(table.get("unit")),
+    )  # fmt: skip
+
+
+def _names(canonical: str, own: Any) -> tuple[str, ...]:
+    names = (own,) if isinstance(own, str) else tuple(own) if isinstance(own, list) else ()
+    if not names or not all(isinstance(name, str) for name in names):
+        raise RequestError(f"{canonical} is the rig's name for it, or a list of names, got {own!r}")
+    return names
+
+
+def _unit(unit: Any) -> float | None:
+    metres = UNITS.get(unit) if isinstance(unit, str) else unit
+    if unit in (None, "auto"):
+        return None
+    if isinstance(metres, bool) or not isinstance(metres, int | float) or not 1e-6 < metres < 1e6:
+        raise RequestError(f"a rig's unit is auto, {', '.join(UNITS)} or metres per unit, got {unit!r}")
+    return float(metres)

@@ -1,0 +1,27 @@
+"""Files whose world does not have Y up, as many rigs' have Z, put upright as `mapctl.retarget` sees them."""
+
+from dataclasses import replace
+
+from mapctl import retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
+
+UNKNOWN = "the rig is not known, and so not which way is up: taken as it is, with Y up"
+"""What is to be said of a motion that cannot be put upright."""
+
+
+def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[str, ...]]:
+    """The motion on its own rig in a world with Y up, and a sentence where the rig is not known.
+
+    Unchanged where Y is up already, or nothing is known.
+    """
+    try:
+        turn = retarget.map_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw
+    except RequestError:
+        return motion, (UNKNOWN,)
+    if turn is None:
+        return motion, ()
+    every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
+    local[:, 0] = rotations.multiply(every, local[:, 0])
+    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local), ()

@@ -1,0 +1,86 @@
+"""Stay close to another motion: to its poses, and to how it moves over the ground rather than to where it stands."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.features import LAYOUT, Place, root_places
+from mapctl.terms.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Closeness:
+    """Poses near those of a target, and a walk near its walk.
+
+    Poses are compared as joint positions seen from the hips, facing and all; the way over the ground is compared from
+    the window's own beginning on. Where feet that slid are made to stand, the character lags behind the target a little
+    with each step: it may, since no place in the world was asked for.
+    """
+
+    target: Float[Tensor, "frames size"]
+    """Features of the window's frames, physical units."""
+    sigma_pose: float = 0.03
+    """Distance of a joint from the target's, seen from the hips, metres."""
+    sigma_height: float = 0.03
+    """Of the hips, metres."""
+    sigma_way: float = 0.15
+    """Of the hips over the ground, from the window's beginning on, metres."""
+    sigma_turn: float = 0.15
+    """Of the heading, from the window's beginning on, radians."""
+    joints_that_count: float = 6.0
+    """Independent joints that a body is worth: neighbours move together, so a body of 21 is not 21 observations."""
+    name: str = "closeness"
+    unit: str = "m"
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Nats."""
+        height = LAYOUT.pick(trial.features - self.target.to(trial.features), "root_height")[..., 0]
+        ground, turn = self._way(trial)
+        return 0.5 * (
+            self.joints_that_count * self._pose(trial).mean(-1) / self.sigma_pose**2
+            + (height / self.sigma_height).square()
+            + ground.square().sum(-1) / self.sigma_way**2
+            + (turn / self.sigma_turn).square()
+        )
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Root mean square distance of the joints from the target's, seen from the hips, metres."""
+        return self._pose(trial).mean(-1).sqrt()
+
+    def _pose(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
+        """Squared distances, m^2."""
+        own = _seen_from_hips(trial)
+        return (own - self._target_seen(trial).to(own)).square().sum(-1)
+
+    def _way(self, trial: Trial) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
+        """Where the hips are (metres) and how far they turned (radians), less the target's, from one common place."""
+        place = trial.start
+        ground, heading = root_places(self.target.to(trial.features), place)
+        return trial.root_xz_world - ground, trial.heading - heading
+
+    def _target_seen(self, trial: Trial) -> Float[Tensor, "1 frames joints 3"]:
+        key = id(trial.skeleton)
+        if key not in self._seen:
+            origin = Place.origin(self.target.dtype)
+            still = trial.features.new_zeros(0, trial.skeleton.num_joints, 3).to(self.target.dtype)
+            target = self.target.unsqueeze(0)
+            bits = LAYOUT.pick(target, "contacts") > 0.5
+            other = Trial(target, origin, target, target[..., 0], bits, still, trial.skeleton, trial.fps)
+            self._seen[key] = _seen_from_hips(other)
+        return self._seen[key]
+
+    @cached_property
+    def _seen(self) -> dict[int, Tensor]:
+        """By skeleton; terms are asked many times about one window."""
+        return {}
+
+
+def _seen_from_hips(trial: Trial) -> Float[Tensor, "batch frames joints 3"]:
+    """Joint positions less the hips', in the heading frame."""
+    relative = trial.joints_world - trial.joints_world[..., :1, :]
+    sine, cosine = torch.sin(trial.heading)[..., None], torch.cos(trial.heading)[..., None]
+    x, y, z = relative.unbind(-1)
+    return torch.stack([cosine * x - sine * z, y, sine * x + cosine * z], dim=-1)

@@ -1,0 +1,165 @@
+"""A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its starts and its card."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.protocols import Abilities, Plan, Starts
+from priors import checkpoints
+from priors.lstm_gmm import labels
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
+
+if TYPE_CHECKING:
+    from priors.lstm_gmm.fast.rollout import FastRollout
+
+
+@dataclass(frozen=True, eq=False)
+class LstmGmmDensity:
+    """A Density (see mapctl.protocols) that rolls out on the fast path unless told otherwise."""
+
+    name: str
+    """How it was asked for."""
+    reference: LstmGmm
+    """The torch network: the specification, and the only path on a GPU."""
+    starts: Starts
+    """Moments of mocap to begin from."""
+    card: checkpoints.Card
+    """What the weights are."""
+    use_fast: bool = True
+    """Whether rollouts and samples take the hand-written kernels."""
+
+    @cached_property
+    def fast(self) -> "FastRollout":
+        """The kernels, built on first use."""
+        from priors.lstm_gmm.fast.rollout import FastRollout
+
+        return FastRollout(self.reference)
+
+    @property
+    def _engine(self) -> "FastRollout | LstmGmm":
+        return self.fast if self.use_fast else self.reference
+
+    @property
+    def abilities(self) -> Abilities:
+        """What the training data show."""
+        return Abilities(**self.card.abilities)
+
+    @property
+    def feature_mean(self) -> Float[Tensor, " size"]:
+        """Mean of the training data."""
+        return self.reference.mean
+
+    @property
+    def feature_std(self) -> Float[Tensor, " size"]:
+        """Spread of the training data."""
+        return self.reference.std
+
+    @property
+    def labels(self) -> dict[str, list[str]]:
+        """What it can be told, by group (gait, style)."""
+        found: dict[str, list[str]] = {}
+        for name in self.reference.config.labels:
+            group, _, value = name.partition("=")
+            found.setdefault(group, []).append(value)
+        return found
+
+    def told(self, wanted: Sequence[str]) -> "LstmGmmDensity":
+        """The same density told labels of its data for good (`run`, `active`, `style=active`), with starts to match.
+
+        RequestError for labels that it does not know.
+        """
+        full = [self._label(name) for name in wanted]
+        known = labels.read(self.starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
+        fitting = known.held.sum(-1)
+        rows = (fitting == fitting.max()).nonzero()[:, 0]
+        weight = self.starts.weight[rows]
+        picked = Starts(self.starts.state.pick(rows), self.starts.speed[rows],
+                        tuple(self.starts.names[i] for i in rows.tolist()), weight / weight.sum())  # fmt: skip
+        return replace(self, reference=self.reference.told(full), starts=picked)
+
+    def told_as_start(self, start: int) -> "LstmGmmDensity":
+        """The same density told what its data say of the clip that a start was taken from, so that it goes on so."""
+        held = labels.read(self.starts.names, self.card.data.get("labels", ""))
+        names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
+        known = [name for name in names if name in self.reference.config.labels]
+        return replace(self, reference=self.reference.told(known))
+
+    def blurred(self, spread: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
+        """The same density, scoring motion that was seen with errors of this spread (physical units); see LstmGmm."""
+        return replace(self, reference=self.reference.blurred(spread))
+
+    @property
+    def usual_nats(self) -> float:
+        """Log density a frame (physical units, see mapctl.problem.density_selection) that 98 % of the windows of its
+        own held-out data reach when blurred by `choosing.spread()`; minus infinity where the card does not say.
+        """
+        return float(self.card.quality.get("windows", {}).get("p2", -math.inf))
+
+    def _label(self, name: str) -> str:
+        """The whole label that a name, or its part after the `=`, stands for."""
+        known = self.reference.config.labels
+        for label in known:
+            if name in (label, label.split("=", 1)[-1]):
+                return label
+        group, told, value = name.partition("=")
+        if not told or group not in self.labels:
+            group, value = " or ".join(self.labels) or "label", name
+        values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items()) or "none"
+        raise RequestError(f"the prior {self.name!r} knows no {group} {value!r}, only {values}")
+
+    def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
+        """A state with empty memory after one frame."""
+        return self.reference.initial_state(previous)
+
+    def likely_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
+        """The state, before them, that makes a motion's first frames likely (Eq. 26); see
+        priors.lstm_gmm.state_inference."""
+        from priors.lstm_gmm.state_inference import likely_state
+
+        return likely_state(self.reference, self.starts.state, features)
+
+    def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
+        """See Density."""
+        return self.reference.log_prob(features, state, inputs=inputs)
+
+    def advance(self, state: LstmState, committed: Tensor) -> LstmState:
+        """See Density."""
+        return self.reference.advance(state, committed)
+
+    def sample(
+        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+    ) -> tuple[Tensor, LstmState]:
+        """See Density."""
+        return self._engine.sample(state, frames, generator, temperature=temperature)
+
+    def latents(self, features: Tensor, state: LstmState) -> tuple[Plan, Tensor]:
+        """See Density."""
+        return self.reference.latents(features, state)
+
+    def plan(self, state: LstmState, noise: Tensor) -> Plan:
+        """See Density."""
+        return self._engine.plan(state, noise)
+
+    def rollout(self, state: LstmState, noise: Tensor, plan: Plan) -> tuple[Tensor, Tensor]:
+        """See Density."""
+        return self._engine.rollout(state, noise, plan)
+
+
+def load(name: str) -> LstmGmmDensity:
+    """A bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    with checkpoints.opened(name, "lstm-gmm", called="density") as (tensors, card):
+        starts = Starts(
+            LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
+            tensors.pop("starts.speed"), tuple(card.data["starts"]), tensors.pop("starts.weight"),
+        )  # fmt: skip
+        Abilities(**card.abilities)
+        model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
+        model.load_state_dict(tensors)
+    return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)

@@ -1,0 +1,341 @@
+"""LSTM with a mixture of Gaussians over the next frame: the density of the rnn paper (section 4.1, figure 3).
+
+FC, FC, LSTM, LSTM, FC, then five Gaussians (Eq. 6-8) and two Bernoulli contact bits (section 4.3). By default it
+departs from the paper in three ways, each measured (docs/results.md): the network predicts a change added to a slightly
+shrunken copy of the current frame, which learns faster and stays bounded in free run; each component's Gaussian is
+correlated, by a unit triangular factor of its own, since what the hips do the legs must undo if the foot is to stand;
+and the network is told how noisy its input is, so that with clean input it need not spread its predictions as if it
+were not. It can also be told labels of the data (gait, style), or none.
+"""
+
+import copy
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, FeatureLayout
+from mapctl.protocols import Plan
+from priors.config import NetworkConfig, check_least
+
+NOISE_UNIT = 0.1
+"""Level of input noise (normalised units) that the network is told as 1."""
+
+
+@dataclass(frozen=True)
+class LstmGmmConfig(NetworkConfig):
+    """Shape of the network."""
+
+    width: int = 500
+    """Units of every hidden layer."""
+    components: int = 5
+    """Gaussians in the mixture."""
+    retain: float = 0.9
+    """Share of the current (normalised) frame carried into the means; 0 is the paper's absolute prediction."""
+    clamp: float = 5.0
+    """The carried frame is clamped to this many standard deviations, which bounds free runs."""
+    min_log_sigma: float = -4.6
+    """Floor of the predicted log standard deviations (normalised units)."""
+    max_log_sigma: float = 1.0
+    """Their ceiling."""
+    correlated: bool = True
+    """Each component has a triangular factor that correlates its values; the paper's Gaussians are diagonal."""
+    knows_noise: bool = True
+    """The network is told the level of the noise on its input."""
+    labels: tuple[str, ...] = ()
+    """What else it can be told of a motion, each yes or no: `gait=run`, `style=active`."""
+
+    def __post_init__(self):
+        check_least(self, 1, "width", "components")
+
+
+@dataclass(frozen=True, eq=False)
+class LstmState:
+    """What the density has seen: the last frame and the memory of both LSTM layers."""
+
+    previous: Float[Tensor, "batch size"]
+    """Last committed frame, physical units."""
+    hidden: Float[Tensor, "2 batch width"]
+    """h of both layers."""
+    cell: Float[Tensor, "2 batch width"]
+    """C of both layers."""
+
+    @property
+    def batch(self) -> int:
+        """How many independent states."""
+        return self.previous.shape[0]
+
+    def pick(self, rows: Int[Tensor, " picked"]) -> "LstmState":
+        """The states of some batch rows."""
+        return LstmState(self.previous[rows], self.hidden[:, rows].contiguous(), self.cell[:, rows].contiguous())
+
+    def repeat(self, count: int) -> "LstmState":
+        """A batch of one, `count` times."""
+        return LstmState(self.previous.expand(count, -1), self.hidden.expand(-1, count, -1).contiguous(),
+                         self.cell.expand(-1, count, -1).contiguous())  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Distribution of the next frame, normalised units."""
+
+    log_weight: Float[Tensor, "*batch components"]
+    """Log mixture weights, normalised to sum to one."""
+    mean: Float[Tensor, "*batch components continuous"]
+    """Means."""
+    log_sigma: Float[Tensor, "*batch components continuous"]
+    """Log standard deviations."""
+    contact_logit: Float[Tensor, "*batch 2"]
+    """Log odds that the left and right toe are planted."""
+
+    def log_prob(
+        self, target: Float[Tensor, "*batch size"], whitening: Float[Tensor, "components continuous continuous"] | None,
+        blur: Float[Tensor, "components continuous"] | None = None,
+    ) -> Float[Tensor, "*batch"]:  # fmt: skip
+        """Eq. 8 without its sign, plus the contact bits; the target is normalised, its bits are 0 or 1.
+
+        `whitening` holds each component's unit lower triangular factor, which leaves volumes as they are; `blur` is
+        added to the variances of the values that it makes independent.
+        """
+        continuous, bits = target[..., : self.mean.shape[-1]], target[..., self.mean.shape[-1] :]
+        error = continuous.unsqueeze(-2) - self.mean
+        if whitening is not None:
+            error = torch.einsum("kij,...kj->...ki", whitening, error)
+        log_sigma = self.log_sigma if blur is None else 0.5 * torch.log(torch.exp(2 * self.log_sigma) + blur)
+        error = error * torch.exp(-log_sigma)
+        each = -0.5 * (error**2).sum(-1) - log_sigma.sum(-1) - 0.5 * math.log(2 * math.pi) * error.shape[-1]
+        signed = torch.where(bits > 0.5, self.contact_logit, -self.contact_logit)
+        return torch.logsumexp(self.log_weight + each, dim=-1) + nn.functional.logsigmoid(signed).sum(-1)
+
+
+class LstmGmm(nn.Module):
+    """The network with its normalisation inside. Features come and go in physical units."""
+
+    mean: Tensor
+    std: Tensor
+    blur: Tensor | None
+
+    def __init__(
+        self, config: LstmGmmConfig, *, mean: Float[Tensor, " size"], std: Float[Tensor, " size"],
+        layout: FeatureLayout = LAYOUT,
+    ):  # fmt: skip
+        super().__init__()
+        self.config, self.layout = config, layout
+        self.register_buffer("mean", mean.clone())
+        self.register_buffer("std", std.clone())
+        self.register_buffer("blur", None)
+        width, outputs = config.width, config.components * (1 + 2 * layout.continuous) + 2
+        self.fc1, self.fc2 = nn.Linear(layout.size, width), nn.Linear(width, width)
+        self.lstm = nn.LSTM(width, width, num_layers=2, batch_first=True)
+        self.fc3, self.out = nn.Linear(width, width), nn.Linear(width, outputs)
+        told = int(config.knows_noise) + len(config.labels)
+        self.condition = nn.Linear(told, width, bias=False) if told else None
+        square = (config.components, layout.continuous, layout.continuous)
+        self.correlation = nn.Parameter(torch.zeros(square)) if config.correlated else None
+
+    @property
+    def whitening(self) -> Float[Tensor, "components continuous continuous"] | None:
+        """Unit lower triangular factor of each component: it takes the values' correlation away."""
+        if self.correlation is None:
+            return None
+        return torch.tril(self.correlation, -1) + torch.eye(self.layout.continuous).to(self.correlation)
+
+    @property
+    def mixing(self) -> Float[Tensor, "components continuous continuous"] | None:
+        """Inverse of `whitening`: it makes independent values correlated."""
+        if (whitening := self.whitening) is None:
+            return None
+        unit = torch.eye(self.layout.continuous).to(whitening).expand_as(whitening)
+        return torch.linalg.solve_triangular(whitening, unit, upper=False, unitriangular=True)
+
+    def told(self, labels: Iterable[str]) -> "LstmGmm":
+        """A copy that has been told these labels for good; its inputs are taken to be clean.
+
+        RequestError for a label that the network does not know.
+        """
+        labels, model = tuple(labels), copy.deepcopy(self)
+        for label in labels:
+            if label not in self.config.labels:
+                raise RequestError(
+                    f"the prior knows no label {label!r}, only {', '.join(self.config.labels) or 'none'}"
+                )
+        if labels and self.condition is not None and model.fc1.bias is not None:
+            known = torch.zeros(self.condition.in_features)
+            known[[int(self.config.knows_noise) + self.config.labels.index(label) for label in labels]] = 1
+            with torch.no_grad():
+                model.fc1.bias += self.condition(known.to(self.mean))
+        return model
+
+    def blurred(self, spread: Float[Tensor, " continuous"]) -> "LstmGmm":
+        """A copy whose `log_prob` is of motion seen with independent errors of this spread (physical units).
+
+        Sharp densities say nothing of how wrong a motion is that is off by more than they allow. What the errors add
+        to the correlated values is taken to be independent as well, which keeps the density a density.
+        """
+        model, size = copy.deepcopy(self), self.layout.continuous
+        variance = (spread.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
+        if (whitening := self.whitening) is not None:
+            variance = torch.einsum("kij,kj->ki", whitening.detach().square(), variance)
+        model.blur = variance.clone()
+        return model
+
+    def normalise(self, features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
+        """Physical to normalised units; contact bits become -1 and 1, since their mean and spread are set to a half."""
+        return (features - self.mean) / self.std
+
+    def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
+        """A state with empty memory after one frame."""
+        zero = previous.new_zeros(2, previous.shape[0], self.config.width)
+        return LstmState(previous, zero, zero)
+
+    def forward(
+        self, inputs: Float[Tensor, "batch frames size"], memory: tuple[Tensor, Tensor], *,
+        condition: Float[Tensor, "batch told"] | None = None,
+    ) -> tuple[Mixture, tuple[Tensor, Tensor]]:  # fmt: skip
+        """Mixtures of the frames after each input; inputs normalised, `memory` is (h, C) of both layers.
+
+        `condition` is what is known of each window: the level of its noise, in units of NOISE_UNIT, then 1 for each
+        label that holds. Zeros, the same as none, say: clean, and nothing known.
+        """
+        x = self.fc1(inputs)
+        if condition is not None and self.condition is not None:
+            x = x + self.condition(condition).unsqueeze(1)
+        x = torch.relu(self.fc2(torch.relu(x)))
+        x, memory = self.lstm(x, memory)
+        return self._mixture(self.out(torch.relu(self.fc3(x))).to(inputs.dtype), inputs), memory
+
+    def _mixture(self, output: Tensor, inputs: Tensor) -> Mixture:
+        config, size = self.config, self.layout.continuous
+        count = config.components
+        weight, mean, log_sigma, contact = output.split([count, count * size, count * size, 2], dim=-1)
+        mean, log_sigma = mean.unflatten(-1, (count, size)), log_sigma.unflatten(-1, (count, size))
+        carried = config.retain * inputs[..., :size].clamp(-config.clamp, config.clamp)
+        # A smooth floor and ceiling keep gradients alive where a hard clamp would stop them.
+        low, high = config.min_log_sigma, config.max_log_sigma
+        log_sigma = low + (high - low) * torch.sigmoid(4 * log_sigma / (high - low) - 1.0)
+        return Mixture(torch.log_softmax(weight, dim=-1), mean + carried.unsqueeze(-2), log_sigma, contact)
+
+    def log_prob(
+        self, features: Float[Tensor, "batch frames size"], state: LstmState, *,
+        inputs: Float[Tensor, "batch frames size"] | None = None,
+    ) -> Float[Tensor, "batch frames"]:  # fmt: skip
+        """Log density (nats, normalised units) of each frame given those before it (Eq. 5-8).
+
+        `inputs` is what the network sees of the frames where that differs from them: the noisy inputs of Eq. 15.
+        """
+        seen = features if inputs is None else inputs
+        before = torch.cat([state.previous.unsqueeze(1), seen[:, :-1]], dim=1)
+        mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
+        return mixture.log_prob(self._target(features), self.whitening, self.blur)
+
+    def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
+        """The state after the committed frames were seen."""
+        before = torch.cat([state.previous.unsqueeze(1), committed[:, :-1]], dim=1)
+        with torch.no_grad():
+            _, (hidden, cell) = self(self.normalise(before), (state.hidden, state.cell))
+        return LstmState(committed[:, -1], hidden, cell)
+
+    def sample(
+        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+    ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
+        """Frames drawn one after the other (section 4.1.4); temperature scales the Gaussians' spread."""
+        with torch.no_grad():
+            return self.draw(state, frames, generator, temperature=temperature)
+
+    def draw(
+        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+    ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
+        """`sample`, differentiable in the weights for the components and bits that were drawn."""
+        drawn, device, mixing = [], self.mean.device, self.mixing
+        for _ in range(frames):
+            mixture, state = self._step(state)
+            # Random numbers come from the CPU's generator wherever the network is.
+            weights = mixture.log_weight.detach().exp().cpu()
+            component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
+            noise = temperature * torch.randn(len(weights), self.layout.continuous, generator=generator).to(device)
+            odds = torch.sigmoid(mixture.contact_logit.detach())
+            bits = torch.rand(odds.shape, generator=generator).to(device) < odds
+            frame, _ = self._compose(mixture, component, noise, bits, mixing)
+            state = LstmState(frame, state.hidden, state.cell)
+            drawn.append(frame)
+        return torch.stack(drawn, dim=1), state
+
+    def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> Plan:
+        """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
+        components, contacts = [], []
+        with torch.no_grad():
+            mixing = self.mixing
+            for step in noise.unbind(1):
+                mixture, state = self._step(state)
+                components.append(mixture.log_weight.argmax(-1))
+                contacts.append(mixture.contact_logit > 0)
+                frame, _ = self._compose(mixture, components[-1], step, contacts[-1], mixing)
+                state = LstmState(frame, state.hidden, state.cell)
+        return Plan(torch.stack(components, 1), torch.stack(contacts, 1))
+
+    def rollout(
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: Plan
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """Features x = mu_k + R_k sigma_k noise under the plan, and each frame's log density under component k.
+
+        R is `mixing`. Differentiable by back-propagation through time: the specification that the fast path is tested
+        against.
+        """
+        frames, densities, mixing = [], [], self.mixing
+        for t, step in enumerate(noise.unbind(1)):
+            mixture, state = self._step(state)
+            frame, density = self._compose(mixture, plan.component[:, t], step, plan.contacts[:, t], mixing)
+            state = LstmState(frame, state.hidden, state.cell)
+            frames.append(frame)
+            densities.append(density)
+        return torch.stack(frames, 1), torch.stack(densities, 1)
+
+    def latents(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> tuple[Plan, Tensor]:
+        """The plan and the noise (batch, frames, continuous) whose rollout is the features; inverse of `rollout`.
+
+        Of each frame's components, the one that explains it best.
+        """
+        with torch.no_grad():
+            before = torch.cat([state.previous.unsqueeze(1), features[:, :-1]], dim=1)
+            mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
+            error = self._target(features)[..., : self.layout.continuous].unsqueeze(-2) - mixture.mean
+            if (whitening := self.whitening) is not None:
+                error = torch.einsum("kij,...kj->...ki", whitening, error)
+            noise = error * torch.exp(-mixture.log_sigma)
+            each = mixture.log_weight - mixture.log_sigma.sum(-1) - 0.5 * noise.square().sum(-1)
+            component = each.argmax(-1)
+            chosen = component[..., None, None].expand(*component.shape, 1, noise.shape[-1])
+            bits = self.layout.pick(features, "contacts") > 0.5
+            return Plan(component, bits), noise.gather(-2, chosen)[..., 0, :]
+
+    def _step(self, state: LstmState) -> tuple[Mixture, LstmState]:
+        inputs = self.normalise(state.previous).unsqueeze(1)
+        mixture, (hidden, cell) = self(inputs, (state.hidden, state.cell))
+        mixture = Mixture(*(part.squeeze(1) for part in vars(mixture).values()))
+        return mixture, LstmState(state.previous, hidden, cell)
+
+    def _compose(
+        self, mixture: Mixture, component: Int[Tensor, " batch"], noise: Float[Tensor, "batch continuous"],
+        contacts: Bool[Tensor, "batch 2"], mixing: Tensor | None,
+    ) -> tuple[Float[Tensor, "batch size"], Float[Tensor, " batch"]]:  # fmt: skip
+        """One frame (physical units) of the chosen component and bits, and its log density."""
+        row = torch.arange(len(component))
+        mean, log_sigma = mixture.mean[row, component], mixture.log_sigma[row, component]
+        size = self.layout.continuous
+        spread = torch.exp(log_sigma) * noise
+        if mixing is not None:
+            spread = torch.einsum("bij,bj->bi", mixing[component], spread)
+        continuous = (mean + spread) * self.std[:size] + self.mean[:size]
+        density = mixture.log_weight[row, component] - log_sigma.sum(-1) - 0.5 * (noise**2).sum(-1)
+        density = density - 0.5 * math.log(2 * math.pi) * size
+        signed = torch.where(contacts, mixture.contact_logit, -mixture.contact_logit)
+        density = density + nn.functional.logsigmoid(signed).sum(-1)
+        return torch.cat([continuous, contacts.to(continuous.dtype)], dim=-1), density
+
+    def _target(self, features: Tensor) -> Tensor:
+        size = self.layout.continuous
+        return torch.cat([self.normalise(features)[..., :size], features[..., size:]], dim=-1)

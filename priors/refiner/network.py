@@ -1,0 +1,145 @@
+"""The adversarial refiner: a residual LSTM that makes sampled motion look captured (rnn paper, section 4.2, Eq. 11).
+
+State and end effectors through a layer, an LSTM and a layer give what is added to the state. Two departures: the first
+layer also sees some frames ahead, since tremble cannot be told from motion without what follows; and the residual is
+bounded, so that no input can make it explode. Contact bits are in its input and in its output (section 4.3).
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT
+from mapctl.skeleton import CANONICAL
+from priors import checkpoints
+from priors.config import NetworkConfig
+from priors.refiner.end_effectors import channels, end_effectors
+
+END_EFFECTORS = ("hips", "head", "leftLowerArm", "leftHand", "rightLowerArm", "rightHand", "leftLowerLeg", "leftFoot",
+                 "leftToes", "rightLowerLeg", "rightFoot", "rightToes")  # fmt: skip
+"""Of the refiner and its critic: the paper's ends of the limbs, and knees, elbows and hips, which tremble too."""
+
+_BIT_LOGIT = 3.0  # log odds that a bit of the input is worth; the network may overrule it
+_PIECE = 600  # frames refined at once
+
+
+@dataclass(frozen=True)
+class RefinerConfig(NetworkConfig):
+    """Shape of the network."""
+
+    width: int = 256
+    """Units of the first layer (the paper's 500)."""
+    memory: int = 256
+    """Units of the LSTM (the paper's 1000)."""
+    lookahead: int = 4
+    """Frames ahead, and behind, that the first layer sees; 0 is the paper's."""
+    limit: float = 2.0
+    """Bound of what is added, standard deviations of each feature."""
+    joints: tuple[str, ...] = END_EFFECTORS
+    """End effectors that are seen."""
+
+    def __post_init__(self):
+        if min(self.width, self.memory) < 1 or self.lookahead < 0 or not self.limit > 0:
+            raise RequestError(f"a refiner needs positive width, memory and limit, and lookahead >= 0, got {self}")
+        if not self.joints or not set(self.joints) <= set(CANONICAL.names):
+            raise RequestError(f"a refiner needs end effectors among {', '.join(CANONICAL.names)}, got {self.joints}")
+
+
+class RefinerNetwork(nn.Module):
+    """Features in and out in physical units; statistics inside. Untrained, it returns what it was given."""
+
+    mean: Tensor
+    std: Tensor
+    reach_mean: Tensor
+    reach_std: Tensor
+
+    def __init__(self, config: RefinerConfig, *, mean: Tensor, std: Tensor, reach_mean: Tensor, reach_std: Tensor):
+        """Statistics of the features (size,) and of `end_effectors` (channels,); RuntimeError for other widths."""
+        super().__init__()
+        self.config = config
+        reach = channels(config.joints)
+        for name, values, width in (("mean", mean, LAYOUT.size), ("std", std, LAYOUT.size),
+                                    ("reach_mean", reach_mean, reach), ("reach_std", reach_std, reach)):  # fmt: skip
+            self.register_buffer(name, values.expand(width).clone())
+        seen = 2 * config.lookahead + 1
+        self.first = nn.Conv1d(LAYOUT.size + reach, config.width, seen)
+        self.lstm = nn.LSTM(config.width, config.memory, batch_first=True)
+        self.last = nn.Linear(config.memory, LAYOUT.size)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    @property
+    def before(self) -> int:
+        """Frames of input before the first refined one; as many less one are needed after the last."""
+        return self.config.lookahead + 1
+
+    def forward(
+        self, features: Float[Tensor, "batch given size"], memory: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Float[Tensor, "batch refined size"], tuple[Tensor, Tensor]]:
+        """Refined frames [lookahead + 1, given - lookahead), contact bits as probabilities, and the LSTM's memory."""
+        reach = (end_effectors(features, self.config.joints) - self.reach_mean) / self.reach_std
+        seen = torch.cat([((features - self.mean) / self.std)[:, 1:], reach], dim=-1)
+        hidden, after = self.lstm(torch.relu(self.first(seen.transpose(1, 2))).transpose(1, 2), memory)
+        change = self.last(hidden).to(features.dtype)
+        own = features[:, self.before : features.shape[1] - self.config.lookahead]
+        size, limit = LAYOUT.continuous, self.config.limit
+        continuous = own[..., :size] + limit * torch.tanh(change[..., :size] / limit) * self.std[:size]
+        bits = torch.sigmoid(_BIT_LOGIT * (2 * own[..., size:] - 1) + change[..., size:])
+        return torch.cat([continuous, bits], dim=-1), after
+
+
+@dataclass(frozen=True, eq=False)
+class LstmRefiner:
+    """A trained refiner (see mapctl.protocols.Refiner)."""
+
+    name: str
+    """How it was asked for."""
+    network: RefinerNetwork
+    """Weights."""
+    card: checkpoints.Card
+    """What they are."""
+
+    def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
+        """The whole motion refined; contact bits are 0 or 1."""
+        return torch.cat(list(self.stream([features])), dim=1)
+
+    def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
+        """Consecutive pieces refined, `lookahead` frames behind their input, in memory that does not grow.
+
+        At both ends the motion is taken to go on as its outermost frame does.
+        """
+        ahead, held, memory = self.network.config.lookahead, None, None
+        for piece in _with_margin(pieces, before=self.network.before, after=ahead):
+            held = piece if held is None else torch.cat([held, piece], dim=1)
+            while held.shape[1] > self.network.before + ahead:
+                given = held[:, : self.network.before + ahead + _PIECE]
+                with torch.no_grad():
+                    refined, memory = self.network(given, memory)
+                held = held[:, refined.shape[1] :]
+                yield torch.cat([refined[..., : LAYOUT.continuous], (refined[..., LAYOUT.continuous :] > 0.5)], dim=-1)
+
+
+def _with_margin(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterator[Tensor]:
+    last = None
+    for piece in pieces:
+        if piece.shape[1] == 0:
+            continue
+        if last is None:
+            yield piece[:, :1].expand(-1, before, -1)
+        yield piece
+        last = piece[:, -1:]
+    if last is not None and after > 0:
+        yield last.expand(-1, after, -1)
+
+
+def load(name: str) -> LstmRefiner:
+    """A bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    with checkpoints.opened(name, "refiner") as (tensors, card):
+        statistics = {part: tensors[part] for part in ("mean", "std", "reach_mean", "reach_std")}
+        network = RefinerNetwork(RefinerConfig.of_card(card.config), **statistics)
+        network.load_state_dict(tensors)
+    return LstmRefiner(name, network.eval().requires_grad_(False), card)

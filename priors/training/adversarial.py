@@ -1,0 +1,62 @@
+"""The refiner's critic and its memory: a bidirectional LSTM on end effectors (rnn paper, Eq. 12, figure 5; 4.2.2)."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.features import LAYOUT
+from priors.refiner.end_effectors import channels, end_effectors
+
+_FEET = ("leftFoot", "leftToes", "rightFoot", "rightToes")
+
+
+class Critic(nn.Module):
+    """Tells captured windows from refined ones by end effectors and contact bits."""
+
+    reach_mean: Tensor
+    reach_std: Tensor
+
+    def __init__(self, joints: Sequence[str], *, width: int, around: int, slow: float, reach_mean: Tensor,
+                 reach_std: Tensor):  # fmt: skip
+        """`width` units in the first layer and in each direction of the LSTM; the first layer sees `around` frames on
+        either side of its own, and feet's ground speeds under `slow` (m/s) magnified, unless that is 0.
+        """
+        super().__init__()
+        self.joints = tuple(joints)
+        self.register_buffer("reach_mean", reach_mean.clone())
+        self.register_buffer("reach_std", reach_std.clone())
+        self.slow = slow
+        self.magnified = [len(joints) + number for number, name in enumerate(joints) if slow > 0 and name in _FEET]
+        seen = channels(joints) + 2 * len(self.magnified) + 2
+        self.first = nn.Conv1d(seen, width, 2 * around + 1)
+        self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
+        self.last = nn.Linear(2 * width, 1)
+
+    def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
+        """Log odds, frame by frame, that a window was captured; for the frames that have enough on either side."""
+        ends = end_effectors(features, self.joints)
+        seen = [(ends - self.reach_mean) / self.reach_std, 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1]
+        if self.magnified:
+            # A foot that slides by 10 cm/s is a twentieth of the spread of feet's speeds, and what every viewer sees.
+            ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified, ::2]
+            seen.append(0.5 * torch.asinh(ground / self.slow).flatten(2))
+        seen = torch.cat(seen, dim=-1).transpose(1, 2)
+        hidden, _ = self.lstm(torch.nn.functional.leaky_relu(self.first(seen), 0.2).transpose(1, 2))
+        return self.last(hidden)[..., 0]
+
+
+class History:
+    """Refined windows of earlier refiners, so that the critic does not forget faults that it once knew."""
+
+    def __init__(self, windows: Float[Tensor, "size frames features"]):
+        self.windows = windows.clone()
+
+    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
+        """Half a batch of the fresh ones, half of kept ones; then the fresh half takes the place of kept ones."""
+        half = len(fresh) // 2
+        picked = torch.randperm(len(self.windows), generator=generator)
+        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
+        self.windows[picked[half : 2 * half]] = fresh[:half]
+        return mixed

@@ -1,0 +1,195 @@
+"""Spoilt copies of clean motion, as captures come: tremble, spikes, joints and limbs that are lost, moments without
+anything. How much of each is drawn anew for every window, and the network is told the noise as a file's would be.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.features import LAYOUT, Place, local_rotations, root_places
+from mapctl.recording import Capture
+from mapctl.skeleton import CANONICAL
+
+_JOINTS = CANONICAL.num_joints
+
+
+@dataclass(frozen=True)
+class CorruptionSettings:
+    """Ranges that are drawn from, for each window."""
+
+    angle_deg: tuple[float, float] = (0.3, 10.0)
+    """Noise of each of a joint's three angles, log-uniform."""
+    root_cm: tuple[float, float] = (0.2, 6.0)
+    """Noise of each coordinate of the hips, log-uniform."""
+    clean: float = 0.1
+    """Share of windows whose angles, and share whose hips, have no noise."""
+    uneven: float = 0.5
+    """Spread (of the logarithm) of the noise among joints, in half of the windows."""
+    markers: float = 0.15
+    """Share of windows whose noise is that of the joints' places: the shorter a bone, the more it turns."""
+    marker_cm: tuple[float, float] = (0.5, 6.0)
+    """That noise, log-uniform."""
+    correlated: float = 0.2
+    """Share of windows whose noise lasts beyond a frame."""
+    spikes: float = 0.02
+    """Of an angle's frames, at most, in half of the windows."""
+    spike_deg: tuple[float, float] = (15.0, 60.0)
+    """How high they are."""
+    found: float = 0.8
+    """Share of the spikes that are taken for what they are, and masked."""
+    dropout: float = 0.4
+    """Of a joint's frames, at most, in a quarter of the windows."""
+    limb: float = 0.25
+    """Share of windows that lose a limb for a while."""
+    gap: float = 0.1
+    """Share of windows that lose everything for a while."""
+    told: float = 0.2
+    """Error (of the logarithm) of the noise that the network is told."""
+    size: float = 0.05
+    """Spread of a performer's size: of the logarithm of the way of the hips."""
+
+
+LIMBS = tuple(
+    tuple(CANONICAL.index(name) for name in names)
+    for names in (
+        ("leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand"), ("leftUpperArm", "leftLowerArm", "leftHand"),
+        ("rightShoulder", "rightUpperArm", "rightLowerArm", "rightHand"),
+        ("rightUpperArm", "rightLowerArm", "rightHand"), ("leftLowerArm", "leftHand"), ("rightLowerArm", "rightHand"),
+        ("leftUpperLeg", "leftLowerLeg", "leftFoot", "leftToes"), ("leftFoot", "leftToes"),
+        ("rightUpperLeg", "rightLowerLeg", "rightFoot", "rightToes"), ("rightFoot", "rightToes"),
+        ("neck", "head"), ("spine", "chest"),
+    )
+)  # fmt: skip
+"""Joints that are lost together."""
+
+
+def clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
+    """The features as a perfect capture, from the origin."""
+    batch, frames = features.shape[:2]
+    origin = Place(features.new_zeros(batch, 2), features.new_zeros(batch))
+    ground, heading = root_places(features, origin)
+    height = LAYOUT.pick(features, "root_height")
+    quats = local_rotations(features, heading)
+    return Capture(
+        torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1), quats[..., 0, :],
+        LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3)),
+        torch.ones(batch, frames, dtype=torch.bool), torch.ones(batch, frames, _JOINTS, dtype=torch.bool),
+        torch.zeros(batch), torch.zeros(batch, _JOINTS),
+    )  # fmt: skip
+
+
+def corrupted(clean: Capture, settings: CorruptionSettings, generator: torch.Generator) -> Capture:
+    """A spoilt copy; what is masked keeps its values, which nobody should look at."""
+    draw = _Draw(generator)
+    batch, frames = clean.root.shape[:2]
+    sigma, sigma_root = _sigmas(batch, settings, draw)
+    angles, spiky = _angles(batch, frames, sigma, settings, draw)
+    quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
+    quats = rotations.multiply(quats, rotations.from_rotation_vector(angles))
+    lost, nothing = _losses(batch, frames, settings, draw)
+    found = spiky & (draw.uniform(batch, frames, _JOINTS) < settings.found)
+    error = torch.exp(settings.told * draw.normal(batch, _JOINTS + 1))
+    return Capture(
+        clean.root + draw.normal(batch, frames, 3) * sigma_root[:, None, None], quats[:, :, 0],
+        rotations.to_rotation_vector(quats[:, :, 1:]), ~nothing, ~(lost | found | nothing[..., None]),
+        sigma_root * error[:, -1], sigma * error[:, :-1],
+    )  # fmt: skip
+
+
+_MOST_TURNED = 0.6  # radians of noise; more is no noise but another motion
+
+
+def _bone_lengths() -> Float[Tensor, " joints"]:
+    """From each canonical joint to the next, metres; of the last ones, the bone before."""
+    lengths = CANONICAL.offsets.norm(dim=-1).float()
+    return torch.stack([lengths[below[0]] if (below := CANONICAL.children(joint)) else lengths[joint]
+                        for joint in range(_JOINTS)])  # fmt: skip
+
+
+class _Draw:
+    """Random numbers of one generator."""
+
+    def __init__(self, generator: torch.Generator):
+        self.generator = generator
+
+    def uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator)
+
+    def log_uniform(self, low: float, high: float, *shape: int) -> Tensor:
+        return low * torch.exp(self.uniform(*shape) * math.log(high / low))
+
+    def below(self, bound: Tensor) -> Tensor:
+        """Whole numbers from 0 up to each bound, exclusive."""
+        return (self.uniform(len(bound)) * bound).long().minimum(bound - 1)
+
+
+def _sigmas(batch: int, settings: CorruptionSettings, draw: _Draw) -> tuple[Tensor, Tensor]:
+    """By joint, radians (batch, joints), and of the hips' place, metres (batch,)."""
+    angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, batch, 1)) * (draw.uniform(batch, 1) > settings.clean)
+    uneven = torch.where(draw.uniform(batch, 1) < 0.5, settings.uneven, 0.0) * draw.normal(batch, _JOINTS)
+    root = draw.log_uniform(*settings.root_cm, batch) / 100 * (draw.uniform(batch) > settings.clean)
+    place = draw.log_uniform(*settings.marker_cm, batch, 1) / 100
+    of_places = (place / _bone_lengths()).clamp(max=_MOST_TURNED)
+    marked = draw.uniform(batch, 1) < settings.markers
+    return torch.where(marked, of_places, angle * torch.exp(uneven)), torch.where(marked[:, 0], place[:, 0], root)
+
+
+def _angles(
+    batch: int, frames: int, sigma: Tensor, settings: CorruptionSettings, draw: _Draw
+) -> tuple[Float[Tensor, "batch frames joints 3"], Tensor]:
+    """Rotation vectors to add, and which joints a spike has hit (batch, frames, joints).
+
+    Noise is added to a rig's three channels, whose axes are square at best: near gimbal lock two of them are one.
+    """
+    noise = draw.normal(batch, frames, _JOINTS, 3)
+    stays = torch.where(draw.uniform(batch) < settings.correlated, 0.8 * draw.uniform(batch), 0.0)
+    noise = _lasting(noise, stays) * sigma[:, None, :, None]
+    share = settings.spikes * draw.uniform(batch) * (draw.uniform(batch) < 0.5)
+    hit = draw.uniform(batch, frames, _JOINTS, 3) < share[:, None, None, None]
+    low, high = settings.spike_deg
+    height = torch.deg2rad(low + (high - low) * draw.uniform(batch, 1, 1, 1))
+    noise = noise + hit * height * torch.sign(draw.normal(batch, frames, _JOINTS, 3))
+    skewed = torch.nn.functional.normalize(draw.normal(batch, _JOINTS, 3, 3), dim=-1)
+    square = torch.linalg.qr(draw.normal(batch, _JOINTS, 3, 3))[0]
+    axes = torch.where(draw.uniform(batch, 1, 1, 1) < 0.5, square, skewed)
+    return torch.einsum("btjk,bjkc->btjc", noise, axes), hit.any(dim=-1)
+
+
+def _lasting(noise: Float[Tensor, "batch frames joints 3"], stays: Float[Tensor, " batch"]) -> Tensor:
+    """Noise of the same spread, of which the share `stays` comes from the frame before."""
+    if not stays.any():
+        return noise
+    kept, fresh = stays[:, None, None], torch.sqrt(1 - stays.square())[:, None, None]
+    out = [noise[:, 0]]
+    for frame in range(1, noise.shape[1]):
+        out.append(kept * out[-1] + fresh * noise[:, frame])
+    return torch.stack(out, dim=1)
+
+
+def _losses(batch: int, frames: int, settings: CorruptionSettings, draw: _Draw) -> tuple[Tensor, Tensor]:
+    """Which joints are lost (batch, frames, joints), and in which frames all are (batch, frames)."""
+    share = settings.dropout * draw.uniform(batch, 1, 1) * (draw.uniform(batch, 1, 1) < 0.25)
+    lost = draw.uniform(batch, frames, _JOINTS) < share
+    limbs = torch.zeros(len(LIMBS), _JOINTS, dtype=torch.bool)
+    for row, joints in enumerate(LIMBS):
+        limbs[row, list(joints)] = True
+    limb = limbs[draw.below(torch.full((batch,), len(LIMBS)))]
+    during = _stretch(batch, frames, 10, frames, draw) & (draw.uniform(batch, 1) < settings.limb)
+    nothing = _stretch(batch, frames, 3, frames // 3, draw) & (draw.uniform(batch, 1) < settings.gap)
+    return lost | (limb[:, None] & during[..., None]), nothing
+
+
+def _stretch(batch: int, frames: int, shortest: int, longest: int, draw: _Draw) -> Tensor:
+    """One run of true frames in each window (batch, frames), never all of them."""
+    shortest, longest = min(shortest, frames - 1), min(longest, frames - 1)
+    length = shortest + draw.below(torch.full((batch,), longest - shortest + 1))
+    start = draw.below(frames - length + 1)
+    frame = torch.arange(frames)
+    return (frame >= start[:, None]) & (frame < (start + length)[:, None])

@@ -1,0 +1,130 @@
+"""Gaps as they are cut into training motions (infilling paper, section 3.3).
+
+Blocks of frames that grow in the course of training, joints that are lost throughout; and what the paper's masks lack:
+keys far apart, poses known in part, joints dropped frame by frame.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl.skeleton import CANONICAL
+from priors.training.augmentation.corruption import LIMBS
+
+_JOINTS = CANONICAL.num_joints
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """What is cut out. A window has gaps, keys, or lost joints; shares of the three are these, gaps get the rest."""
+
+    keys: float = 0.15
+    """Share of windows of which only single frames are known, now and then."""
+    joints: float = 0.4
+    """Share of windows that lose joints (paper: half)."""
+    shortest: float = 5.0
+    """Mean length of a gap when training begins, frames (paper: 10 at 60 fps)."""
+    longest: float = 60.0
+    """And when it has grown up (paper: 120 at 60 fps)."""
+    spread: float = 15.0
+    """Standard deviation of the length, frames."""
+    grown: float = 0.5
+    """Share of training after which the mean grows no more (paper: 60 of 200 epochs)."""
+    several: int = 3
+    """Gaps in a window, at most."""
+    partial: float = 0.3
+    """Share of windows with gaps, in which some joints stay known for some frames."""
+    dropout: float = 0.2
+    """Share of windows with lost joints that drop them frame by frame, half of them at most."""
+
+    def mean_length(self, progress: float) -> float:
+        """Of a gap, frames, `progress` of the way through training."""
+        return self.shortest + (self.longest - self.shortest) * min(1.0, progress / self.grown)
+
+
+def known_places(
+    present: Bool[Tensor, "batch frames"], settings: GapSettings, *, progress: float, generator: torch.Generator
+) -> Bool[Tensor, "batch frames joints"]:
+    """Which places of each window stay known; in every window some frame is known whole or in part."""
+    draw = _Draw(generator, *present.shape)
+    length = settings.mean_length(progress)
+    kind = draw.uniform()
+    frames = _gaps(draw, length, settings)
+    partial = _partly(draw, settings) & (draw.uniform() < settings.partial)[:, None, None]
+    gaps = frames[..., None] | partial
+    keys = _keys(draw, length)[..., None].expand_as(gaps)
+    known = torch.where((kind < settings.keys)[:, None, None], keys, gaps)
+    known = torch.where((kind > 1 - settings.joints)[:, None, None], _without_joints(draw, settings), known)
+    known = known & present[..., None]
+    # A window without anything known would teach the mean motion.
+    lost = ~known.any(dim=2).any(dim=1)
+    first = present & (present.long().cumsum(dim=1) == 1)
+    return known | (lost[:, None] & first)[..., None]
+
+
+class _Draw:
+    """Random numbers of one generator, for a batch of windows."""
+
+    def __init__(self, generator: torch.Generator, batch: int, frames: int):
+        self.generator, self.batch, self.frames = generator, batch, frames
+        self.frame = torch.arange(frames)
+
+    def uniform(self, *shape: int) -> Tensor:
+        """(batch, *shape)."""
+        return torch.rand(self.batch, *shape, generator=self.generator)
+
+    def normal(self) -> Tensor:
+        """(batch,)."""
+        return torch.randn(self.batch, generator=self.generator)
+
+    def stretch(self, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
+        """One run of so many frames, that may reach beyond the window's ends."""
+        start = self.uniform() * (self.frames + 8 - length).clamp_min(1) - 4
+        return (self.frame >= start[:, None]) & (self.frame < (start + length)[:, None])
+
+
+def _gaps(draw: _Draw, length: float, settings: GapSettings) -> Bool[Tensor, "batch frames"]:
+    """True where a frame is known."""
+    known = torch.ones(draw.batch, draw.frames, dtype=torch.bool)
+    count = (1 + draw.uniform() * settings.several).floor()
+    for number in range(settings.several):
+        size = (length + settings.spread * draw.normal()).clamp(2, draw.frames - 10)
+        known &= ~(draw.stretch(size / count.sqrt()) & (number < count)[:, None])
+    return known
+
+
+def _keys(draw: _Draw, length: float) -> Bool[Tensor, "batch frames"]:
+    """Single frames, on average `length` apart, in half of the windows with the frame after it: a pose and its pace."""
+    known = draw.uniform(draw.frames) < 1 / (2 + draw.uniform(1) * (2 * length))
+    after = torch.cat([torch.zeros(draw.batch, 1, dtype=torch.bool), known[:, :-1]], dim=1)
+    return known | (after & (draw.uniform(1) < 0.5))
+
+
+def _partly(draw: _Draw, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
+    """Some joints, or all but some, known for a stretch."""
+    some = _some_joints(draw)
+    other = draw.uniform(1) < 0.25
+    stretch = draw.stretch(1 + draw.uniform() ** 2 * draw.frames)
+    return stretch[..., None] & torch.where(other, ~some, some)[:, None]
+
+
+def _without_joints(draw: _Draw, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
+    """All known but 1 to 3 joints, or a limb, throughout or for a stretch; or any joint now and then."""
+    lost = _some_joints(draw)[:, None].expand(-1, draw.frames, -1)
+    during = draw.stretch(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
+    dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
+    lost = torch.where((draw.uniform() < settings.dropout)[:, None, None], dropped, lost & during[..., None])
+    return ~lost
+
+
+def _some_joints(draw: _Draw) -> Bool[Tensor, "batch joints"]:
+    """1 to 3 joints at random, or a limb."""
+    limbs = torch.zeros(len(LIMBS), _JOINTS, dtype=torch.bool)
+    for row, joints in enumerate(LIMBS):
+        limbs[row, list(joints)] = True
+    limb = limbs[(draw.uniform() * len(LIMBS)).long()]
+    order = draw.uniform(_JOINTS).argsort(dim=1).argsort(dim=1)
+    some = order < (1 + draw.uniform(1) * 3).floor()
+    return torch.where(draw.uniform(1) < 0.5, some, limb)

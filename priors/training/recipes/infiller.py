@@ -1,0 +1,135 @@
+"""Training of the infiller: windows of motion with gaps cut into them, and how far from them it comes back."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
+
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL
+from priors.config import check_least
+from priors.infiller.network import InfillerConfig, InfillerNetwork
+from priors.training.augmentation.gap_masks import GapSettings, known_places
+from priors.training.corpus import Corpus
+from priors.training.trainer import Trainer
+from priors.training.windows import PositionWindows, Window
+
+TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
+_EVEN_OFF = 0.5  # cm that the guess may be off by before a window's weight falls
+_MOST_OFF = 4.0  # cm beyond which it falls no more
+_LEAST_SPREAD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
+
+
+@dataclass(frozen=True)
+class InfillerSettings:
+    """The recipe."""
+
+    steps: int = 8_000
+    """Updates."""
+    batch: int = 64
+    """Windows an update."""
+    window: int = 160
+    """Frames of each; shorter clips are taken whole."""
+    learning_rate: float = 1e-3
+    """At its highest; it falls to nothing along a cosine."""
+    pace: float = 1.0
+    """Weight of the joints' error in velocity, cm a frame, beside 1 for that in place, cm."""
+    feet: float = 0.05
+    """Weight of the planted toes' error in velocity, cm a frame."""
+    contacts: float = 0.1
+    """Weight of the contacts' cross entropy, nats."""
+    evenness: float = 0.5
+    """Of windows among the data's top folders: 0 draws by their frames, 1 the same number from each."""
+    gaps: GapSettings = field(default_factory=GapSettings)
+    """What is cut out."""
+    bfloat16: bool = False
+    """The network computes in bfloat16; weights and loss stay in float32."""
+    seed: int = 1
+    """Of weights, windows and gaps."""
+
+    def __post_init__(self):
+        check_least(self, 1, "steps", "batch")
+        if self.window < 32:
+            raise RequestError(f"window must be at least 32 frames, got {self.window}")
+
+
+class InfillerTrainer(Trainer[InfillerNetwork]):
+    """Draws windows, cuts gaps into them, and brings the network nearer to filling them."""
+
+    def __init__(self, config: InfillerConfig, settings: InfillerSettings, corpus: Corpus):
+        self.settings = settings
+        self.windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
+        super().__init__(lambda: InfillerNetwork(config, bfloat16=settings.bfloat16), steps=settings.steps,
+                         learning_rate=settings.learning_rate, seed=settings.seed)  # fmt: skip
+        mean, std = self.windows.moments()
+        self.network.mean.copy_(mean)
+        self.network.std.copy_(std.clamp_min(_LEAST_SPREAD))
+
+    def losses(self) -> dict[str, Tensor]:
+        """Of a batch drawn anew."""
+        window, progress = self.windows.draw(self.settings.batch, self.generator), self.step / self.settings.steps
+        known = known_places(window.present, self.settings.gaps, progress=progress, generator=self.generator)
+        return losses(self.network, window, known, self.settings)
+
+
+def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: InfillerSettings) -> dict[str, Tensor]:
+    """The loss, and in plain units the errors it is made of.
+
+    L1 over the whole motion (section 3.3), window by window divided by the number of coordinates that had to be made:
+    two joints that are lost count as much as a gap. A network that keeps what is known is so judged on what is not, an
+    autoencoder on everything. A window in which the guess would do counts for more, or a network learns to fidget where
+    nobody moves.
+    """
+    image = window.image(known)
+    wanted = image.from_world(window.places)
+    proposed = network(image)
+    lacking = window.present[..., None] & ~known
+    made = lacking if network.keeps else window.present[..., None].expand_as(known)
+    wrong = 100 * (proposed.places - wanted)
+    weight = _weights(image.places, wanted, lacking) / (3 * made.sum(dim=(1, 2)).clamp_min(1))
+    place = (weight * (wrong.abs().sum(-1) * made).sum(dim=(1, 2))).mean()
+    pairs = window.present[:, 1:] & window.present[:, :-1]
+    slip = torch.diff(wrong, dim=1) * pairs[..., None, None]
+    pace = (weight * slip.abs().sum(dim=(1, 2, 3))).mean()
+    planted = window.contacts[:, 1:] * window.contacts[:, :-1]
+    feet = (slip[..., list(TOES), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
+    unsure = made[..., list(TOES)]
+    guessed = cross_entropy(proposed.contacts, window.contacts, reduction="none")
+    contacts = (guessed * unsure).sum() / unsure.sum().clamp_min(1)
+    loss = place + settings.pace * pace + settings.feet * feet + settings.contacts * contacts
+    error = ((wrong - wrong[..., :1, :]).norm(dim=-1).detach() * lacking).sum() / lacking.sum().clamp_min(1)
+    return {"loss": loss, "place": place, "pace": pace, "feet_cm_frame": feet, "contacts_nats": contacts,
+            "error_cm": error}  # fmt: skip
+
+
+def _weights(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
+    """Of windows: the less, the more the guess is off (mean over coordinates, cm); 1 at 2 cm."""
+    off = (100 * (guess - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
+    return (2 + _EVEN_OFF) / (off.clamp(max=_MOST_OFF) + _EVEN_OFF)
+
+
+VALIDATED = (15, 30, 60)
+"""Gaps that are validated, frames, where a window has room for them."""
+_ROOM = 8  # frames of a window that a gap must leave
+
+
+@torch.no_grad()
+def validate(network: InfillerNetwork, corpus: Corpus, settings: InfillerSettings) -> dict[str, Any]:
+    """Root-aligned joint error over a gap in the middle of unseen windows, cm, beside that of the guess."""
+    windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
+    row = {}
+    for gap in [gap for gap in VALIDATED if gap + _ROOM <= settings.window]:
+        window = windows.draw(192, torch.Generator().manual_seed(gap))
+        middle = (settings.window - gap) // 2
+        known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()
+        known[:, middle : middle + gap] = False
+        image = window.image(known)
+        wanted = image.from_world(window.places)
+        for name, places in (("error", network(image).places), ("guess", image.places)):
+            wrong = 100 * (places - wanted)
+            wrong = (wrong - wrong[..., :1, :]).norm(dim=-1) * (window.present[..., None] & ~known)
+            row[f"{name}_{gap}_cm"] = float(wrong.sum() / (window.present[..., None] & ~known).sum())
+    return row

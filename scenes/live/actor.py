@@ -1,0 +1,65 @@
+"""One character on the stage: who moves it, what is shown of it, and what of it is kept."""
+
+from collections import deque
+
+import numpy as np
+import viser
+
+from mapctl.features import PRIOR_FPS
+from mapctl.mesh import colours
+from mapctl.runtime.live_protocol import Delivered, LiveCharacter
+from scenes.live import ground
+from scenes.live.inputs import Orders
+from scenes.live.realtime import Pace
+from scenes.live.recording import Recording
+from scenes.live.skinned_character import Puppet
+
+
+class Member:
+    """A LiveCharacter with its mannequin, orders, pace and recording."""
+
+    def __init__(self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, orders: Orders):
+        """`number` counts from 0; its nodes hang below the node `world`."""
+        self.name = f"character {number + 1}"
+        self.character, self.orders, self.first = character, orders, orders
+        self.pace = Pace()
+        self.recording: Recording | None = None
+        self.gone = ""  # why it is no more
+        self.place = np.zeros(2)
+        self._puppet = Puppet(scene, f"{world}/character{number + 1}", character.skeleton, colours.default(number))
+        self._marks = ground.Marks(scene, f"{world}/marks{number + 1}", character.skeleton)
+        self._waiting: deque[tuple[float, Delivered, int]] = deque()
+
+    def command(self) -> None:
+        """Tell the character its orders."""
+        self.character.command(self.orders.command)
+
+    def reset(self) -> None:
+        """Begin anew with the first orders; a recording goes on."""
+        self._waiting.clear()
+        self.orders, self.gone = self.first, ""
+        self.pace.forget()
+        self.command()
+        self.character.reset()
+
+    def take(self, delivered: Delivered, now: float) -> None:
+        """Keep what came until it is due, record it."""
+        if self.recording is not None:
+            self.recording.add(delivered)
+        self.pace.add(now, delivered)
+        self._waiting.extend((delivered.due + k / PRIOR_FPS, delivered, k) for k in range(len(delivered.root)))
+        self._marks.forecast(delivered.forecast)
+
+    def show_due(self, now: float) -> None:
+        """Pose it as it is at this moment, a value of time.perf_counter."""
+        due = None
+        while self._waiting and self._waiting[0][0] <= now:
+            due = self._waiting.popleft()
+        if due is not None:
+            self._pose(*due[1:])
+
+    def _pose(self, delivered: Delivered, frame: int) -> None:
+        self._puppet.pose(delivered.root[frame], delivered.quats[frame])
+        self.place = delivered.root[frame, ::2]
+        joints = delivered.motion(self.character.skeleton).joint_positions()[frame].numpy()
+        self._marks.planted(joints, delivered.contacts[frame])

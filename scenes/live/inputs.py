@@ -1,0 +1,111 @@
+"""What a character is told, and what it can be told: numbers and words of a page are checked here as they arrive."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from mapctl.intent.steering import STEP_LENGTHS, Command
+
+AS_IT_LIKES = "any"
+"""The choice that tells a prior nothing."""
+_FIELDS = ("speed", "heading", "facing", "step_length")
+_SHOWN = {"speed": ("speed", "m/s"), "step_length": ("step length", "m")}
+
+
+@dataclass(frozen=True)
+class Orders:
+    """What one character is to do, as the panel shows it."""
+
+    speed: float = 1.2
+    """m/s."""
+    heading: float = 0.0
+    """Degrees; 0 is +Z, 90 is +X."""
+    facing: float | None = None
+    """Degrees; None faces where it goes."""
+    step_length: float | None = None
+    """Metres; None steps as the prior does."""
+    told: Mapping[str, str] = field(default_factory=dict)
+    """By group of labels (gait, style) the one that is told."""
+
+    @property
+    def command(self) -> Command:
+        """The same for a LiveCharacter."""
+        facing = None if self.facing is None else math.radians(self.facing)
+        return Command(self.speed, math.radians(self.heading), facing, step_length=self.step_length,
+                       told=tuple(self.told.values()))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A sentence for whoever asked for what cannot be."""
+
+    name: str
+    """Of the order."""
+    held: Any
+    """What holds instead."""
+    text: str
+    """With what is allowed."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What can be asked of a prior."""
+
+    fastest: float
+    """m/s."""
+    labels: Mapping[str, Sequence[str]]
+    """That it knows, by group."""
+    steps: tuple[float, float] = STEP_LENGTHS
+    """Shortest and longest, metres."""
+
+    def changed(self, orders: Orders, changes: Mapping[str, Any]) -> tuple[Orders, list[Refusal]]:
+        """The orders after changes by name, each brought to the nearest that can be; what is no number changes nothing.
+
+        `told` names a label by group, AS_IT_LIKES none; groups that it does not name stay as they are.
+        """
+        found, refused = {}, list[Refusal]()
+        for name, asked in changes.items():
+            held = self._label(orders.told, asked) if name == "told" else self._number(orders, name, asked)
+            if (text := self._why(name, asked, held)) is not None:
+                refused.append(Refusal(name, held, text))
+            found[name] = held
+        return replace(orders, **found), refused
+
+    def _number(self, orders: Orders, name: str, asked: Any) -> float | None:
+        if name not in _FIELDS or not _is_number(asked):
+            may_be_none = name in ("facing", "step_length") and asked is None
+            return None if may_be_none else getattr(orders, name)
+        if name in ("heading", "facing"):
+            return float(asked) if abs(asked) <= 180 else math.remainder(asked, 360)
+        lowest, highest = self._range(name)
+        return min(highest, max(lowest, float(asked)))
+
+    def _label(self, told: Mapping[str, str], asked: Any) -> dict[str, str]:
+        known = {group: (AS_IT_LIKES, *labels) for group, labels in self.labels.items()}
+        heard = {group: label for group, label in dict(asked).items() if label in known.get(group, ())}
+        return {group: label for group, label in {**told, **heard}.items() if label != AS_IT_LIKES}
+
+    def _range(self, name: str) -> tuple[float, float]:
+        return (0.0, self.fastest) if name == "speed" else self.steps
+
+    def _why(self, name: str, asked: Any, held: Any) -> str | None:
+        """The sentence, None where it holds as it was asked."""
+        if name == "told":
+            return next((f"{label!r} is not a {group} that this prior knows." for group, label in dict(asked).items()
+                         if held.get(group, AS_IT_LIKES) != label), None)  # fmt: skip
+        if asked == held:
+            return None
+        if not _is_number(asked):
+            held = "none" if held is None else f"{held:g}"
+            return f"{name.replace('_', ' ').capitalize()}: {str(asked)[:20]!r} is no number; {held} holds."
+        if name not in _SHOWN:
+            return f"A {name} of {asked:g} degrees is the same as {held:g}."
+        words, unit = _SHOWN[name]
+        low, high = self._range(name)
+        way = "raised" if held > asked else "lowered"
+        return f"A {words} of {asked:g} {unit} was {way} to {held:g}: it can be {low:g} to {high:g} {unit}."
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,101 @@
+"""What the live viewer says in words: in the page, for as long as it is true or takes to read, and on the console."""
+
+import sys
+import time
+from contextlib import suppress
+
+import viser
+
+from mapctl.errors import MapctlError
+from scenes.live.access import one_line
+from scenes.live.inputs import Refusal
+
+_READ = 8.0  # seconds for which a refusal is shown
+_AGAIN = 10.0  # seconds before the same is said again
+_TOAST = 8.0
+
+
+class Notices:
+    """Lasting states on top of the panel, refusals below the controls, events as notes that pass."""
+
+    def __init__(self, server: viser.ViserServer):
+        """Make it where the lasting states are to be shown; `below` puts the refusals."""
+        self._server = server
+        self._top = server.gui.add_markdown("", visible=False)
+        self._refusals: viser.GuiMarkdownHandle | None = None
+        self._states: dict[str, str] = {}
+        self._shown: tuple[Refusal, float] | None = None
+        self._said: dict[str, float] = {}
+
+    def below(self) -> None:
+        """Refusals are shown here."""
+        self._refusals = self._server.gui.add_markdown("", visible=False)
+
+    def state(self, key: str, text: str | None) -> None:
+        """Something that holds until another text, or None, is given under its key."""
+        if text is None:
+            self._states.pop(key, None)
+        else:
+            self._states[key] = text
+        _put(self._top, "\n\n".join(f"⚠️ {text}" for text in self._states.values()))
+
+    def refused(self, refusals: list[Refusal]) -> None:
+        """What was asked for and cannot be."""
+        if refusals:
+            self._shown = refusals[-1], time.perf_counter()
+            self._show_refusal("\n\n".join(refusal.text for refusal in refusals))
+
+    def held(self, name: str, value: object) -> None:
+        """An order as it was asked: what was refused of it before is no longer of interest, unless this is what came of
+        it (a field that is left puts itself right).
+        """
+        if self._shown is not None and self._shown[0].name == name and self._shown[0].held != value:
+            self._show_refusal("")
+
+    def pass_on(self, now: float) -> None:
+        """Take away what was shown long enough."""
+        if self._shown is not None and now - self._shown[1] > _READ:
+            self._show_refusal("")
+
+    def event(self, title: str, body: str, *, console: bool = True) -> None:
+        """Something that happened, in every browser; the same once in a while only."""
+        if not self._is_new(f"{title} {body}"):
+            return
+        if console:
+            self._print(f"{title}: {body}")
+        for client in list(self._server.get_clients().values()):
+            with suppress(Exception):  # it may have gone just now
+                client.add_notification(title, body, auto_close_seconds=_TOAST)
+
+    def fault(self, error: BaseException) -> None:
+        """An error of the project's own, or of an input that nobody thought of; everything goes on."""
+        if isinstance(error, MapctlError):
+            self.event("Not done", str(error))  # what was asked cannot be
+        else:
+            self.event("Something went wrong", one_line(error))
+
+    def console(self, text: str) -> None:
+        """A line on standard error; the same once in a while only."""
+        if self._is_new(text):
+            self._print(text)
+
+    def _show_refusal(self, text: str) -> None:
+        if not text:
+            self._shown = None
+        if self._refusals is not None:
+            _put(self._refusals, text)
+
+    def _is_new(self, text: str) -> bool:
+        now = time.perf_counter()
+        self._said = {said: at for said, at in self._said.items() if now - at < _AGAIN}
+        return self._said.setdefault(text, now) == now
+
+    def _print(self, text: str) -> None:
+        print(f"mapctl: {text}", file=sys.stderr, flush=True)
+
+
+def _put(handle: viser.GuiMarkdownHandle, text: str) -> None:
+    if handle.content != text:
+        handle.content = text
+    if handle.visible != bool(text):
+        handle.visible = bool(text)

@@ -1,0 +1,43 @@
+"""A character in the browser: its mannequin sent once, hung on joints that are then turned."""
+
+import numpy as np
+import trimesh
+import viser
+from trimesh.visual import ColorVisuals
+
+from mapctl.mesh.primitives import Array
+from mapctl.mesh.skinning import Skin, at_rest, skin
+from mapctl.skeleton import Skeleton
+
+
+class Puppet:
+    """The mannequin of a skeleton below a node of a scene."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton, colour: str):
+        """`colour` is the torso's."""
+        body, paths = skin(at_rest(skeleton), colour), []
+        self._joints: list[viser.FrameHandle] = []
+        for joint, parent in enumerate(skeleton.parents):
+            paths.append(f"{paths[parent] if parent >= 0 else name}/{skeleton.names[joint]}")
+            offset = skeleton.offsets[joint].numpy()
+            self._joints.append(scene.add_frame(paths[joint], show_axes=False, position=offset))
+            if (part := _part(body, joint)) is not None:
+                scene.add_mesh_trimesh(f"{paths[joint]}/skin", part)
+
+    def pose(self, root: Array, quats: Array) -> None:
+        """Stand the root (3,) there, in metres, and turn every joint (joints, 4), xyzw."""
+        self._joints[0].position = root
+        for handle, (x, y, z, w) in zip(self._joints, quats, strict=True):
+            handle.wxyz = (w, x, y, z)
+
+
+def _part(body: Skin, joint: int) -> trimesh.Trimesh | None:
+    """The triangles that hang on a joint, None if there are none."""
+    faces = body.faces[body.joint[body.faces[:, 0]] == joint]
+    if not len(faces):
+        return None
+    used, packed = np.unique(faces, return_inverse=True)
+    colours = np.column_stack([body.rgb[used], np.ones(len(used))])
+    mesh = trimesh.Trimesh(body.vertices[used], packed.reshape(-1, 3), process=False)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * colours).round().astype(np.uint8))
+    return mesh

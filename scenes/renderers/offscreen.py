@@ -1,0 +1,86 @@
+"""Pictures by pyrender without a window (EGL); works in software where there is no graphics card."""
+
+import os
+from collections.abc import Sequence
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from mapctl.errors import MapctlError
+from mapctl.mesh import colours
+from mapctl.mesh.primitives import Array, Surface, merge
+from scenes.cameras import View
+from scenes.content import Content
+from scenes.overlays import shadow
+from scenes.renderers.lighting import shade
+
+_NEAR, _FAR = 0.3, 400.0
+
+
+class NoGraphicsError(MapctlError):
+    """OpenGL cannot be used here; the message says what is missing."""
+
+
+class OffscreenPainter:
+    """Paints shaded bodies on the ground. Raises NoGraphicsError where there is no OpenGL."""
+
+    name = "pyrender (EGL)"
+
+    def __init__(self):
+        self._gl, self._renderer = _graphics()
+        gl = self._gl
+        self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
+        self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_NEAR, zfar=_FAR))
+        self._solid = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4)
+        self._sheer = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, alphaMode="BLEND", doubleSided=True)
+
+    def paint(self, view: View, content: Content) -> Array:
+        """The picture, (height, width, 3) uint8."""
+        eye = view.pose[:3, 3]
+        bodies = [figure.surface() for figure in content.figures]
+        shadows = [shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
+        groups = (([*content.ground, *shadows], self._sheer), (bodies, self._solid))
+        nodes = [self._scene.add(self._mesh(group, material, eye)) for group, material in groups if group]
+        camera = self._camera.camera
+        camera.yfov, camera.aspectRatio = view.fov, view.width / view.height
+        self._scene.set_pose(self._camera, view.pose)
+        self._renderer.viewport_width, self._renderer.viewport_height = view.width, view.height
+        picture, _ = self._renderer.render(self._scene, self._gl.RenderFlags.FLAT)
+        for node in nodes:
+            self._scene.remove_node(node)
+        return picture
+
+    def _mesh(self, surfaces: Sequence[Surface], material: object, eye: Array):
+        """All surfaces as one mesh: a draw call costs more than a body's triangles, and the order stays."""
+        surface = merge(surfaces)
+        primitive = self._gl.Primitive(
+            positions=surface.vertices, indices=surface.faces, color_0=shade(surface, eye), material=material
+        )
+        return self._gl.Mesh([primitive])
+
+
+@cache
+def _graphics() -> tuple[ModuleType, Any]:
+    """pyrender and its one renderer. Deleting one cuts off all others, so none is deleted and none added."""
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    if not hasattr(np, "infty"):
+        setattr(np, "infty", np.inf)  # noqa: B010 - pyrender 0.1.45 asks numpy 2 for what it dropped
+    try:
+        import pyrender
+
+        return pyrender, pyrender.OffscreenRenderer(64, 64)
+    except _no_graphics() as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise NoGraphicsError(f"no OpenGL without a window ({reason})") from error
+
+
+def _no_graphics() -> tuple[type[Exception], ...]:
+    """What a missing library, driver or display raises somewhere between Python and EGL."""
+    plain = (ImportError, OSError, AttributeError, AssertionError, ValueError, RuntimeError, TypeError)
+    try:
+        from OpenGL.error import Error
+    except (ImportError, AttributeError, TypeError):
+        return plain
+    return *plain, Error
