@@ -8,5 +8,16 @@ from controllers.inbetweening.infill import InfillSettings, infill
 from controllers.inbetweening.keyframes import Key, Keys
 from controllers.inbetweening.tween import tween
 
-__all__ = ["DenoiseSettings", "FollowSettings", "GenerateSettings", "InfillSettings", "Key", "Keys", "denoise",
-           "follow", "generate", "infill", "tween"]  # fmt: skip
+__all__ = [
+    "DenoiseSettings",
+    "FollowSettings",
+    "GenerateSettings",
+    "InfillSettings",
+    "Key",
+    "Keys",
+    "denoise",
+    "follow",
+    "generate",
+    "infill",
+    "tween",
+]

@@ -13,8 +13,13 @@ if TYPE_CHECKING:
     from mapctl.skeleton import Skeleton as Skeleton
 
 # torch takes a second to import; `mapctl --help` must not wait for it, so public names arrive on first use.
-_HOMES = {"load": "mapctl.formats", "Motion": "mapctl.motion", "Skeleton": "mapctl.skeleton",
-          "CANONICAL": "mapctl.skeleton", "curves": "mapctl.curves"}  # fmt: skip
+_HOMES = {
+    "load": "mapctl.formats",
+    "Motion": "mapctl.motion",
+    "Skeleton": "mapctl.skeleton",
+    "CANONICAL": "mapctl.skeleton",
+    "curves": "mapctl.curves",
+}
 
 
 def __getattr__(name: str):

@@ -59,14 +59,16 @@ class FeatureLayout:
         return features[..., self.slices[block]]
 
 
-LAYOUT = FeatureLayout((
-    ("root_displacement_heading", 2),  # x and z, metres per frame, in the previous frame's heading frame
-    ("heading_change", 1),  # radians per frame
-    ("root_height", 1),  # metres
-    ("root_tilt", 2),  # rotation vector (x, z) of what remains of the hips' rotation without its heading
-    ("joint_rotations", 3 * (CANONICAL.num_joints - 1)),  # rotation vectors in the parent's frame
-    ("contacts", 2),  # left and right toe planted, 0 or 1
-))  # fmt: skip
+LAYOUT = FeatureLayout(
+    (
+        ("root_displacement_heading", 2),  # x and z, metres per frame, in the previous frame's heading frame
+        ("heading_change", 1),  # radians per frame
+        ("root_height", 1),  # metres
+        ("root_tilt", 2),  # rotation vector (x, z) of what remains of the hips' rotation without its heading
+        ("joint_rotations", 3 * (CANONICAL.num_joints - 1)),  # rotation vectors in the parent's frame
+        ("contacts", 2),  # left and right toe planted, 0 or 1
+    )
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +162,14 @@ def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*b
     swap = [CANONICAL.index(mirrored_name(name)) - 1 for name in CANONICAL.names[1:]]
     vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))[..., swap, :]
     flip = features.new_tensor
-    return torch.cat([
-        LAYOUT.pick(features, "root_displacement_heading") * flip([-1.0, 1.0]),
-        -LAYOUT.pick(features, "heading_change"),
-        LAYOUT.pick(features, "root_height"),
-        LAYOUT.pick(features, "root_tilt") * flip([1.0, -1.0]),
-        (vectors * flip([1.0, -1.0, -1.0])).flatten(-2),
-        LAYOUT.pick(features, "contacts").flip(-1),
-    ], dim=-1)  # fmt: skip
+    return torch.cat(
+        [
+            LAYOUT.pick(features, "root_displacement_heading") * flip([-1.0, 1.0]),
+            -LAYOUT.pick(features, "heading_change"),
+            LAYOUT.pick(features, "root_height"),
+            LAYOUT.pick(features, "root_tilt") * flip([1.0, -1.0]),
+            (vectors * flip([1.0, -1.0, -1.0])).flatten(-2),
+            LAYOUT.pick(features, "contacts").flip(-1),
+        ],
+        dim=-1,
+    )

@@ -65,10 +65,16 @@ _SIDE = (
     r"|^{small}(?=femur|tibia|foot|toes|humerus|radius|wrist|hand|fingers|thumb|clavicle|hipjoint)"
 )
 _SIDES = tuple(
-    (side, re.compile(_SIDE.format(word=word, title=word.title(), upper=word.upper(),
-                                   letter=word[0] + word[0].upper(), small=word[0])))
+    (
+        side,
+        re.compile(
+            _SIDE.format(
+                word=word, title=word.title(), upper=word.upper(), letter=word[0] + word[0].upper(), small=word[0]
+            )
+        ),
+    )
     for side, word in ((Side.LEFT, "left"), (Side.RIGHT, "right"))
-)  # fmt: skip
+)
 
 
 def role(name: str) -> Role:

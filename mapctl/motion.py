@@ -85,8 +85,12 @@ class Motion:
         travelling = sorted({*self.moving_offsets, *other.moving_offsets})
         moving = {j: torch.cat([self._offset(j), other._offset(j)]) for j in travelling}
         root = torch.cat([self.root_position, other.root_position])
-        return replace(self, root_position=root, moving_offsets=moving,
-                       local_quat_xyzw=torch.cat([self.local_quat_xyzw, other.local_quat_xyzw]))  # fmt: skip
+        return replace(
+            self,
+            root_position=root,
+            moving_offsets=moving,
+            local_quat_xyzw=torch.cat([self.local_quat_xyzw, other.local_quat_xyzw]),
+        )
 
     def resample(self, fps: Fraction | float) -> "Motion":
         """The motion at another frame rate: positions linear, rotations slerp; the first frame stays.
@@ -108,9 +112,13 @@ class Motion:
 
         quat = self.local_quat_xyzw
         joint_weight = weight.unsqueeze(-1).expand(count, self.num_joints)
-        return replace(self, fps=fps, root_position=linear(self.root_position),
-                       local_quat_xyzw=rotations.slerp(quat[low], quat[high], joint_weight),
-                       moving_offsets={j: linear(v) for j, v in self.moving_offsets.items()})  # fmt: skip
+        return replace(
+            self,
+            fps=fps,
+            root_position=linear(self.root_position),
+            local_quat_xyzw=rotations.slerp(quat[low], quat[high], joint_weight),
+            moving_offsets={j: linear(v) for j, v in self.moving_offsets.items()},
+        )
 
     def mirror(self) -> "Motion":
         """Left and right exchanged through the plane x = 0; for canonical joint frames and names.
@@ -125,8 +133,14 @@ class Motion:
         ends = {mirrored_name(n): (-x, y, z) for n, (x, y, z) in self.skeleton.end_offsets.items()}
         skeleton = Skeleton(names, self.skeleton.parents, self.skeleton.offsets[swap] * flip, ends)
         moving = {swap[j]: v * flip for j, v in self.moving_offsets.items()}
-        return replace(self, skeleton=skeleton, root_position=self.root_position * flip, moving_offsets=moving,
-                       local_quat_xyzw=self.local_quat_xyzw[:, swap] * flip_quat, source=None)  # fmt: skip
+        return replace(
+            self,
+            skeleton=skeleton,
+            root_position=self.root_position * flip,
+            moving_offsets=moving,
+            local_quat_xyzw=self.local_quat_xyzw[:, swap] * flip_quat,
+            source=None,
+        )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the motion in the format that the path's ending names."""
@@ -140,5 +154,9 @@ class Motion:
 
     def _with_frames(self, pick) -> "Motion":
         moving = {j: pick(v) for j, v in self.moving_offsets.items()}
-        return replace(self, root_position=pick(self.root_position), moving_offsets=moving,
-                       local_quat_xyzw=pick(self.local_quat_xyzw))  # fmt: skip
+        return replace(
+            self,
+            root_position=pick(self.root_position),
+            moving_offsets=moving,
+            local_quat_xyzw=pick(self.local_quat_xyzw),
+        )

@@ -22,9 +22,14 @@ _PACKAGES = ("torch", "numpy", "scipy", "numba")
 
 
 def build(
-    solution: Solution, *, request: Mapping[str, Any], seed: int, measures: Mapping[str, float],
-    seconds: float, prior: Mapping[str, Any],
-) -> dict[str, Any]:  # fmt: skip
+    solution: Solution,
+    *,
+    request: Mapping[str, Any],
+    seed: int,
+    measures: Mapping[str, float],
+    seconds: float,
+    prior: Mapping[str, Any],
+) -> dict[str, Any]:
     """Everything about one solve; `seconds` is its wall clock, `prior` its name, licence and quality.
 
     Keys: mapctl, request, seed, versions, prior, status, motion, ledger, measures, mocap, timing.
@@ -111,12 +116,7 @@ def peak_memory_mb() -> float | None:
 def versions() -> dict[str, str]:
     """Of mapctl, Python and the packages that decide the numbers, and the platform."""
     installed = {name: metadata.version(name) for name in _PACKAGES}
-    return {
-        "mapctl": __version__,
-        "python": platform.python_version(),
-        **installed,
-        "platform": platform.platform(),
-    }
+    return {"mapctl": __version__, "python": platform.python_version(), **installed, "platform": platform.platform()}
 
 
 def _finite(values: Any) -> Any:

@@ -71,14 +71,32 @@ class Skeleton:
 # Bones of the canonical skeleton: joint, parent, offset in centimetres in the T-pose, facing +Z, left toward +X.
 # The lengths are those of the Bandai Namco performer, so that the bundled prior needs no rescaling. Its feet stand
 # flat with the ankle 11.74 cm and the toe joint 4.25 cm above the floor (1st percentiles over its walks).
-_LEFT_ARM = (("Shoulder", "chest", (4.98, 12.99, -0.24)), ("UpperArm", "Shoulder", (5.35, 0, 0)),
-             ("LowerArm", "UpperArm", (24.33, 0, 0)), ("Hand", "LowerArm", (22.29, 0, 0)))  # fmt: skip
-_LEFT_LEG = (("UpperLeg", "hips", (6.47, -2.19, 0)), ("LowerLeg", "UpperLeg", (0, -39.08, 0)),
-             ("Foot", "LowerLeg", (0, -40.99, 0)), ("Toes", "Foot", (0, -7.49, 9.06)))  # fmt: skip
-_SPINE = (("hips", "", (0, 0, 0)), ("spine", "hips", (0, 15.74, 0)), ("chest", "spine", (0, 8.98, -0.41)),
-          ("neck", "chest", (0, 16.38, 0)), ("head", "neck", (0, 6.46, 0)))  # fmt: skip
-_ENDS = {"head": (0.0, 0.17, 0.0), "leftHand": (0.17, 0.0, 0.0), "rightHand": (-0.17, 0.0, 0.0),
-         "leftToes": (0.0, -0.01, 0.07), "rightToes": (0.0, -0.01, 0.07)}  # fmt: skip
+_LEFT_ARM = (
+    ("Shoulder", "chest", (4.98, 12.99, -0.24)),
+    ("UpperArm", "Shoulder", (5.35, 0, 0)),
+    ("LowerArm", "UpperArm", (24.33, 0, 0)),
+    ("Hand", "LowerArm", (22.29, 0, 0)),
+)
+_LEFT_LEG = (
+    ("UpperLeg", "hips", (6.47, -2.19, 0)),
+    ("LowerLeg", "UpperLeg", (0, -39.08, 0)),
+    ("Foot", "LowerLeg", (0, -40.99, 0)),
+    ("Toes", "Foot", (0, -7.49, 9.06)),
+)
+_SPINE = (
+    ("hips", "", (0, 0, 0)),
+    ("spine", "hips", (0, 15.74, 0)),
+    ("chest", "spine", (0, 8.98, -0.41)),
+    ("neck", "chest", (0, 16.38, 0)),
+    ("head", "neck", (0, 6.46, 0)),
+)
+_ENDS = {
+    "head": (0.0, 0.17, 0.0),
+    "leftHand": (0.17, 0.0, 0.0),
+    "rightHand": (-0.17, 0.0, 0.0),
+    "leftToes": (0.0, -0.01, 0.07),
+    "rightToes": (0.0, -0.01, 0.07),
+}
 
 
 def _canonical() -> Skeleton:

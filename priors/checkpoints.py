@@ -57,8 +57,10 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
     CheckpointError, and nothing written, for a card that holds NaN or infinity, which JSON does not know.
     """
     text = as_json(vars(card), path, indent=1)
-    kept = {name: t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t
-            for name, t in tensors.items()}  # fmt: skip
+    kept = {
+        name: t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t
+        for name, t in tensors.items()
+    }
     # The card is written first and renamed last: a full disk leaves neither file, nor one that fits no other.
     with atomic_path(path.with_suffix(".json")) as scratch:
         scratch.write_text(text, encoding="utf-8")

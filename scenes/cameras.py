@@ -76,10 +76,7 @@ class View:
         depth = -local[..., 2]
         focal = self.height / 2 / np.tan(self.fov / 2)
         safe = np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-        right, down = (
-            local[..., 0] / safe * focal + self.width / 2,
-            -local[..., 1] / safe * focal + self.height / 2,
-        )
+        right, down = (local[..., 0] / safe * focal + self.width / 2, -local[..., 1] / safe * focal + self.height / 2)
         return np.stack([right, down, depth], axis=-1)
 
 

@@ -87,9 +87,13 @@ def frames(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int
 
 
 def _shoot(
-    paths: Sequence[Path], stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int],
+    paths: Sequence[Path],
+    stage: Stage,
+    brush: Painter,
+    camera: CameraSettings,
+    size: tuple[int, int],
     progress: Callable[[int, int], None] | None,
-) -> None:  # fmt: skip
+) -> None:
     with ExitStack() as open_files:
         writers: list[Any] = []
         for path in paths:

@@ -8,14 +8,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 # Name, parent, direction, length in metres and the turns it has; in a T-pose facing +Z, left toward +X.
-_LEG = (("hipjoint", "root", (0.6, -0.8, 0), 0.11, ""), ("femur", "hipjoint", (0.1, -0.995, 0), 0.42, "xyz"),
-        ("tibia", "femur", (0.1, -0.99, 0.1), 0.41, "x"), ("foot", "tibia", (0.1, -0.5, 0.86), 0.15, "xz"),
-        ("toes", "foot", (0, -0.1, 0.99), 0.07, "x"))  # fmt: skip
-_ARM = (("clavicle", "thorax", (0.9, 0.4, 0), 0.17, "yz"), ("humerus", "clavicle", (1, 0, 0), 0.29, "xyz"),
-        ("radius", "humerus", (1, 0, 0), 0.18, "x"), ("wrist", "radius", (1, 0, 0), 0.09, "y"),
-        ("hand", "wrist", (1, 0, 0), 0.08, "xz"))  # fmt: skip
-_SPINE = (("lowerback", "root", (0, 1, -0.1), 0.12, "xyz"), ("thorax", "lowerback", (0, 1, 0.1), 0.22, "zyx"),
-          ("head", "thorax", (0, 1, 0.1), 0.2, "yxz"))  # fmt: skip
+_LEG = (
+    ("hipjoint", "root", (0.6, -0.8, 0), 0.11, ""),
+    ("femur", "hipjoint", (0.1, -0.995, 0), 0.42, "xyz"),
+    ("tibia", "femur", (0.1, -0.99, 0.1), 0.41, "x"),
+    ("foot", "tibia", (0.1, -0.5, 0.86), 0.15, "xz"),
+    ("toes", "foot", (0, -0.1, 0.99), 0.07, "x"),
+)
+_ARM = (
+    ("clavicle", "thorax", (0.9, 0.4, 0), 0.17, "yz"),
+    ("humerus", "clavicle", (1, 0, 0), 0.29, "xyz"),
+    ("radius", "humerus", (1, 0, 0), 0.18, "x"),
+    ("wrist", "radius", (1, 0, 0), 0.09, "y"),
+    ("hand", "wrist", (1, 0, 0), 0.08, "xz"),
+)
+_SPINE = (
+    ("lowerback", "root", (0, 1, -0.1), 0.12, "xyz"),
+    ("thorax", "lowerback", (0, 1, 0.1), 0.22, "zyx"),
+    ("head", "thorax", (0, 1, 0.1), 0.2, "yxz"),
+)
 _UNIT = 0.0254 / 0.45
 
 
@@ -163,8 +174,17 @@ def _person(random: np.random.Generator) -> tuple[Bone, ...]:
         vector = np.array(direction) * (sign, 1, 1)
         above = parent if parent in ("root", "thorax", "lowerback") else side + parent
         order = "".join(random.permutation(list("xyz")))
-        bones.append(Bone(side + name, above, vector / np.linalg.norm(vector), round(length / _UNIT, 6),
-                          random.uniform(-90, 90, 3).round(3), order, dof))  # fmt: skip
+        bones.append(
+            Bone(
+                side + name,
+                above,
+                vector / np.linalg.norm(vector),
+                round(length / _UNIT, 6),
+                random.uniform(-90, 90, 3).round(3),
+                order,
+                dof,
+            )
+        )
     return tuple(bones)
 
 

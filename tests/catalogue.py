@@ -36,9 +36,14 @@ _SEEN = encode(walk(30, cadence=1.2, seed=5))[0][4 : 4 + FRAMES]
 _MASK = torch.arange(FRAMES)[:, None] % (2 + torch.arange(21)) != 1
 _OBSERVED = Observation(
     torch.tensor([[0.1, 0.9, 0.2]]).double() + 0.04 * torch.arange(FRAMES).double()[:, None],
-    0.2 + 0.3 * torch.arange(FRAMES).double(), _SEEN[:, 4:66], _MASK[:, 3], _MASK, 0.02,
-    torch.linspace(0.05, 0.2, 21), outlier=1.5,
-)  # fmt: skip
+    0.2 + 0.3 * torch.arange(FRAMES).double(),
+    _SEEN[:, 4:66],
+    _MASK[:, 3],
+    _MASK,
+    0.02,
+    torch.linspace(0.05, 0.2, 21),
+    outlier=1.5,
+)
 
 TERMS: dict[str, Term] = {
     "likelihood": Likelihood(temperature=2.0),

@@ -96,8 +96,10 @@ def check_acclaim(path: Path) -> None:
     """As many frames as lines with a number alone, as many joints as bones and the root."""
     motion = formats.load(path)
     check_motion(motion)
-    lines = [line.partition("#")[0].replace(",", " ").replace("(", " ").replace(")", " ").split()
-             for line in plain(path).split("\n")]  # fmt: skip
+    lines = [
+        line.partition("#")[0].replace(",", " ").replace("(", " ").replace(")", " ").split()
+        for line in plain(path).split("\n")
+    ]
     said = sum(len(words) == 1 and words[0].isdigit() for words in lines)
     require(said == motion.num_frames, f"{said} frames in the text, {motion.num_frames} read")
     bones = plain(path.with_suffix(".asf")).partition(":bonedata")[2].partition(":hierarchy")[0]
@@ -149,10 +151,15 @@ def check_masks(path: Path) -> None:
 
 
 READERS: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "bvh": ("x.bvh", check_bvh), "amc": ("x.amc", check_acclaim), "asf": ("x.amc", check_acclaim),
-    "npz": ("x.npz", check_npz), "commands": ("x.csv", check_commands), "curve": ("x.csv", check_curve),
-    "svg": ("x.svg", check_svg), "masks": ("x.csv", check_masks),
-}  # fmt: skip
+    "bvh": ("x.bvh", check_bvh),
+    "amc": ("x.amc", check_acclaim),
+    "asf": ("x.amc", check_acclaim),
+    "npz": ("x.npz", check_npz),
+    "commands": ("x.csv", check_commands),
+    "curve": ("x.csv", check_curve),
+    "svg": ("x.svg", check_svg),
+    "masks": ("x.csv", check_masks),
+}
 """By kind of file, its name on disk and what reads and checks it."""
 
 
@@ -250,13 +257,22 @@ def _forged(raw: bytes, random: np.random.Generator) -> bytes:
     old = arrays[key]
     odd = (np.nan, np.inf, 1e308, -1e308, 0.0, 1e9, -1.0, 2.0**63)
     changes: tuple[Callable[[], np.ndarray | None], ...] = (
-        lambda: None, lambda: old[..., None], lambda: old.reshape(-1), lambda: old[:0] if old.ndim else old,
-        lambda: np.concatenate([old, old]) if old.ndim else old, lambda: old.astype(np.complex128, casting="unsafe"),
-        lambda: old.astype(np.float16), lambda: old.astype(object), lambda: np.array("x" * 500),
-        lambda: np.zeros((2**20, 3)), lambda: np.array(7), lambda: old.astype(">f8"), lambda: np.flip(old),
+        lambda: None,
+        lambda: old[..., None],
+        lambda: old.reshape(-1),
+        lambda: old[:0] if old.ndim else old,
+        lambda: np.concatenate([old, old]) if old.ndim else old,
+        lambda: old.astype(np.complex128, casting="unsafe"),
+        lambda: old.astype(np.float16),
+        lambda: old.astype(object),
+        lambda: np.array("x" * 500),
+        lambda: np.zeros((2**20, 3)),
+        lambda: np.array(7),
+        lambda: old.astype(">f8"),
+        lambda: np.flip(old),
         lambda: _with(old, odd[int(random.integers(len(odd)))], random),
         lambda: _with(old, odd[int(random.integers(len(odd)))], random),
-    )  # fmt: skip
+    )
     try:
         new = changes[int(random.integers(len(changes)))]()
     except (ValueError, TypeError):  # as text to numbers
@@ -333,8 +349,11 @@ def _made() -> Iterator[Specimen]:
 
 _TABLES = (
     ("commands", "time_s,speed_mps,heading_deg\n0,1.2,0\n2,0.5,90\n4.5,0,-90\n"),
-    ("commands", "time_s,speed_mps,heading_deg,facing_deg,turn_deg_s,step_m,gait,style\n"
-                 "0,1,0,,,,walk,\n1,1,10,5,,0.6,,old\n3,2,20,,15,,run,\n"),
+    (
+        "commands",
+        "time_s,speed_mps,heading_deg,facing_deg,turn_deg_s,step_m,gait,style\n"
+        "0,1,0,,,,walk,\n1,1,10,5,,0.6,,old\n3,2,20,,15,,run,\n",
+    ),
     ("curve", "x,z\n0,0\n1,0.5\n2,0.25\n3,1\n"),
     ("curve", "# drawn by hand\nz;y;x\n0,5;0;1\n1;0;2,5\n"),
     ("curve", "0 0\n1 1\n2 4\n3 9\n"),
@@ -345,7 +364,7 @@ _TABLES = (
     ("svg", '<svg><g transform="translate(10 20) rotate(30)"><path d="M0,0 Q50,50 100,0 T200,0"/></g></svg>'),
     ("svg", '<svg><polyline points="0,0 10,10 20,0"/></svg>'),
     ("svg", '<svg><circle cx="0" cy="0" r="200" transform="scale(2)"/></svg>'),
-)  # fmt: skip
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -100,7 +100,7 @@ COMMANDS = {
     "train lstm-gmm, paper": "train lstm-gmm --data data -o paper --steps 2 --batch 2 --window 20 --width 8 --seed 2"
     " --paper",
     "train infiller, image": "train infiller --data data -o image --steps 1 --batch 2 --window 32 --architecture image",
-}  # fmt: skip
+}
 """By name, a command line that is run in the folder `prepare` makes, one after the other."""
 
 
@@ -214,8 +214,9 @@ def _near(ours: dict, theirs: dict) -> bool:
     if ours["count"] != theirs["count"]:
         return False
     room = 0.05 * theirs["rms"] + 1e-6
-    return all(abs(a - b) <= room for a, b in zip([ours["rms"], *ours["some"]], [theirs["rms"], *theirs["some"]],
-                                                  strict=True))  # fmt: skip
+    return all(
+        abs(a - b) <= room for a, b in zip([ours["rms"], *ours["some"]], [theirs["rms"], *theirs["some"]], strict=True)
+    )
 
 
 def main() -> None:

@@ -67,12 +67,7 @@ def _swing(phase: Tensor, seed: int) -> Tensor:
     for side, sign in (("left", 1.0), ("right", -1.0)):
         swing = -sign * STRIDE * torch.sin(phase)
         knee = 0.6 * torch.clamp(sign * torch.cos(phase), min=0) ** 2
-        for joint, angle in (
-            ("UpperLeg", swing),
-            ("LowerLeg", knee),
-            ("Foot", -swing - knee),
-            ("LowerArm", 0 * knee),
-        ):
+        for joint, angle in (("UpperLeg", swing), ("LowerLeg", knee), ("Foot", -swing - knee), ("LowerArm", 0 * knee)):
             vectors[:, CANONICAL.index(side + joint), 0] = angle
         vectors[:, CANONICAL.index(side + "UpperArm"), 2] -= sign * 1.2
     return vectors
@@ -132,8 +127,10 @@ def cmu_skeleton() -> Skeleton:
     rig = next(r for r in rigs.known() if r.name == "cmu-daz")
     kept = [name for name in CANONICAL.names if name in rig.joints]
     names = [rig.joints[name] for name in kept]
-    parents = [kept.index(CANONICAL.names[p]) if p >= 0 else -1 for p in
-               (CANONICAL.parents[CANONICAL.index(name)] for name in kept)]  # fmt: skip
+    parents = [
+        kept.index(CANONICAL.names[p]) if p >= 0 else -1
+        for p in (CANONICAL.parents[CANONICAL.index(name)] for name in kept)
+    ]
     offsets = torch.stack([CANONICAL.offsets[CANONICAL.index(name)] for name in kept])
     bend = torch.tensor([0.0, -0.017, 0.03], dtype=torch.float64)
     for limb in ("LowerArm", "Hand", "LowerLeg", "Foot"):
@@ -160,8 +157,15 @@ def write_corpus(folder: Path, count: int = 5, frames: int = 80) -> Path:
     return folder
 
 
-def tiny_model(*, width: int = 8, components: int = 3, seed: int = 0, retain: float = 0.9,
-               correlated: bool = True, dtype: torch.dtype = torch.float32) -> LstmGmm:  # fmt: skip
+def tiny_model(
+    *,
+    width: int = 8,
+    components: int = 3,
+    seed: int = 0,
+    retain: float = 0.9,
+    correlated: bool = True,
+    dtype: torch.dtype = torch.float32,
+) -> LstmGmm:
     """An untrained network with the statistics of the walks: it walks on at their mean pose and speed."""
     mean, std = statistics(corpus().features)
     with torch.random.fork_rng():
@@ -171,8 +175,9 @@ def tiny_model(*, width: int = 8, components: int = 3, seed: int = 0, retain: fl
     return model.to(dtype).eval().requires_grad_(False)
 
 
-def tiny_density(*, width: int = 8, components: int = 3, seed: int = 0, starts: int = 4,
-                 dtype: torch.dtype = torch.float32) -> LstmGmmDensity:  # fmt: skip
+def tiny_density(
+    *, width: int = 8, components: int = 3, seed: int = 0, starts: int = 4, dtype: torch.dtype = torch.float32
+) -> LstmGmmDensity:
     """The network as the solver takes it, on the reference path, with starts from the walks."""
     model = tiny_model(width=width, components=components, seed=seed)
     data = corpus()
@@ -193,8 +198,15 @@ def walking_trial(frames: int) -> Trial:
     ground, heading = root_places(vectors[:2], start)
     nothing = torch.zeros(1, frames, 1).double()
     bits = torch.zeros(1, frames, 2, dtype=torch.bool)
-    return Trial(vectors[None, 2:], Place(ground[-1], heading[-1]), nothing, nothing[..., 0], bits,
-                 motion.joint_positions()[:2], contacts_before=bits[0, 0])  # fmt: skip
+    return Trial(
+        vectors[None, 2:],
+        Place(ground[-1], heading[-1]),
+        nothing,
+        nothing[..., 0],
+        bits,
+        motion.joint_positions()[:2],
+        contacts_before=bits[0, 0],
+    )
 
 
 def noise(batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Float[Tensor, "b f c"]:

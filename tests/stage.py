@@ -14,9 +14,19 @@ def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> Deliver
     """Some frames of a walk, due now."""
     motion = walk(90).slice(first, first + count)
     joints = motion.joint_positions().numpy()
-    return Delivered(time.perf_counter(), first / 30, motion.root_position.numpy(), motion.local_quat_xyzw.numpy(),
-                     np.tile([1.0, 0.0], (count, 1)), joints, (0.0, 1.2), {"noise": 1.0, "travel": 0.5}, spare,
-                     0.05, 12)  # fmt: skip
+    return Delivered(
+        time.perf_counter(),
+        first / 30,
+        motion.root_position.numpy(),
+        motion.local_quat_xyzw.numpy(),
+        np.tile([1.0, 0.0], (count, 1)),
+        joints,
+        (0.0, 1.2),
+        {"noise": 1.0, "travel": 0.5},
+        spare,
+        0.05,
+        12,
+    )
 
 
 class Actor:

@@ -129,11 +129,7 @@ def test_right_imports_pass(file, source):
 
 def test_unsafe_lines_are_seen():
     source = "try:\n    torch.load(p)\nexcept:\n    np.load(p, allow_pickle=True)"
-    assert {fault.split(":")[0] for fault in content_faults(ast.parse(source))} == {
-        "line 2",
-        "line 3",
-        "line 4",
-    }
+    assert {fault.split(":")[0] for fault in content_faults(ast.parse(source))} == {"line 2", "line 3", "line 4"}
 
 
 def requirements() -> dict[str, list[str]]:

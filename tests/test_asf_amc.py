@@ -221,7 +221,7 @@ ASF = {
     "root as child": ("thorax head", "thorax head root", "thorax head root", "'root' has a second parent"),
     "loose bone": ("thorax head", "thorax", "begin\n     id 3", "'head' does not hang on the root"),
     "loop": ("    root lowerback", "    thorax lowerback\n    root", "begin\n     id 1\n", "'lowerback' does not hang"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", ASF)
@@ -268,7 +268,7 @@ AMC = {
     "rate missing": (":DEGREES", ":DEGREES\n:SAMPLES-PER-SECOND", 4, "samples a second"),
     "bone left out": ("\nhead", "\n#", 27, "not every frame up to 2 holds 'head'"),
     "root left out": ("\nroot", "\n#", 4, "frame 1 has no line for the root"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", AMC)

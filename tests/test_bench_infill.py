@@ -15,8 +15,13 @@ from mapctl.inbetweening import Proposed
 from priors import checkpoints
 from priors.infiller.network import ConvInfiller
 
-SOME = (Task("nothing missing", 40), Task("gap", 40, 10), Task("noise", 40, noise=0.03),
-        Task("dropped", 40, dropout=0.4), Task("longer than any", 400, 10))  # fmt: skip
+SOME = (
+    Task("nothing missing", 40),
+    Task("gap", 40, 10),
+    Task("noise", 40, noise=0.03),
+    Task("dropped", 40, dropout=0.4),
+    Task("longer than any", 400, 10),
+)
 COLUMNS = {"task", "clips", "method", "error_cm", "std_cm", "bones_mm"}
 
 
@@ -46,8 +51,12 @@ def rows():
     networks, told = {"skips": tiny_infiller(drawn=0.1), "vanilla": vanilla()}, []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(infilling, "TASKS", SOME)
-        rows = table([walk(40, turn_rate=-1.0, seed=2)], networks, ours="skips",
-                     progress=lambda done, of: told.append((done, of)))  # fmt: skip
+        rows = table(
+            [walk(40, turn_rate=-1.0, seed=2)],
+            networks,
+            ours="skips",
+            progress=lambda done, of: told.append((done, of)),
+        )
     assert told == [(number + 1, len(SOME)) for number in range(len(SOME))]
     return rows
 
@@ -124,8 +133,11 @@ def test_the_papers_tasks_are_there():
 
 def test_clips_come_to_canonical_bones_and_the_priors_rate_from_any_size():
     motion = walk(120, fps=60)
-    large = replace(motion, skeleton=replace(motion.skeleton, offsets=1.3 * motion.skeleton.offsets),
-                    root_position=1.3 * motion.root_position)  # fmt: skip
+    large = replace(
+        motion,
+        skeleton=replace(motion.skeleton, offsets=1.3 * motion.skeleton.offsets),
+        root_position=1.3 * motion.root_position,
+    )
     first, second = (on_canonical_bones(each) for each in (motion, large))
     assert (first.num_frames, float(first.fps)) == (60, 30)
     assert torch.allclose(first.joint_positions(), second.joint_positions(), atol=1e-9)
@@ -159,10 +171,13 @@ def test_the_command_compares_networks_on_the_clips_kept_from_training(folder, c
     assert drawn["bones_mm"] > 100 * plain["bones_mm"]
 
 
-@pytest.mark.parametrize(("data", "said"), [
-    (None, "bench infill compares with mocap: name the training data's folder with --data"),
-    ("empty", "does not hold the clips kept from training"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (None, "bench infill compares with mocap: name the training data's folder with --data"),
+        ("empty", "does not hold the clips kept from training"),
+    ],
+)
 def test_the_clips_kept_from_training_are_asked_for(folder, capsys, data, said):
     (folder / "empty").mkdir()
     words = [] if data is None else ["--data", folder / data]

@@ -14,9 +14,11 @@ def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough():
     rows = table(kinds, tiny_infiller(drawn=0.02), [tiny_density()], progress=lambda *at: seen.append(at))
     assert seen == [(1, 2), (2, 2)]
     assert [(row["kind"], row["what"], row["by"]) for row in rows] == [
-        ("walks", "keys", "chosen"), ("walks", "keys", "rolled"), ("walks", "keys", "best of 4"),
+        ("walks", "keys", "chosen"),
+        ("walks", "keys", "rolled"),
+        ("walks", "keys", "best of 4"),
         *(("walks", f"end of {count} frames", by) for count in (30, 60) for by in ("infiller", "density")),
-    ]  # fmt: skip
+    ]
     for row in rows[:2]:
         assert row["key_mm"] == 0
         assert row["error_cm"] > 0

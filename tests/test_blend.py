@@ -63,9 +63,10 @@ def test_frames_are_the_other_clips_own(own, other, asked):
     torch.testing.assert_close(asked["seconds"], wanted, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (("--frames", "60:120", "--at", "10"), (60, 120, 10)), (("--frames", "0.5s:1s", "--at", "1s"), (60, 120, 30)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("--frames", "60:120", "--at", "10"), (60, 120, 10)), (("--frames", "0.5s:1s", "--at", "1s"), (60, 120, 30))],
+)
 def test_the_command_counts_so_too(words, said, tmp_path, monkeypatch):
     waving(30).save(tmp_path / "in.bvh")
     waving(120).save(tmp_path / "other.bvh")
@@ -103,8 +104,13 @@ def peaks_of(motion):
 def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
     """README's figures: 20 frames of a raised arm at frame 70 of a walk, without the jumps of 85 cm that there were."""
     motion, source = walk(4 * fps, fps=fps), waving(30)
-    done = blend(motion, source, Borrowed(("leftHand",), 8, 28, 70 * fps // 30, margin=margin), tiny_infiller(),
-                 settings=InfillSettings(method="infiller"))  # fmt: skip
+    done = blend(
+        motion,
+        source,
+        Borrowed(("leftHand",), 8, 28, 70 * fps // 30, margin=margin),
+        tiny_infiller(),
+        settings=InfillSettings(method="infiller"),
+    )
     own, theirs, made = peaks_of(motion), peaks_of(source), peaks_of(done.motion)
     assert made.step < max(1.3 * max(own.step, theirs.step), 0.17)
     assert made.acceleration < max(1.5 * max(own.acceleration, theirs.acceleration), 60)
@@ -113,8 +119,13 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
 
 def test_a_limb_that_is_hurried_is_named_with_numbers_and_bends_as_it_did():
     motion, source = walk(120), waving(30)
-    done = blend(motion, source, Borrowed(("leftHand",), 8, 28, 70, margin=0.1), tiny_infiller(),
-                 settings=InfillSettings(method="infiller"))  # fmt: skip
+    done = blend(
+        motion,
+        source,
+        Borrowed(("leftHand",), 8, 28, 70, margin=0.1),
+        tiny_infiller(),
+        settings=InfillSettings(method="infiller"),
+    )
     assert any(
         "leftHand goes " in note and "80 is the most that is common: a margin of " in note for note in done.notes
     )

@@ -7,10 +7,7 @@ from mapctl.joint_parts import Part, Role, Side, role, roles
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
 NAMES = {
-    (
-        Side.LEFT,
-        Part.UPPER_LEG,
-    ): "leftUpperLeg LeftUpLeg UpperLeg_L lThigh lfemur mixamorig:LeftUpLeg L_Thigh thigh.L",
+    (Side.LEFT, Part.UPPER_LEG): "leftUpperLeg LeftUpLeg UpperLeg_L lThigh lfemur mixamorig:LeftUpLeg L_Thigh thigh.L",
     (Side.RIGHT, Part.LOWER_LEG): "rightLowerLeg RightLeg LowerLeg_R rShin rtibia RightKnee Bip01_R_Calf",
     (Side.LEFT, Part.UPPER_ARM): "leftUpperArm LeftArm UpperArm_L lShldr lhumerus upper_arm.L",
     (Side.RIGHT, Part.LOWER_ARM): "rightLowerArm RightForeArm LowerArm_R rForeArm rradius RightElbow",

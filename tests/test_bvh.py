@@ -51,10 +51,7 @@ Frame Time: 0.0333333
 
 def world(tree, values):
     """World positions (frames, joints, 3) and matrices, straight from the definition of the channels."""
-    places, turns = (
-        np.zeros((len(values), len(tree.names), 3)),
-        np.zeros((len(values), len(tree.names), 3, 3)),
-    )
+    places, turns = (np.zeros((len(values), len(tree.names), 3)), np.zeros((len(values), len(tree.names), 3, 3)))
     for frame, row in enumerate(values):
         numbers = iter(row)
         for joint, parent in enumerate(tree.parents):
@@ -319,9 +316,16 @@ def test_a_frame_rate_out_of_range_is_refused(fps, tmp_path):
 
 def test_a_long_capture_is_read_and_written_quickly(tmp_path):
     names = tuple(f"joint{j}" for j in range(31))
-    tree = bvh_text.Hierarchy(names, tuple(range(-1, 30)), ((0.0, 5.0, 0.0),) * 31,
-                              (("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation"),
-                               *[("Zrotation", "Xrotation", "Yrotation")] * 30), {})  # fmt: skip
+    tree = bvh_text.Hierarchy(
+        names,
+        tuple(range(-1, 30)),
+        ((0.0, 5.0, 0.0),) * 31,
+        (
+            ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation"),
+            *[("Zrotation", "Xrotation", "Yrotation")] * 30,
+        ),
+        {},
+    )
     values = np.random.default_rng(0).uniform(-180, 180, (5000, 96))
     (tmp_path / "in.bvh").write_text(bvh_text.compose(tree, "0.00833333", values, decimals=6))
     start = time.perf_counter()

@@ -101,9 +101,11 @@ BROKEN = {
     "two channel lists": (swap("    End", "    CHANNELS 0\n    End"), 10, "a second CHANNELS"),
     "unknown word": (swap("    End", "    LENGTH 4\n    End"), 10, "got 'LENGTH'"),
     "no channels at all": (
-        "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 0 }\nMOTION\nFrames: 1\nFrame Time: 0.1\n\n", 4, "CHANNELS",
+        "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 0 }\nMOTION\nFrames: 1\nFrame Time: 0.1\n\n",
+        4,
+        "CHANNELS",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BROKEN)
@@ -186,19 +188,7 @@ def test_a_declared_count_allocates_nothing(tmp_path):
 
 def mutated(random: np.random.Generator) -> bytes:
     """The good file with a few bytes replaced, removed or repeated, or words exchanged for hostile ones."""
-    hostile = (
-        b"nan",
-        b"{",
-        b"}",
-        b"-1",
-        b"1e309",
-        b"End Site",
-        b"MOTION",
-        b"",
-        b"\xff",
-        b"JOINT",
-        b"99999999999",
-    )
+    hostile = (b"nan", b"{", b"}", b"-1", b"1e309", b"End Site", b"MOTION", b"", b"\xff", b"JOINT", b"99999999999")
     raw = GOOD.encode()
     for _ in range(random.integers(1, 4)):
         start = int(random.integers(len(raw)))

@@ -55,9 +55,12 @@ def test_nothing_seen_breaks_nothing():
 def capture_of(motion, seen=None, seen_root=None):
     everything = torch.ones(motion.num_frames, motion.num_joints, dtype=torch.bool)
     return Capture.of_motion(
-        motion, seen=everything if seen is None else seen, seen_root=everything[:, 0] if seen_root is None else
-        seen_root, sigma=torch.zeros(motion.num_joints), sigma_root=0.0,
-    )  # fmt: skip
+        motion,
+        seen=everything if seen is None else seen,
+        seen_root=everything[:, 0] if seen_root is None else seen_root,
+        sigma=torch.zeros(motion.num_joints),
+        sigma_root=0.0,
+    )
 
 
 def test_rotation_vectors_near_a_half_turn_stay_continuous_and_mean_the_same():

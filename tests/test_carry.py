@@ -193,8 +193,9 @@ def test_hips_that_shake_do_not_shake_others_more():
 def test_a_clip_on_a_platform_stays_there():
     clip = USUAL.walks()
     high = replace(clip, root_position=clip.root_position + torch.tensor([0.0, 1.0, 0.0]).double())
-    torch.testing.assert_close(low_toes(carry(high, PEOPLE["tall"].body()).motion), torch.full((2,), 1.02).double(),
-                               atol=0.012, rtol=0)  # fmt: skip
+    torch.testing.assert_close(
+        low_toes(carry(high, PEOPLE["tall"].body()).motion), torch.full((2,), 1.02).double(), atol=0.012, rtol=0
+    )
 
 
 def test_legs_that_cannot_reach_are_named_with_numbers():

@@ -76,14 +76,17 @@ def test_another_layout_is_refused_with_both_printed(tmp_path):
     assert str([list(block) for block in LAYOUT.blocks]) in message
 
 
-@pytest.mark.parametrize(("changes", "match"), [
-    ({"kind": "refiner"}, "a refiner is no density"),
-    ({"config": {**DENSITY.card.config, "width": 9}}, "do not fit its card"),
-    ({"config": {**DENSITY.card.config, "depth": 3}}, "do not fit its card"),
-    ({"config": {**DENSITY.card.config, "width": "wide"}}, "do not fit its card"),
-    ({"data": {}}, "do not fit its card"),
-    ({"abilities": {"fastest": 1.0}}, "do not fit its card"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"kind": "refiner"}, "a refiner is no density"),
+        ({"config": {**DENSITY.card.config, "width": 9}}, "do not fit its card"),
+        ({"config": {**DENSITY.card.config, "depth": 3}}, "do not fit its card"),
+        ({"config": {**DENSITY.card.config, "width": "wide"}}, "do not fit its card"),
+        ({"data": {}}, "do not fit its card"),
+        ({"abilities": {"fastest": 1.0}}, "do not fit its card"),
+    ],
+)
 def test_a_card_that_does_not_fit_is_refused(tmp_path, changes, match):
     refused(write(tmp_path, card=replace(DENSITY.card, **changes)), match=match)
 

@@ -112,8 +112,10 @@ def test_blur_widens_the_density_and_nothing_widens_it_by_nothing():
     away = features.clone()
     away[..., 10] += 0.3  # radians, far beyond what the walks show
     blurs = [tiny().blurred(times * density_selection.spread()) for times in (1, 30)]
-    costs = [float((density.log_prob(features[:, 1:], state) - density.log_prob(away[:, 1:], state)).mean())
-             for density in (tiny(), *blurs)]  # fmt: skip
+    costs = [
+        float((density.log_prob(features[:, 1:], state) - density.log_prob(away[:, 1:], state)).mean())
+        for density in (tiny(), *blurs)
+    ]
     assert costs[0] > costs[1] > costs[2] > 0
 
 

@@ -22,9 +22,16 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 
 TOES = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
-QUICK = ChoiceSettings(tempos=(1.0, 0.9), rolling=RolloutSettings(
-    temperature=0.0, trajectory=0.2, stage=30, ahead=4, method=LatentMethod(
-        rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=6))))  # fmt: skip
+QUICK = ChoiceSettings(
+    tempos=(1.0, 0.9),
+    rolling=RolloutSettings(
+        temperature=0.0,
+        trajectory=0.2,
+        stage=30,
+        ahead=4,
+        method=LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=6)),
+    ),
+)
 
 
 def gap_of(motion, start, stop):

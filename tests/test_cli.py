@@ -18,18 +18,7 @@ from mapctl.commands import COMMANDS
 from mapctl.commands.shared.options import parse_size
 from mapctl.commands.train import Train
 
-HEAVY = (
-    "torch",
-    "numpy",
-    "scipy",
-    "rich",
-    "pydantic",
-    "numba",
-    "pyrender",
-    "av",
-    "matplotlib",
-    "mapctl.formats",
-)
+HEAVY = ("torch", "numpy", "scipy", "rich", "pydantic", "numba", "pyrender", "av", "matplotlib", "mapctl.formats")
 
 
 @pytest.fixture(scope="session")
@@ -235,20 +224,7 @@ def test_info_names_what_is_here(prior, capsys):
 
 
 def test_train_takes_its_options(tmp_path):
-    words = [
-        "train",
-        "lstm-gmm",
-        "--data",
-        str(tmp_path),
-        "-o",
-        "run",
-        "--width",
-        "64",
-        "--steps",
-        "7",
-        "--seed",
-        "3",
-    ]
+    words = ["train", "lstm-gmm", "--data", str(tmp_path), "-o", "run", "--width", "64", "--steps", "7", "--seed", "3"]
     command = cli.parse([*words, "--match", "walk", "--device", "cpu", "--minutes-between-checkpoints", "0.5"])
     assert isinstance(command, Train)
     request = command.request()
@@ -280,8 +256,10 @@ def _ended(process: subprocess.Popen[str]) -> tuple[str, str]:
         raise
 
 
-@pytest.mark.parametrize(("number", "said"), [(signal.SIGINT, (130, "mapctl: interrupted\n")),
-                                              (signal.SIGTERM, (143, "mapctl: terminated\n"))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [(signal.SIGINT, (130, "mapctl: interrupted\n")), (signal.SIGTERM, (143, "mapctl: terminated\n"))],
+)
 def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
     """Ctrl-C or SIGTERM in the middle of hours of motion: no traceback, no file, no folder."""
     words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
@@ -377,10 +355,7 @@ def test_a_closed_pipe_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        [sys.executable, "-m", "mapctl.cli", "--version"],
-        stdout=writer,
-        stderr=subprocess.PIPE,
-        timeout=120,
+        [sys.executable, "-m", "mapctl.cli", "--version"], stdout=writer, stderr=subprocess.PIPE, timeout=120
     )
     os.close(writer)
     assert b"Traceback" not in done.stderr
@@ -389,8 +364,9 @@ def test_a_closed_pipe_is_no_error():
 
 def test_a_full_disk_for_what_is_printed_is_one_line():
     with Path("/dev/full").open("wb") as full:
-        done = subprocess.run([sys.executable, "-m", "mapctl.cli", "--version"], stdout=full, stderr=subprocess.PIPE,
-                              timeout=120)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-m", "mapctl.cli", "--version"], stdout=full, stderr=subprocess.PIPE, timeout=120
+        )
     assert (done.returncode, done.stderr) == (2, b"mapctl: input or output: No space left on device\n")
 
 

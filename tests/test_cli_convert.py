@@ -55,23 +55,29 @@ def test_a_capture_says_its_rate_on_the_command_line(here):
     np.testing.assert_allclose(motion.joint_positions(), mapctl.load("in.amc").joint_positions()[::2], atol=1e-9)
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (("gone.amc", "out.bvh"), "gone.amc: no such file"),
-    (("gone.asf+in.amc", "out.bvh"), "gone.asf: no such file"),
-    (("01.asf", "out.bvh"), "01.asf: is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"),
-    (("in.glb", "out.bvh"), "in.glb: can be written but not read; allowed: .bvh, .npz, .amc"),
-    (("in.usda", "out.bvh"), "can be written but not read"),
-    (("in.fbx", "out.bvh"), "cannot read the ending '.fbx'; allowed: .bvh, .npz, .amc"),
-    (("in", "out.bvh"), "cannot read the ending ''"),
-    (("in.bvh", "out.amc"), "cannot write out.amc: unknown ending '.amc'; allowed: .bvh, .npz, .glb, .usda"),
-    (("in.bvh", "out.npz", "--fps-in", "60"), "a .bvh file says its frame rate itself"),
-    (("in.amc", "out.npz", "--fps-in", "none"), "a frame rate is a number"),
-    (("in.amc", "out.npz", "--fps-in", "0"), "the frame rate must be 0.01 to 1000"),
-    (("broken.amc", "out.npz"), "broken.amc, line 1: expected the number of the first frame, got 'hello'"),
-    (("two/in.amc", "out.npz"), "beside it: 01.asf, 02.asf; name one as 01.asf+in.amc"),
-    (("objects.npz", "out.bvh"), "objects.npz: is not a sound .npz archive: Object arrays cannot be loaded"),
-    (("in.bvh", "gone/out.usda"), "the folder"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("gone.amc", "out.bvh"), "gone.amc: no such file"),
+        (("gone.asf+in.amc", "out.bvh"), "gone.asf: no such file"),
+        (
+            ("01.asf", "out.bvh"),
+            "01.asf: is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
+        ),
+        (("in.glb", "out.bvh"), "in.glb: can be written but not read; allowed: .bvh, .npz, .amc"),
+        (("in.usda", "out.bvh"), "can be written but not read"),
+        (("in.fbx", "out.bvh"), "cannot read the ending '.fbx'; allowed: .bvh, .npz, .amc"),
+        (("in", "out.bvh"), "cannot read the ending ''"),
+        (("in.bvh", "out.amc"), "cannot write out.amc: unknown ending '.amc'; allowed: .bvh, .npz, .glb, .usda"),
+        (("in.bvh", "out.npz", "--fps-in", "60"), "a .bvh file says its frame rate itself"),
+        (("in.amc", "out.npz", "--fps-in", "none"), "a frame rate is a number"),
+        (("in.amc", "out.npz", "--fps-in", "0"), "the frame rate must be 0.01 to 1000"),
+        (("broken.amc", "out.npz"), "broken.amc, line 1: expected the number of the first frame, got 'hello'"),
+        (("two/in.amc", "out.npz"), "beside it: 01.asf, 02.asf; name one as 01.asf+in.amc"),
+        (("objects.npz", "out.bvh"), "objects.npz: is not a sound .npz archive: Object arrays cannot be loaded"),
+        (("in.bvh", "gone/out.usda"), "the folder"),
+    ],
+)
 def test_what_cannot_be_is_said_in_one_line_and_nothing_is_written(here, capsys, words, said):
     Path("broken.amc").write_text("hello\n")
     Path("two").mkdir()
@@ -93,8 +99,12 @@ def test_a_missing_package_is_named(here, capsys, monkeypatch):
 
 
 def test_as_installed(here):
-    done = subprocess.run([sys.executable, "-m", "mapctl.cli", "convert", "in.amc", "out.bvh"],
-                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "mapctl.cli", "convert", "in.amc", "out.bvh"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert mapctl.load("out.bvh").num_frames == 6
 
@@ -110,8 +120,12 @@ def test_the_page_names_every_format_and_key():
     rows = dict(re.findall(r"^\| (`\.[^|]*) \| (yes|no) \| ", DOCS, re.MULTILINE))
     read = {ending for cell, yes in rows.items() if yes == "yes" for ending in re.findall(r"`(\.\w+)`", cell)}
     assert read - {".asf"} == set(formats.READERS)
-    written = {e for cell, yes in re.findall(r"^\| (`\.[^|]*) \| \w+ \| (yes|no)", DOCS, re.MULTILINE) if yes == "yes"
-               for e in re.findall(r"`(\.\w+)`", cell)}  # fmt: skip
+    written = {
+        e
+        for cell, yes in re.findall(r"^\| (`\.[^|]*) \| \w+ \| (yes|no)", DOCS, re.MULTILINE)
+        if yes == "yes"
+        for e in re.findall(r"`(\.\w+)`", cell)
+    }
     assert written == set(formats.WRITERS)
     assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(npz._arrays(walk(2)))
 

@@ -83,10 +83,7 @@ def test_broken_curves(fails, prior, kind):
         (["follow", "line:4", "-o", "a.bvh", "--seconds", "-3"], "seconds must be positive, got -3"),
         (["follow", "line:4", "-o", "a.bvh", "--seconds", "nan"], "seconds must be positive"),
         (["follow", "line:4", "-o", "a.bvh", "--seconds", "1e9"], "fewer seconds"),
-        (
-            ["follow", "line:4", "-o", "a.bvh", "--seconds", "long"],
-            "--seconds: expected a number, got 'long'",
-        ),
+        (["follow", "line:4", "-o", "a.bvh", "--seconds", "long"], "--seconds: expected a number, got 'long'"),
         (["follow", "line:4", "-o", "a.bvh", "--seed", "1.5"], "--seed: expected a whole number, got '1.5'"),
         (["follow", "line:4", "-o", "a.bvh", "--seed", "-1"], "seed"),
         (["follow", "line:4", "-o", "a.bvh", "--seed", str(2**63)], "seed"),
@@ -101,10 +98,7 @@ def test_broken_curves(fails, prior, kind):
         (["follow", "line:4", "-o", "a.bvh", "--video", "a.mp4", "--size", "big"], "WIDTHxHEIGHT"),
         (["follow", "line:4", "-o", "a.bvh", "--video", "a.mp4", "--size", "1x1"], "pixels"),
         (["follow", "line:4", "-o", "a.bvh", "--camera", "side"], "'side'"),
-        (
-            ["follow", "line:4", "-o", "a.bvh", "--camera", "follow"],
-            "--camera is of the film, and --video",
-        ),
+        (["follow", "line:4", "-o", "a.bvh", "--camera", "follow"], "--camera is of the film, and --video"),
         (["follow", "line:4", "-o", "a.bvh", "--size", "1280x720"], "--size is of the film, and --video"),
         (["follow", "line:4", "-o", "a.bvh", "--strct"], "Perhaps you meant: --strict"),
         (["follow", "line:4"], "--out"),

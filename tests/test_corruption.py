@@ -12,8 +12,9 @@ from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, clean_capture, corrupted
 
 JOINTS = CANONICAL.num_joints
-NOTHING = CorruptionSettings(clean=1.0, uneven=0.0, markers=0.0, correlated=0.0, spikes=0.0, dropout=0.0, limb=0.0,
-                             gap=0.0, told=0.0)  # fmt: skip
+NOTHING = CorruptionSettings(
+    clean=1.0, uneven=0.0, markers=0.0, correlated=0.0, spikes=0.0, dropout=0.0, limb=0.0, gap=0.0, told=0.0
+)
 PLAIN = replace(NOTHING, clean=0.0)
 BATCH, FRAMES = 40, 50
 
@@ -111,8 +112,9 @@ def test_the_noise_of_places_turns_short_bones_more(clean):
 
 
 def test_lasting_noise_has_the_same_spread_and_lasts(clean):
-    white, lasting = (turned_deg(clean, spoilt(clean, replace(PLAIN, angle_deg=(4.0, 4.0), correlated=share)))
-                      for share in (0.0, 1.0))  # fmt: skip
+    white, lasting = (
+        turned_deg(clean, spoilt(clean, replace(PLAIN, angle_deg=(4.0, 4.0), correlated=share))) for share in (0.0, 1.0)
+    )
     assert float(lasting.square().mean().sqrt()) == pytest.approx(4, rel=0.05)
 
     def neighbours(noise):

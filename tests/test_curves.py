@@ -84,8 +84,10 @@ def test_a_curve_through_points_passes_them_smoothly_and_few_points_are_a_line()
     dense = torch.linspace(0, curve.length, 400).double()
     for point in points:
         assert float((curve.point(dense) - torch.tensor(point)).norm(dim=-1).min()) < 0.02
-    turns = [torch.diff(c.tangent(torch.linspace(0.1, c.length - 0.1, 300).double()), dim=0).norm(dim=-1).max()
-             for c in (curve, sharp)]  # fmt: skip
+    turns = [
+        torch.diff(c.tangent(torch.linspace(0.1, c.length - 0.1, 300).double()), dim=0).norm(dim=-1).max()
+        for c in (curve, sharp)
+    ]
     assert turns[0] < turns[1] / 2
     assert curves.through(points[:2]).length == pytest.approx(float(np.hypot(1.0, 0.2)))
     with pytest.raises(RequestError, match="at least 2"):
@@ -171,10 +173,7 @@ def test_gradients_of_places_and_of_searches():
     numeric = torch.autograd.functional.jacobian(offset, places).sum(1)
     # The sideways offset grows by one to the left whatever the search does.
     torch.testing.assert_close(
-        (numeric * curve.left(curve.nearest(places, around=arcs))).sum(-1),
-        torch.ones(4).double(),
-        rtol=0,
-        atol=0.02,
+        (numeric * curve.left(curve.nearest(places, around=arcs))).sum(-1), torch.ones(4).double(), rtol=0, atol=0.02
     )
 
 

@@ -56,8 +56,9 @@ def test_joints_that_the_canonical_skeleton_lacks_are_smoothed_too(rig):
     done = cleaned(given)
     used = set(retarget.map_rig(truth.skeleton).joint_of)
     for joint in set(range(truth.num_joints)) - used:
-        before, after = (apart_deg(truth.local_quat_xyzw[:, joint], m.local_quat_xyzw[:, joint]).mean()
-                         for m in (given, done.motion))  # fmt: skip
+        before, after = (
+            apart_deg(truth.local_quat_xyzw[:, joint], m.local_quat_xyzw[:, joint]).mean() for m in (given, done.motion)
+        )
         assert after < 0.7 * before or before < 1e-4
 
 
@@ -139,8 +140,11 @@ def test_frames_in_which_everything_is_masked_are_filled_in(rig):
     quats, root = shaken(given.local_quat_xyzw, 2.0, seed=3), given.root_position + 5
     lost = torch.zeros(120, dtype=torch.bool)
     lost[60:66] = True
-    wild = replace(given, local_quat_xyzw=torch.where(lost[:, None, None], quats, given.local_quat_xyzw),
-                   root_position=torch.where(lost[:, None], root, given.root_position))  # fmt: skip
+    wild = replace(
+        given,
+        local_quat_xyzw=torch.where(lost[:, None, None], quats, given.local_quat_xyzw),
+        root_position=torch.where(lost[:, None], root, given.root_position),
+    )
     if given.moving_offsets:
         wild = replace(
             wild,
@@ -201,11 +205,20 @@ def test_a_summary_is_plain_numbers():
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_tpose_in_frame_0_stays(rig):
     truth = on_rig(rig, 60)
-    tpose = retarget.from_canonical(
-        replace(retarget.to_canonical(truth)[0].slice(0, 1), local_quat_xyzw=torch.tensor(
-            [0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)), retarget.map_rig(truth.skeleton)
-    ) if rig != "canonical" else replace(truth.slice(0, 1), local_quat_xyzw=torch.tensor(
-        [0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4))  # fmt: skip
+    tpose = (
+        retarget.from_canonical(
+            replace(
+                retarget.to_canonical(truth)[0].slice(0, 1),
+                local_quat_xyzw=torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4),
+            ),
+            retarget.map_rig(truth.skeleton),
+        )
+        if rig != "canonical"
+        else replace(
+            truth.slice(0, 1),
+            local_quat_xyzw=torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4),
+        )
+    )
     given = replace(tpose, source=truth.source).join(noisy(truth))
     assert begins_with_tpose(given)
     assert not begins_with_tpose(truth)

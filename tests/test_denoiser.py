@@ -26,8 +26,13 @@ def capture(frames=90, *, degrees=0.0, centimetres=0.0, seed=0, turn_rate=0.8):
     """A walk with white noise, everything seen."""
     motion = walk(frames, turn_rate=turn_rate)
     seen = torch.ones(frames, JOINTS, dtype=torch.bool)
-    clean = Capture.of_motion(motion, seen=seen, seen_root=seen[:, 0], sigma=torch.full((JOINTS,), degrees * DEGREE),
-                              sigma_root=centimetres / 100)  # fmt: skip
+    clean = Capture.of_motion(
+        motion,
+        seen=seen,
+        seen_root=seen[:, 0],
+        sigma=torch.full((JOINTS,), degrees * DEGREE),
+        sigma_root=centimetres / 100,
+    )
     draw = generator(seed)
     quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
     noise = degrees * DEGREE * torch.randn(1, frames, JOINTS, 3, generator=draw)
@@ -39,8 +44,10 @@ def capture(frames=90, *, degrees=0.0, centimetres=0.0, seed=0, turn_rate=0.8):
 def errors(cleaned, truth):
     """Root mean square: of the place in cm, of the angles in degrees."""
     angles = torch.cat([truth.tilt, truth.joints.flatten(2)], dim=-1)
-    return (100 * float((cleaned.root - truth.root).square().mean().sqrt()),
-            float(torch.rad2deg((cleaned.angles - angles).square().mean().sqrt())))  # fmt: skip
+    return (
+        100 * float((cleaned.root - truth.root).square().mean().sqrt()),
+        float(torch.rad2deg((cleaned.angles - angles).square().mean().sqrt())),
+    )
 
 
 def test_untrained_it_smooths():
@@ -109,8 +116,11 @@ def test_what_was_not_seen_does_not_matter():
     noisy.seen[:, 30:40, 4] = False
     noisy.seen[:, 50:55] = False
     noisy.seen_root[:, 50:55] = False
-    wild = replace(noisy, root=torch.where(noisy.seen_root[..., None], noisy.root, 7.0),
-                   joints=torch.where(noisy.seen[..., 1:, None], noisy.joints, 2.0))  # fmt: skip
+    wild = replace(
+        noisy,
+        root=torch.where(noisy.seen_root[..., None], noisy.root, 7.0),
+        joints=torch.where(noisy.seen[..., 1:, None], noisy.joints, 2.0),
+    )
     first, second = network(drawn=0.3)(noisy), network(drawn=0.3)(wild)
     for name in ("root", "heading", "angles", "contacts"):
         assert torch.equal(getattr(first, name), getattr(second, name))

@@ -58,9 +58,14 @@ def trial(batch=3, *, features=None, place=None, skeleton=CANONICAL, dtype=torch
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(1))
     bits = torch.rand(batch, FRAMES, 2, generator=generator(2)) < 0.6
     return Trial(
-        features.to(dtype).requires_grad_(), Place(place.position_xz.to(dtype), place.heading.to(dtype)),
-        draw[..., 1:].to(dtype), draw[..., 0].to(dtype), bits, motion.joint_positions()[:PAST].to(dtype), skeleton,
-    )  # fmt: skip
+        features.to(dtype).requires_grad_(),
+        Place(place.position_xz.to(dtype), place.heading.to(dtype)),
+        draw[..., 1:].to(dtype),
+        draw[..., 0].to(dtype),
+        bits,
+        motion.joint_positions()[:PAST].to(dtype),
+        skeleton,
+    )
 
 
 def close(found, expected, tolerance=1e-4):
@@ -271,7 +276,8 @@ def test_kernels_work_where_nothing_can_be_written(tmp_path):
     home.write_text("")
     surroundings = {**os.environ, "HOME": str(home), "XDG_CACHE_HOME": str(home), "PYTHONDONTWRITEBYTECODE": "1"}
     surroundings.pop("NUMBA_CACHE_DIR", None)
-    ran = subprocess.run([sys.executable, "-c", COMPILED], cwd=tmp_path, env=surroundings, capture_output=True,
-                         text=True, timeout=200)  # fmt: skip
+    ran = subprocess.run(
+        [sys.executable, "-c", COMPILED], cwd=tmp_path, env=surroundings, capture_output=True, text=True, timeout=200
+    )
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.strip() == "2.0"

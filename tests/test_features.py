@@ -55,10 +55,7 @@ def test_mirrored_features_are_those_of_the_mirrored_motion(kind):
 def test_a_straight_walk_reads_in_metres_and_radians_a_frame():
     straight, _ = encode(walk(30))
     torch.testing.assert_close(
-        LAYOUT.pick(straight, "root_displacement_heading")[:, 0].mean(),
-        torch.tensor(0.0).double(),
-        atol=1e-3,
-        rtol=0,
+        LAYOUT.pick(straight, "root_displacement_heading")[:, 0].mean(), torch.tensor(0.0).double(), atol=1e-3, rtol=0
     )
     assert float(LAYOUT.pick(straight, "root_displacement_heading")[:, 1].mean()) * 30 == pytest.approx(1.24, abs=0.01)
     turning, _ = encode(walk(90, turn_rate=0.6))

@@ -18,8 +18,15 @@ SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
-    request = run.TrainRequest(write_corpus(tmp_path / "data"), tmp_path / "first", config=TINY, settings=SETTINGS,
-                               device="cpu", starts=4, labels=r"-(?P<number>[0-4])")  # fmt: skip
+    request = run.TrainRequest(
+        write_corpus(tmp_path / "data"),
+        tmp_path / "first",
+        config=TINY,
+        settings=SETTINGS,
+        device="cpu",
+        starts=4,
+        labels=r"-(?P<number>[0-4])",
+    )
     first = run.train(request)
     slow = replace(SETTINGS, steps=1, learning_rate=1e-6)
     tuned = replace(request, out=tmp_path / "second", init=str(first), match="walk-[0-2]", settings=slow, labels="")

@@ -28,8 +28,9 @@ from mapctl.solver.budget import Budget
 from mapctl.terms import Likelihood
 
 DENSITY = tiny_density()
-QUICK = FollowSettings(window=WindowSettings(frames=10, overlap=4, past=12),
-                       method=LatentMethod(rounds=1, budget=Budget(evaluations=5)))  # fmt: skip
+QUICK = FollowSettings(
+    window=WindowSettings(frames=10, overlap=4, past=12), method=LatentMethod(rounds=1, budget=Budget(evaluations=5))
+)
 ABLE = Abilities(slowest=0.5, fastest=2.0, turn_rate=1.5)
 HILL = torch.stack(
     [torch.zeros(50), 0.9 + 0.02 * torch.linspace(0, 6, 50).sin(), torch.linspace(0, 3, 50)], -1
@@ -133,19 +134,22 @@ def test_progress_ends_with_all_frames():
     assert told[-1] == (15, 15)
 
 
-@pytest.mark.parametrize(("wishes", "message"), [
-    ({"speed": -1.0}, "speed must be positive, got -1 m/s"),
-    ({"speed": 0.0}, "speed must be positive, got 0 m/s"),
-    ({"speed": math.nan}, "speed must be positive, got nan m/s"),
-    ({"speed": math.inf}, "speed must be positive, got inf m/s"),
-    ({"seconds": 0.0}, "seconds must be positive, got 0"),
-    ({"seconds": -2.0}, "seconds must be positive, got -2"),
-    ({"seconds": math.nan}, "seconds must be positive, got nan"),
-    ({"seconds": 1e9}, "frames are more than the 3600000 allowed"),
-    ({"speed": 1e-7}, "frames are more than the 3600000 allowed"),
-    ({"speed": 1e-320}, "more than the 3600000 allowed"),
-    ({"speed": SpeedProfile((0.0, 1.0), (1e-9, 1e-9))}, "more than the 3600000 allowed"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("wishes", "message"),
+    [
+        ({"speed": -1.0}, "speed must be positive, got -1 m/s"),
+        ({"speed": 0.0}, "speed must be positive, got 0 m/s"),
+        ({"speed": math.nan}, "speed must be positive, got nan m/s"),
+        ({"speed": math.inf}, "speed must be positive, got inf m/s"),
+        ({"seconds": 0.0}, "seconds must be positive, got 0"),
+        ({"seconds": -2.0}, "seconds must be positive, got -2"),
+        ({"seconds": math.nan}, "seconds must be positive, got nan"),
+        ({"seconds": 1e9}, "frames are more than the 3600000 allowed"),
+        ({"speed": 1e-7}, "frames are more than the 3600000 allowed"),
+        ({"speed": 1e-320}, "more than the 3600000 allowed"),
+        ({"speed": SpeedProfile((0.0, 1.0), (1e-9, 1e-9))}, "more than the 3600000 allowed"),
+    ],
+)
 def test_wishes_that_make_no_sense_are_refused(wishes, message):
     with pytest.raises(RequestError, match=message):
         follow(curves.circle(radius=2), **wishes)
@@ -235,9 +239,10 @@ def test_the_start_is_one_of_the_best_by_the_wishes_speed():
     torch.testing.assert_close(stood.heading, found.committed.place.heading)
 
 
-@pytest.mark.parametrize(("text", "at", "speed"), [
-    ("1.2", 7.0, 1.2), ("0:1.0,4:2.0", 2.0, 1.5), ("0:1.0,4:2.0", 9.0, 2.0), ("1:3,2:1", 0.0, 3.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "at", "speed"),
+    [("1.2", 7.0, 1.2), ("0:1.0,4:2.0", 2.0, 1.5), ("0:1.0,4:2.0", 9.0, 2.0), ("1:3,2:1", 0.0, 3.0)],
+)
 def test_speed_profiles_are_linear_between_their_arcs(text, at, speed):
     assert SpeedProfile.parse(text).at(at) == pytest.approx(speed)
 

@@ -29,8 +29,29 @@ def test_seconds_are_written_in_any_usual_way(text, wanted):
     assert parse_frame(text, fps=30.0) == wanted
 
 
-@pytest.mark.parametrize("text", ["", "-1", "+3", "1.5", "s", ".s", "1e3", "1 s", "1ms", "nan", "inf", "nans", "1,5s",
-                                  "0x10", "1_000", "9" * 5000, "12s3", "1\n2"])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "-1",
+        "+3",
+        "1.5",
+        "s",
+        ".s",
+        "1e3",
+        "1 s",
+        "1ms",
+        "nan",
+        "inf",
+        "nans",
+        "1,5s",
+        "0x10",
+        "1_000",
+        "9" * 5000,
+        "12s3",
+        "1\n2",
+    ],
+)
 def test_anything_else_is_refused_as_it_came(text):
     with pytest.raises(RequestError, match="a frame is a whole number from 0, or seconds"):
         parse_frame(text, fps=30.0)
@@ -50,11 +71,21 @@ def test_a_range_comes_back_within_the_motion(ends):
         parse_range(f"{stop}:{start}", fps=30.0, frames=500)
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("12", "a gap is A:B"), ("", "a gap is A:B"), ("5-9", "a gap is A:B"), ("5:", "a whole number"),
-    (":9", "a whole number"), ("5:9:12", "a whole number"), ("5:5", "begin before it ends"),
-    ("5:101", "within the motion's frames 0:100"), ("100:101", "0:100"), ("1s:4s", "0:100"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("12", "a gap is A:B"),
+        ("", "a gap is A:B"),
+        ("5-9", "a gap is A:B"),
+        ("5:", "a whole number"),
+        (":9", "a whole number"),
+        ("5:9:12", "a whole number"),
+        ("5:5", "begin before it ends"),
+        ("5:101", "within the motion's frames 0:100"),
+        ("100:101", "0:100"),
+        ("1s:4s", "0:100"),
+    ],
+)
 def test_what_is_no_range_of_the_motion_is_refused(text, said):
     with pytest.raises(RequestError, match=said):
         parse_range(text, fps=30.0, frames=100)
@@ -64,8 +95,10 @@ def test_frames_and_seconds_may_be_mixed():
     assert parse_range("15:1s", fps=30.0, frames=100) == (15, 30)
 
 
-@given(st.lists(st.integers(0, 500), min_size=2, max_size=12, unique=True).filter(lambda ends: len(ends) % 2 == 0),
-       st.randoms())  # fmt: skip
+@given(
+    st.lists(st.integers(0, 500), min_size=2, max_size=12, unique=True).filter(lambda ends: len(ends) % 2 == 0),
+    st.randoms(),
+)
 def test_several_come_in_the_order_of_time(ends, random):
     ordered = sorted(ends)
     ranges = list(zip(ordered[::2], ordered[1::2], strict=True))

@@ -77,14 +77,22 @@ def _words(text, *more):
     return (*text.split(), *more)
 
 
-_BVH = _words("HIERARCHY ROOT JOINT { } OFFSET CHANNELS MOTION Frames: Xposition Zrotation a b 0 1 3 6 0.1 nan",
-              "End Site", "Frame Time:", "\n")  # fmt: skip
-_ASF = _words(":root :bonedata :hierarchy :units begin end name direction length axis dof order TX RY rx XYZ limits ( "
-              "# a b root 0 1 inf", "\n")  # fmt: skip
+_BVH = _words(
+    "HIERARCHY ROOT JOINT { } OFFSET CHANNELS MOTION Frames: Xposition Zrotation a b 0 1 3 6 0.1 nan",
+    "End Site",
+    "Frame Time:",
+    "\n",
+)
+_ASF = _words(
+    ":root :bonedata :hierarchy :units begin end name direction length axis dof order TX RY rx XYZ limits ( "
+    "# a b root 0 1 inf",
+    "\n",
+)
 _AMC = _words(":FULLY-SPECIFIED :DEGREES :SAMPLES-PER-SECOND 1 2 3 root head lfemur 0 1e9 nan #", "\n", "\n")
 _TABLE = _words('time_s speed_mps heading_deg joint start stop x z , , ; 0 1 2 1e9 -1 nan " * hips #', "\n", "\n", " ")
-_SVG = _words("<svg> </svg> <path d=' '/> M L C A Z 0 1 1e9 nan , scale( rotate( ) '> </g>",
-              " ", "<g transform='", "<circle r='")  # fmt: skip
+_SVG = _words(
+    "<svg> </svg> <path d=' '/> M L C A Z 0 1 1e9 nan , scale( rotate( ) '> </g>", " ", "<g transform='", "<circle r='"
+)
 
 
 def _texts(words):
@@ -175,12 +183,19 @@ def test_masks_without_their_columns_are_refused(tmp_path, text):
     assert caught.value.line == 1
 
 
-@pytest.mark.parametrize(("row", "words"), [
-    ("hips,0", "found 2 values where 3 belong"), ("hips,0,9,9", "found 4 values where 3 belong"),
-    (f"hips,0,{'9' * 5000}", "a joint and two whole frames"), ("hips,0,1_0", "a joint and two whole frames"),
-    ("hips,0,٣", "a joint and two whole frames"), (",0,3", "a joint and two whole frames"),
-    ("hips,4,4", "0 <= start < stop, got 4 and 4"), ("hips,-1,4", "0 <= start < stop, got -1 and 4"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("hips,0", "found 2 values where 3 belong"),
+        ("hips,0,9,9", "found 4 values where 3 belong"),
+        (f"hips,0,{'9' * 5000}", "a joint and two whole frames"),
+        ("hips,0,1_0", "a joint and two whole frames"),
+        ("hips,0,٣", "a joint and two whole frames"),
+        (",0,3", "a joint and two whole frames"),
+        ("hips,4,4", "0 <= start < stop, got 4 and 4"),
+        ("hips,-1,4", "0 <= start < stop, got -1 and 4"),
+    ],
+)
 def test_masks_that_are_none_are_refused_in_short(tmp_path, row, words):
     with pytest.raises(FileFormatError, match=words) as caught:
         load_masks(_written(tmp_path, "a.csv", f"joint,start,stop\n\n{row}\n"))
@@ -217,13 +232,16 @@ class TestArchives:
         (tmp_path / "good.bvh").write_text(GOOD)
         return npz._arrays(mapctl.load(tmp_path / "good.bvh"))
 
-    @pytest.mark.parametrize(("changes", "words"), [
-        ({"fps": np.array([10**9, 1])}, r"1e\+09 frames per second, allowed are 0.01 to 100000"),
-        ({"offsets": np.array([[0, 0, 0], [1e200, 0, 0]])}, r"offsets at \[1, 0\]: expected a finite number below"),
-        ({"end_names": np.array(["leg", "leg"]), "end_offsets": np.zeros((2, 3))}, "name a joint once"),
-        ({"moving_joints": np.array([1, 1]), "moving_offsets": np.zeros((2, 3, 3))}, "name a joint once"),
-        ({"names": np.array(["x" * 9000, "x" * 9000])}, "names must be unique, got"),
-    ])  # fmt: skip
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"fps": np.array([10**9, 1])}, r"1e\+09 frames per second, allowed are 0.01 to 100000"),
+            ({"offsets": np.array([[0, 0, 0], [1e200, 0, 0]])}, r"offsets at \[1, 0\]: expected a finite number below"),
+            ({"end_names": np.array(["leg", "leg"]), "end_offsets": np.zeros((2, 3))}, "name a joint once"),
+            ({"moving_joints": np.array([1, 1]), "moving_offsets": np.zeros((2, 3, 3))}, "name a joint once"),
+            ({"names": np.array(["x" * 9000, "x" * 9000])}, "names must be unique, got"),
+        ],
+    )
     def test_absurd_and_doubled_values_are_refused(self, tmp_path, arrays, changes, words):
         np.savez(tmp_path / "a.npz", **{**arrays, **changes})
         if "names" in changes:

@@ -127,5 +127,7 @@ def test_a_gap_without_edges_is_left_as_it_is():
 def test_nothing_put_in_changes_nothing():
     nothing = gap(0, 0)
     assert torch.equal(closed_places(way(), nothing, fps=30.0), way())
-    assert torch.equal(closed_rotations(swaying(FRAMES, 2), nothing[:, None].expand(-1, 2), fps=30.0),
-                       rotations.sign_continuous(swaying(FRAMES, 2)))  # fmt: skip
+    assert torch.equal(
+        closed_rotations(swaying(FRAMES, 2), nothing[:, None].expand(-1, 2), fps=30.0),
+        rotations.sign_continuous(swaying(FRAMES, 2)),
+    )

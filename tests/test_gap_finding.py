@@ -20,8 +20,12 @@ def frozen(motion, start, stop):
     frame = torch.arange(motion.num_frames)
     frame[start:stop] = start - 1
     moving = {joint: values[frame] for joint, values in motion.moving_offsets.items()}
-    return replace(motion, root_position=motion.root_position[frame], moving_offsets=moving,
-                   local_quat_xyzw=motion.local_quat_xyzw[frame])  # fmt: skip
+    return replace(
+        motion,
+        root_position=motion.root_position[frame],
+        moving_offsets=moving,
+        local_quat_xyzw=motion.local_quat_xyzw[frame],
+    )
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -67,12 +71,16 @@ def test_a_frozen_joint_in_a_body_that_moves_is_found():
 
 
 @pytest.mark.parametrize("rig", RIGS)
-@pytest.mark.parametrize("spoil", [
-    lambda motion: motion,
-    lambda motion: frozen(motion, 60, 90),  # at rest, when the recording ends
-    lambda motion: frozen(motion, 40, 41),  # a repeated frame is no freeze
-    lambda motion: frozen(motion, 1, 90),  # a stand
-], ids=["whole", "rest", "repeat", "stand"])  # fmt: skip
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda motion: motion,
+        lambda motion: frozen(motion, 60, 90),  # at rest, when the recording ends
+        lambda motion: frozen(motion, 40, 41),  # a repeated frame is no freeze
+        lambda motion: frozen(motion, 1, 90),  # a stand
+    ],
+    ids=["whole", "rest", "repeat", "stand"],
+)
 def test_where_nothing_is_wrong_one_is_asked_to_say_what_is(rig, spoil):
     with pytest.raises(RequestError, match=r"say which frames are missing \(--gap A:B\) or which joints"):
         find(spoil(on_rig(rig, 90)))

@@ -21,11 +21,13 @@ def shown(motion, known=None, *, present=None, contacts=None):
     places, frames = motion.joint_positions()[None], motion.num_frames
     whole = torch.ones(1, frames, CANONICAL.num_joints, dtype=torch.bool)
     return PositionImage.of_world(
-        places, kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
+        places,
+        kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
         torch.ones(1, frames, 2).double() if contacts is None else contacts,
-        known=whole if known is None else known, toes=TOES,
+        known=whole if known is None else known,
+        toes=TOES,
         present=whole[..., 0] if present is None else present,
-    )  # fmt: skip
+    )
 
 
 def drawn_masks(seed, share):
@@ -119,8 +121,12 @@ def test_a_batch_is_its_members():
     first, second = shown(walk(FRAMES), with_hole(5, 9)), shown(walk(FRAMES, turn_rate=1.0, seed=1), with_hole(20, 35))
     worlds = [image.to_world(image.places) for image in (first, second)]
     both = PositionImage.of_world(
-        torch.cat(worlds), torch.cat([first.heading, second.heading]), torch.cat([first.contacts, second.contacts]),
-        known=torch.cat([first.known, second.known]), present=torch.cat([first.present, second.present]), toes=TOES,
-    )  # fmt: skip
+        torch.cat(worlds),
+        torch.cat([first.heading, second.heading]),
+        torch.cat([first.contacts, second.contacts]),
+        known=torch.cat([first.known, second.known]),
+        present=torch.cat([first.present, second.present]),
+        toes=TOES,
+    )
     assert torch.allclose(both.places, torch.cat([first.places, second.places]), atol=1e-12)
     assert torch.allclose(both.ground, torch.cat([first.ground, second.ground]), atol=1e-12)

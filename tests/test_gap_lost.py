@@ -19,8 +19,12 @@ def lost_of(motion, *masks):
 
 def interpolated(quats, start, stop):
     """Between the frames beside a gap, by scipy; (gap, joints, 4)."""
-    between = [Slerp([start - 1, stop], Rotation.from_quat(quats[[start - 1, stop], joint].numpy()))
-               (range(start, stop)).as_quat() for joint in range(quats.shape[1])]  # fmt: skip
+    between = [
+        Slerp([start - 1, stop], Rotation.from_quat(quats[[start - 1, stop], joint].numpy()))(
+            range(start, stop)
+        ).as_quat()
+        for joint in range(quats.shape[1])
+    ]
     return torch.stack([torch.from_numpy(quat) for quat in between], dim=1)
 
 
@@ -82,13 +86,20 @@ def names_of(motion, lost):
     return {name for name, gone in zip(motion.skeleton.names, lost.joints.any(dim=0).tolist(), strict=True) if gone}
 
 
-@pytest.mark.parametrize(("joint", "taken"), [
-    ("leftHand", {"leftHand", "leftLowerArm"}), ("leftLowerArm", {"leftLowerArm", "leftUpperArm"}),
-    ("leftUpperArm", {"leftUpperArm", "leftShoulder"}), ("rightToes", {"rightToes", "rightFoot"}),
-    ("head", {"head", "neck"}),
-    # A shoulder's place is the chest's doing, which the neck and the other shoulder show.
-    ("leftShoulder", {"leftShoulder"}), ("leftUpperLeg", {"leftUpperLeg"}), ("hips", {"hips"}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("joint", "taken"),
+    [
+        ("leftHand", {"leftHand", "leftLowerArm"}),
+        ("leftLowerArm", {"leftLowerArm", "leftUpperArm"}),
+        ("leftUpperArm", {"leftUpperArm", "leftShoulder"}),
+        ("rightToes", {"rightToes", "rightFoot"}),
+        ("head", {"head", "neck"}),
+        # A shoulder's place is the chest's doing, which the neck and the other shoulder show.
+        ("leftShoulder", {"leftShoulder"}),
+        ("leftUpperLeg", {"leftUpperLeg"}),
+        ("hips", {"hips"}),
+    ],
+)
 def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
     motion = on_rig("canonical", 30)
     lost = lost_of(motion, Mask(joint, 5, 9))
@@ -98,9 +109,14 @@ def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
     assert not lost.root.any()
 
 
-@pytest.mark.parametrize(("rig", "joint", "taken"), [("bandai", "Hand_L", {"Hand_L", "LowerArm_L"}),
-                                                     ("daz", "lHand", {"lHand", "lForeArm"}),
-                                                     ("daz", "lThumb1", {"lThumb1"})])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rig", "joint", "taken"),
+    [
+        ("bandai", "Hand_L", {"Hand_L", "LowerArm_L"}),
+        ("daz", "lHand", {"lHand", "lForeArm"}),
+        ("daz", "lThumb1", {"lThumb1"}),
+    ],
+)
 def test_on_other_rigs_too(rig, joint, taken):
     motion = on_rig(rig, 30)
     assert names_of(motion, lost_of(motion, Mask(joint, 5, 9))) == taken
@@ -124,13 +140,16 @@ def test_joints_that_are_never_known_rest():
         assert torch.equal(made.local_quat_xyzw[:, motion.skeleton.index(name)], rest.expand(30, 4))
 
 
-@pytest.mark.parametrize(("masks", "message"), [
-    ([Mask("leftHnad", 5, 9)], "no joint 'leftHnad'.* the nearest is leftHand"),
-    ([Mask(ALL, 5, 31)], "the gap 5:31 ends after the motion's 30 frames"),
-    ([Mask(ALL, 0, 30)], "leave nothing of the motion's 30 frames"),
-    ([Mask(ALL, 0, 15), Mask(ALL, 15, 30)], "leave nothing"),
-    ([Mask(ROOT, 0, 30)], "leave nothing"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        ([Mask("leftHnad", 5, 9)], "no joint 'leftHnad'.* the nearest is leftHand"),
+        ([Mask(ALL, 5, 31)], "the gap 5:31 ends after the motion's 30 frames"),
+        ([Mask(ALL, 0, 30)], "leave nothing of the motion's 30 frames"),
+        ([Mask(ALL, 0, 15), Mask(ALL, 15, 30)], "leave nothing"),
+        ([Mask(ROOT, 0, 30)], "leave nothing"),
+    ],
+)
 def test_what_cannot_be_is_refused(masks, message):
     with pytest.raises(RequestError, match=message):
         lost_of(on_rig("canonical", 30), *masks)

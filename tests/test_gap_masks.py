@@ -100,8 +100,12 @@ def test_windows_are_of_the_three_kinds_by_their_shares(keys, joints):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.sampled_from([GapSettings(), GAPS, KEYS, JOINTS]), st.floats(0, 1), st.integers(0, 999),
-       st.sampled_from([32, 50, 160]))  # fmt: skip
+@given(
+    st.sampled_from([GapSettings(), GAPS, KEYS, JOINTS]),
+    st.floats(0, 1),
+    st.integers(0, 999),
+    st.sampled_from([32, 50, 160]),
+)
 def test_no_window_is_without_a_known_frame_and_absent_frames_are_not_known(recipe, progress, seed, frames):
     first = torch.randint(0, frames // 2, (64, 1), generator=generator(seed))
     last = torch.randint(frames // 2 + 1, frames + 1, (64, 1), generator=generator(seed + 1))

@@ -113,8 +113,13 @@ def test_runs_of_places_are_met_in_every_frame(count):
     motion = walk(60)
     frames = range(20, 20 + count)
     start = nearer(motion, 20, "rightHand")
-    targets = at(motion, {(frame, "rightHand"): start + place_of(motion, frame, "chest") - place_of(motion, 20, "chest")
-                          for frame in frames})  # fmt: skip
+    targets = at(
+        motion,
+        {
+            (frame, "rightHand"): start + place_of(motion, frame, "chest") - place_of(motion, 20, "chest")
+            for frame in frames
+        },
+    )
     made = reached(motion, targets, all_free(motion))
     assert missed(made.joint_positions(), targets).max() < HAIR
 

@@ -53,9 +53,13 @@ class Viewer:
         def visit(node, above):
             local = np.eye(4)
             x, y, z, w = turn[node]
-            local[:3, :3] = np.eye(3) + 2 * np.array([[-y * y - z * z, x * y - z * w, x * z + y * w],
-                                                      [x * y + z * w, -x * x - z * z, y * z - x * w],
-                                                      [x * z - y * w, y * z + x * w, -x * x - y * y]])  # fmt: skip
+            local[:3, :3] = np.eye(3) + 2 * np.array(
+                [
+                    [-y * y - z * z, x * y - z * w, x * z + y * w],
+                    [x * y + z * w, -x * x - z * z, y * z - x * w],
+                    [x * z - y * w, y * z + x * w, -x * x - y * y],
+                ]
+            )
             local[:3, 3] = place[node]
             found[node] = above @ local
             for child in nodes[node].get("children") or ():

@@ -11,10 +11,19 @@ from mapctl import retarget
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
-_BONES = {side: {
-    "Clavicle": "Shoulder", "Upperarm": "UpperArm", "Forearm": "LowerArm", "Hand": "Hand",
-    "Thigh": "UpperLeg", "Calf": "LowerLeg", "Foot": "Foot", "ToeBase": "Toes",
-} for side in ("left", "right")}  # fmt: skip
+_BONES = {
+    side: {
+        "Clavicle": "Shoulder",
+        "Upperarm": "UpperArm",
+        "Forearm": "LowerArm",
+        "Hand": "Hand",
+        "Thigh": "UpperLeg",
+        "Calf": "LowerLeg",
+        "Foot": "Foot",
+        "ToeBase": "Toes",
+    }
+    for side in ("left", "right")
+}
 TWISTED = {"Upperarm": "Forearm", "Forearm": "Hand", "Thigh": "Calf", "Calf": "Foot"}
 
 

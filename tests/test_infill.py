@@ -118,8 +118,9 @@ class Oracle:
 def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
     motion = on_rig(rig, 3 * fps, fps=fps)
     masks = [seconds(motion, 0.8, 1.4), seconds(motion, 2.0, 2.03 + 1 / fps)]
-    made, lines = (filled(motion, *masks, method=method, infiller=Oracle(motion)).motion
-                   for method in ("infiller", "linear"))  # fmt: skip
+    made, lines = (
+        filled(motion, *masks, method=method, infiller=Oracle(motion)).motion for method in ("infiller", "linear")
+    )
     # Places do not tell how a collarbone or a shin is turned about itself, and a rig's joints beside them show it.
     assert error_cm(made, motion) < 0.2 * error_cm(lines, motion)
     frames = lost_of(motion, masks).frames
@@ -132,10 +133,11 @@ def test_a_larger_performer_is_shown_as_one_of_the_networks_size(rig):
     """What is proposed is scaled back: places by the legs, while rotations are the same."""
     small = on_rig(rig, 60)
     motion = replace(
-        small, skeleton=replace(small.skeleton, offsets=1.25 * small.skeleton.offsets),
+        small,
+        skeleton=replace(small.skeleton, offsets=1.25 * small.skeleton.offsets),
         root_position=1.25 * small.root_position,
         moving_offsets={joint: 1.25 * values for joint, values in small.moving_offsets.items()},
-    )  # fmt: skip
+    )
     made, unscaled = (filled(each, Mask(ALL, 20, 40), infiller=Oracle(small)).motion for each in (motion, small))
     assert (made.joint_positions() - 1.25 * unscaled.joint_positions()).norm(dim=-1).max() < 0.005
 
@@ -212,8 +214,10 @@ def test_the_summary_tells_gaps_and_cost():
     motion = on_rig("canonical", 45)
     done = filled(motion, Mask(ALL, 15, 25), Mask("leftHand", 30, 33), method="linear")
     told = done.summary()
-    assert told["gaps"] == [{"start": 15, "stop": 25, "joints": 21, "root": True},
-                            {"start": 30, "stop": 33, "joints": 2, "root": False}]  # fmt: skip
+    assert told["gaps"] == [
+        {"start": 15, "stop": 25, "joints": 21, "root": True},
+        {"start": 30, "stop": 33, "joints": 2, "root": False},
+    ]
     assert (told["frames"], told["fps"], told["notes"]) == (45, 30.0, [])
     assert told["seconds"] == done.seconds > 0
     assert told["frame_ms"] == pytest.approx(1000 * done.seconds / 13)

@@ -56,10 +56,17 @@ def spoilt(source, out, *gaps):
     return out
 
 
-@pytest.mark.parametrize(("rig", "fps", "method"), [
-    ("bandai", 30, "infiller"), ("bandai", 120, "infiller"), ("canonical", 30, "infiller"), ("daz", 120, "infiller"),
-    ("daz", 30, "linear"), ("bandai", 30, "map"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rig", "fps", "method"),
+    [
+        ("bandai", 30, "infiller"),
+        ("bandai", 120, "infiller"),
+        ("canonical", 30, "infiller"),
+        ("daz", 120, "infiller"),
+        ("daz", 30, "linear"),
+        ("bandai", 30, "map"),
+    ],
+)
 def test_outside_the_gap_every_channel_is_as_it_was(infill, recording, tmp_path, rig, fps, method):
     """In the text of the file, also where what is filled in turns about."""
     source, out = recording(rig, fps), tmp_path / "out.bvh"
@@ -133,39 +140,46 @@ def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):
     assert "filled 20:30 (22 joints);" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (["in.bvh", "-o", "a.bvh"], "say which frames are missing (--gap A:B) or which joints"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:12", "--gap", "11:20"], "the gaps 5:12 and 11:20 overlap; make them one"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "40:46"], "within the motion's frames 0:45"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "1s:2s"], "within the motion's frames 0:45"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "9:5"], "must begin before it ends"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:5"], "must begin before it ends"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5"], "a gap is A:B, frames or seconds as in 60:120 or 2s:4s; got '5'"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "a:b"], "a frame is a whole number from 0"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "0:45"], "leave nothing of the motion's 45 frames"),
-    (["in.bvh", "-o", "a.bvh", "--joints", "Hnad_L"], "no joint 'Hnad_L' to mask; the nearest is Hand_L"),
-    (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,LowArm_L"], "the nearest is LowerArm_L"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "best"], "--method"),
-    (["in.bvh", "-o", "a.bvh", "--gap=-5:9"], "a frame is a whole number from 0, or seconds as in 1.5s; got '-5'"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "-5:9"], "a frame is a whole number from 0"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:9:12"], "got '9:12'"),
-    (["in.bvh", "-o", "a.bvh", "--gap", ""], "a gap is A:B"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "0:20", "--gap", "20:45"], "leave nothing of the motion's 45 frames"),
-    (["in.bvh", "-o", "a.bvh", "--joints", ""], "no joint '' to mask"),
-    (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,,Hand_R"], "no joint '' to mask"),
-    (["in.bvh", "-o", "a.bvh", "--joints", "root position"], "leave nothing of the motion's 45 frames"),
-    (["in.bvh", "-o", "in.bvh", "--gap", "5:9"], "in.bvh would be written over what it is made from"),
-    (["in.bvh", "-o", "./in.bvh", "--gap", "5:9"], "would be written over what it is made from"),
-    (["in.bvh", "-o", "link.bvh", "--gap", "5:9"], "link.bvh would be written over what it is made from"),
-    (["in.bvh", "-o", "a.bvh", "--report", "in.bvh", "--gap", "5:9"], "would be written over what it is made from"),
-    (["in.bvh", "-o", ".", "--gap", "5:9"], "unknown ending"),
-    (["in.bvh", "-o", "folder.bvh", "--gap", "5:9"], "it is a folder"),
-    (["folder.bvh", "-o", "a.bvh", "--gap", "5:9"], "is a folder, expected a file"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "infiller", "--prior", "general"], "leave --prior out"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear", "--prior", "general"], "leave --prior out"),
-    (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear", "--curve", "line:4"], "--curve needs"),
-    (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L", "--curve", "line:4"], "a curve leads the hips where"),
-], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["in.bvh", "-o", "a.bvh"], "say which frames are missing (--gap A:B) or which joints"),
+        (
+            ["in.bvh", "-o", "a.bvh", "--gap", "5:12", "--gap", "11:20"],
+            "the gaps 5:12 and 11:20 overlap; make them one",
+        ),
+        (["in.bvh", "-o", "a.bvh", "--gap", "40:46"], "within the motion's frames 0:45"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "1s:2s"], "within the motion's frames 0:45"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "9:5"], "must begin before it ends"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:5"], "must begin before it ends"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5"], "a gap is A:B, frames or seconds as in 60:120 or 2s:4s; got '5'"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "a:b"], "a frame is a whole number from 0"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "0:45"], "leave nothing of the motion's 45 frames"),
+        (["in.bvh", "-o", "a.bvh", "--joints", "Hnad_L"], "no joint 'Hnad_L' to mask; the nearest is Hand_L"),
+        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,LowArm_L"], "the nearest is LowerArm_L"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "best"], "--method"),
+        (["in.bvh", "-o", "a.bvh", "--gap=-5:9"], "a frame is a whole number from 0, or seconds as in 1.5s; got '-5'"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "-5:9"], "a frame is a whole number from 0"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:9:12"], "got '9:12'"),
+        (["in.bvh", "-o", "a.bvh", "--gap", ""], "a gap is A:B"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "0:20", "--gap", "20:45"], "leave nothing of the motion's 45 frames"),
+        (["in.bvh", "-o", "a.bvh", "--joints", ""], "no joint '' to mask"),
+        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,,Hand_R"], "no joint '' to mask"),
+        (["in.bvh", "-o", "a.bvh", "--joints", "root position"], "leave nothing of the motion's 45 frames"),
+        (["in.bvh", "-o", "in.bvh", "--gap", "5:9"], "in.bvh would be written over what it is made from"),
+        (["in.bvh", "-o", "./in.bvh", "--gap", "5:9"], "would be written over what it is made from"),
+        (["in.bvh", "-o", "link.bvh", "--gap", "5:9"], "link.bvh would be written over what it is made from"),
+        (["in.bvh", "-o", "a.bvh", "--report", "in.bvh", "--gap", "5:9"], "would be written over what it is made from"),
+        (["in.bvh", "-o", ".", "--gap", "5:9"], "unknown ending"),
+        (["in.bvh", "-o", "folder.bvh", "--gap", "5:9"], "it is a folder"),
+        (["folder.bvh", "-o", "a.bvh", "--gap", "5:9"], "is a folder, expected a file"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "infiller", "--prior", "general"], "leave --prior out"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear", "--prior", "general"], "leave --prior out"),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear", "--curve", "line:4"], "--curve needs"),
+        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L", "--curve", "line:4"], "a curve leads the hips where"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, recording, words, said):
     Path("in.bvh").write_bytes(recording().read_bytes())
     Path("link.bvh").symlink_to("in.bvh")

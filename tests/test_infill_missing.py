@@ -47,10 +47,16 @@ def clip(tmp_path):
     return of
 
 
-@pytest.mark.parametrize(("rig", "fps", "seed", "method"), [
-    ("canonical", 30, None, "linear"), ("bandai", 30, 1, "map"), ("bandai", 120, None, "infiller"),
-    ("daz", 30, 2, "infiller"), ("daz", 60, 3, "linear"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rig", "fps", "seed", "method"),
+    [
+        ("canonical", 30, None, "linear"),
+        ("bandai", 30, 1, "map"),
+        ("bandai", 120, None, "infiller"),
+        ("daz", 30, 2, "infiller"),
+        ("daz", 60, 3, "linear"),
+    ],
+)
 def test_frames_of_nan_are_gaps(infilled, clip, tmp_path, rig, fps, seed, method):
     source, gaps = clip(rig, fps, seed), ((fps // 3, fps // 2), (fps, fps + 7))
     lossy = without(source, tmp_path / "lossy.bvh", [("", *gap) for gap in gaps])
@@ -78,8 +84,10 @@ def test_the_roots_place_alone_may_be_lost(infilled, clip, tmp_path, rig, root):
 def test_what_is_asked_for_comes_to_what_is_nan(infilled, clip, tmp_path):
     source = clip("bandai")
     both = without(source, tmp_path / "both.bvh", [("", 8, 12), ("Hand_L", 20, 30)])
-    for lost, words in (([("", 8, 12)], ("--joints", "Hand_L", "--gap", "20:30")),
-                        ([("Hand_L", 20, 30)], ("--gap", "8:12"))):  # fmt: skip
+    for lost, words in (
+        ([("", 8, 12)], ("--joints", "Hand_L", "--gap", "20:30")),
+        ([("Hand_L", 20, 30)], ("--gap", "8:12")),
+    ):
         lossy = without(source, tmp_path / "lossy.bvh", lost)
         assert infilled(lossy, *words) == infilled(both)
 
@@ -110,16 +118,24 @@ def test_where_something_is_nan_nothing_else_is_looked_for(tiny, clip, tmp_path)
 def test_an_archive_with_nan_is_filled(infilled, tmp_path):
     on_rig("bandai", 45).save(tmp_path / "in.npz")
     frames = (slice(20, 30),)
-    lossy = archive_without(tmp_path / "in.npz", tmp_path / "lossy.npz", local_quat_xyzw=frames,
-                            root_position_world=frames, moving_offsets=(slice(None), *frames))  # fmt: skip
+    lossy = archive_without(
+        tmp_path / "in.npz",
+        tmp_path / "lossy.npz",
+        local_quat_xyzw=frames,
+        root_position_world=frames,
+        moving_offsets=(slice(None), *frames),
+    )
     assert infilled(lossy) == infilled(tmp_path / "in.npz", "--gap", "20:30")
 
 
-@pytest.mark.parametrize(("lost", "said"), [
-    ([("", 0, 45)], "every value is nan: nothing is known of the motion"),
-    ([("Hips ", 0, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
-    ([("", 0, 20), ("Hips Yposition", 20, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        ([("", 0, 45)], "every value is nan: nothing is known of the motion"),
+        ([("Hips ", 0, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
+        ([("", 0, 20), ("Hips Yposition", 20, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
+    ],
+)
 def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, said):
     lossy = without(clip("bandai"), tmp_path / "lossy.bvh", lost)
     assert run("infill", lossy, "-o", tmp_path / "out.bvh", "--infiller", tiny) == 2
@@ -130,10 +146,17 @@ def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, sa
     assert not (tmp_path / "out.bvh").exists()
 
 
-@pytest.mark.parametrize("words", [
-    ("convert", "lossy.bvh", "out.npz"), ("tween", "lossy.bvh", "-o", "out.bvh", "--keyframes", "0,44"),
-    ("info", "lossy.bvh"), ("measure", "lossy.bvh"), ("render", "lossy.bvh", "-o", "out.png"),
-], ids=" ".join)  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("convert", "lossy.bvh", "out.npz"),
+        ("tween", "lossy.bvh", "-o", "out.bvh", "--keyframes", "0,44"),
+        ("info", "lossy.bvh"),
+        ("measure", "lossy.bvh"),
+        ("render", "lossy.bvh", "-o", "out.png"),
+    ],
+    ids=" ".join,
+)
 def test_other_commands_refuse_nan_and_say_who_fills_it(clip, tmp_path, monkeypatch, capsys, words):
     monkeypatch.chdir(tmp_path)
     without(clip("bandai"), tmp_path / "lossy.bvh", [("Hand_L Zrotation", 3, 5)])

@@ -171,8 +171,18 @@ def test_what_is_no_infiller_is_refused(tmp_path):
         priors.load_denoiser(str(path))
 
 
-@pytest.mark.parametrize("config", [{"widths": [8, 8]}, {"widths": 3}, {"kernel": 5}, {"kernel": 4}, {"depth": 3},
-                                    {"architecture": "manifold"}, {"architecture": "gpt"}])  # fmt: skip
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"widths": [8, 8]},
+        {"widths": 3},
+        {"kernel": 5},
+        {"kernel": 4},
+        {"depth": 3},
+        {"architecture": "manifold"},
+        {"architecture": "gpt"},
+    ],
+)
 def test_tensors_that_do_not_fit_their_card_are_refused(tmp_path, config):
     path = tmp_path / "broken.safetensors"
     checkpoints.save(network().state_dict(), replace(card(), config={**CONFIG.as_card(), **config}), path)

@@ -87,8 +87,16 @@ def test_names_of_a_rig_that_only_the_user_knows():
     assert mask.joint == f"b{CANONICAL.names.index('rightFoot')}"
 
 
-ASKED = {"LeftForeArm": "leftHand", "left_arm": "leftHand", "rElbow": "rightHand", "LeftKnee": "leftFoot",
-         "r_thigh": "rightFoot", "leftHnad": "leftHand", "L_Ankle": "leftFoot", "RightToe": "rightFoot"}  # fmt: skip
+ASKED = {
+    "LeftForeArm": "leftHand",
+    "left_arm": "leftHand",
+    "rElbow": "rightHand",
+    "LeftKnee": "leftFoot",
+    "r_thigh": "rightFoot",
+    "leftHnad": "leftHand",
+    "L_Ankle": "leftFoot",
+    "RightToe": "rightFoot",
+}
 
 
 @pytest.mark.parametrize(("asked", "meant"), ASKED.items())
@@ -126,9 +134,11 @@ def test_a_refusal_names_few_joints():
 @pytest.mark.parametrize("words", [("info",), ("convert", "--rig", "canonical"), ("measure",)])
 def test_no_refusal_of_a_rig_lists_sixty_joints(words, tmp_path, capsys):
     skeleton = make(Make({c: f"Glied_{n:02d}" for n, c in enumerate(CANONICAL.names) if "Leg" not in c})).skeleton
-    crowd = type(skeleton)((*skeleton.names, *(f"Knochen_{n:02d}" for n in range(70))),
-                           (*skeleton.parents, *[0] * 70),
-                           skeleton.offsets.new_zeros(len(skeleton.names) + 70, 3))  # fmt: skip
+    crowd = type(skeleton)(
+        (*skeleton.names, *(f"Knochen_{n:02d}" for n in range(70))),
+        (*skeleton.parents, *[0] * 70),
+        skeleton.offsets.new_zeros(len(skeleton.names) + 70, 3),
+    )
     random_motion(crowd, 2).save(tmp_path / "a.bvh")
     command, *options = words
     more = [tmp_path / "b.bvh"] if command == "convert" else []

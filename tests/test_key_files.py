@@ -22,43 +22,69 @@ def test_files_are_found_beside_the_key_file_and_times_become_frames(tmp_path):
 
 
 def test_all_keys_of_a_table_are_read(tmp_path):
-    more = ("[[key]]\nframe = 9\npose = 'a.bvh'\npose_seconds = 1.5\nplace = [1, -2.5]\nheight = 0.8\n"
-            "facing_deg = -90\njoints = ['LeftFoot']\nreach = { LeftHand = [0.5, 1.5, 2] }\n")  # fmt: skip
+    more = (
+        "[[key]]\nframe = 9\npose = 'a.bvh'\npose_seconds = 1.5\nplace = [1, -2.5]\nheight = 0.8\n"
+        "facing_deg = -90\njoints = ['LeftFoot']\nreach = { LeftHand = [0.5, 1.5, 2] }\n"
+    )
     key = read_keys(written(tmp_path, TWO + more)).key[2]
-    assert key == PlacedKey(frame=9, pose=str(tmp_path / "a.bvh"), pose_seconds=1.5, place=(1, -2.5), height=0.8,
-                            facing_deg=-90, joints=("LeftFoot",), reach={"LeftHand": (0.5, 1.5, 2)})  # fmt: skip
+    assert key == PlacedKey(
+        frame=9,
+        pose=str(tmp_path / "a.bvh"),
+        pose_seconds=1.5,
+        place=(1, -2.5),
+        height=0.8,
+        facing_deg=-90,
+        joints=("LeftFoot",),
+        reach={"LeftHand": (0.5, 1.5, 2)},
+    )
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    (TWO.replace("pose =", "poze =", 1), "key[0].poze: there is no such key; the nearest is pose; allowed: "),
-    (f"fsp = 30\n{TWO}", "fsp: there is no such key; the nearest is fps; allowed: "),
-    (f"{TWO}root = true", "key[1].root: there is no such key; the nearest is "),
-    ("", "key: this key is needed"),
-    ("[[key]]\nframe = 0\npose = 'a.bvh'", "in-betweening needs at least two keys, got 1"),
-    ("key = []", "in-betweening needs at least two keys, got 0"),
-    ("[key]\nframe = 0", "key: "),
-    (TWO.replace("frame = 30", "frame = 0"), "key[1]: key[0] is at frame 0 already"),
-    (TWO.replace("frame = 30", "seconds = 0.01"), "key[1]: key[0] is at frame 0 already"),
-    (TWO.replace("frame = 30", "frame = -1"), "key[1].frame: "),
-    (TWO.replace("frame = 30", "frame = 1.5"), "key[1].frame: "),
-    (TWO.replace("frame = 30", "frame = true"), "key[1].frame: "),
-    (TWO.replace("frame = 30", "seconds = inf"), "key[1].seconds: "),
-    (TWO.replace("frame = 30", "frame = 10000000"), "key[1].frame: "),
-    (f"fps = 1000\n{TWO.replace('frame = 30', 'seconds = 3600')}", "key[1].seconds: a motion may have 100000 frames"),
-    (TWO.replace("frame = 30", ""), "key[1].frame: a key is at a frame or at seconds, one of them"),
-    (f"{TWO}seconds = 1.0", "key[1].frame: a key is at a frame or at seconds, one of them"),
-    (TWO.replace("frame = 0", "frame = 4"), "key[0]: the motion begins with its first key, so that is at frame 0"),
-    (f"{TWO}pose_frame = 1\npose_seconds = 0.1", "key[1].pose_frame: a pose is told by pose_frame or by pose_seconds"),
-    (f"{TWO}place = [1, nan]", "key[1].place[1]: "), (f"{TWO}place = [1, 2, 3]", "key[1].place: "),
-    (f"{TWO}place = 'here'", "key[1].place: "), (f"{TWO}facing_deg = nan", "key[1].facing_deg: "),
-    (f"{TWO}height = 1979-05-27", "key[1].height: "), (f"{TWO}reach = {{ a = [1, 2] }}", "key[1].reach.a[2]: "),
-    (f"{TWO}root_only = true", "key[1]: the first and the last key in time are whole poses"),
-    (f"{TWO}joints = ['LeftHand']", "key[1]: the first and the last key in time are whole poses"),
-    (f"{TWO}[[key]]\nframe = 9\npose = 'a.bvh'\nroot_only = true\njoints = ['a']",
-     "key[2].root_only: a key tells the root or some joints; choose one"),
-    (TWO.replace('pose = "b.bvh"', ""), "key[1].pose: this key is needed where no body is given"),
-    (f"fps = 0\n{TWO}", "fps: "), (f"fps = nan\n{TWO}", "fps: "), (f"{TWO}]", "not TOML: "),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (TWO.replace("pose =", "poze =", 1), "key[0].poze: there is no such key; the nearest is pose; allowed: "),
+        (f"fsp = 30\n{TWO}", "fsp: there is no such key; the nearest is fps; allowed: "),
+        (f"{TWO}root = true", "key[1].root: there is no such key; the nearest is "),
+        ("", "key: this key is needed"),
+        ("[[key]]\nframe = 0\npose = 'a.bvh'", "in-betweening needs at least two keys, got 1"),
+        ("key = []", "in-betweening needs at least two keys, got 0"),
+        ("[key]\nframe = 0", "key: "),
+        (TWO.replace("frame = 30", "frame = 0"), "key[1]: key[0] is at frame 0 already"),
+        (TWO.replace("frame = 30", "seconds = 0.01"), "key[1]: key[0] is at frame 0 already"),
+        (TWO.replace("frame = 30", "frame = -1"), "key[1].frame: "),
+        (TWO.replace("frame = 30", "frame = 1.5"), "key[1].frame: "),
+        (TWO.replace("frame = 30", "frame = true"), "key[1].frame: "),
+        (TWO.replace("frame = 30", "seconds = inf"), "key[1].seconds: "),
+        (TWO.replace("frame = 30", "frame = 10000000"), "key[1].frame: "),
+        (
+            f"fps = 1000\n{TWO.replace('frame = 30', 'seconds = 3600')}",
+            "key[1].seconds: a motion may have 100000 frames",
+        ),
+        (TWO.replace("frame = 30", ""), "key[1].frame: a key is at a frame or at seconds, one of them"),
+        (f"{TWO}seconds = 1.0", "key[1].frame: a key is at a frame or at seconds, one of them"),
+        (TWO.replace("frame = 0", "frame = 4"), "key[0]: the motion begins with its first key, so that is at frame 0"),
+        (
+            f"{TWO}pose_frame = 1\npose_seconds = 0.1",
+            "key[1].pose_frame: a pose is told by pose_frame or by pose_seconds",
+        ),
+        (f"{TWO}place = [1, nan]", "key[1].place[1]: "),
+        (f"{TWO}place = [1, 2, 3]", "key[1].place: "),
+        (f"{TWO}place = 'here'", "key[1].place: "),
+        (f"{TWO}facing_deg = nan", "key[1].facing_deg: "),
+        (f"{TWO}height = 1979-05-27", "key[1].height: "),
+        (f"{TWO}reach = {{ a = [1, 2] }}", "key[1].reach.a[2]: "),
+        (f"{TWO}root_only = true", "key[1]: the first and the last key in time are whole poses"),
+        (f"{TWO}joints = ['LeftHand']", "key[1]: the first and the last key in time are whole poses"),
+        (
+            f"{TWO}[[key]]\nframe = 9\npose = 'a.bvh'\nroot_only = true\njoints = ['a']",
+            "key[2].root_only: a key tells the root or some joints; choose one",
+        ),
+        (TWO.replace('pose = "b.bvh"', ""), "key[1].pose: this key is needed where no body is given"),
+        (f"fps = 0\n{TWO}", "fps: "),
+        (f"fps = nan\n{TWO}", "fps: "),
+        (f"{TWO}]", "not TOML: "),
+    ],
+)
 def test_what_is_wrong_is_said_with_its_place(tmp_path, text, said):
     path = written(tmp_path, text)
     with pytest.raises(FileFormatError) as caught:

@@ -44,8 +44,9 @@ def canonical_of(found):
 
 def made_of(request):
     found = keyed(request)
-    done = tween(found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig,
-                 settings=InfillSettings(method="infiller"))  # fmt: skip
+    done = tween(
+        found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig, settings=InfillSettings(method="infiller")
+    )
     return found, done
 
 
@@ -72,8 +73,9 @@ def test_hips_are_put_turned_and_lifted_and_the_pose_stays(poses, rig):
     assert torch.allclose(whole.root_position[0], plain.root_position[0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("body", "other"), [("bandai", "daz"), ("daz", "canonical"), ("canonical", "zup"),
-                                             ("zup", "bandai")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("body", "other"), [("bandai", "daz"), ("daz", "canonical"), ("canonical", "zup"), ("zup", "bandai")]
+)
 def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
     """Rotations stay but of the legs, the hips' way is in the scale of these, and toes are as high over their rest."""
     found = keyed(KeyRequest(first_and_last(poses[other]), body=poses[body]))
@@ -85,8 +87,9 @@ def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
     assert aside[::2].norm() < 0.02
     stance = Stance.of(*retarget.to_canonical(mapctl.load(poses[body])))
     own = Stance.of(*retarget.to_canonical(mapctl.load(poses[other])))
-    high, theirs = (m.joint_positions()[30, [m.skeleton.index(n) for n in ("leftToes", "rightToes")], 1]
-                    for m in (whole, source))  # fmt: skip
+    high, theirs = (
+        m.joint_positions()[30, [m.skeleton.index(n) for n in ("leftToes", "rightToes")], 1] for m in (whole, source)
+    )
     torch.testing.assert_close(high - stance.toe_height, legs * (theirs - own.flat_height), atol=0.01, rtol=0)
     known = [joint for joint, name in enumerate(whole.skeleton.names) if not name.endswith(("Leg", "Foot", "Toes"))]
     turned = apart_deg(whole.joint_rotations()[30], source.joint_rotations()[30])[known]
@@ -96,13 +99,16 @@ def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
 @pytest.mark.parametrize("rig", [*RIGS, "zup"])
 def test_every_kind_of_key_is_met_in_one_motion(poses, rig):
     rigmap = retarget.to_canonical(keyed(KeyRequest(first_and_last(poses[rig]))).motion)[1]
-    hand, foot = (rigmap.rig_skeleton.names[rigmap.joint_of[rigmap.skeleton.index(name)]]
-                  for name in ("leftHand", "rightFoot"))  # fmt: skip
+    hand, foot = (
+        rigmap.rig_skeleton.names[rigmap.joint_of[rigmap.skeleton.index(name)]] for name in ("leftHand", "rightFoot")
+    )
     start, stop = first_and_last(poses[rig])
-    between = (PlacedKey(frame=7, reach={hand: (0.4, 1.2, 0.5)}),
-               PlacedKey(frame=13, pose=poses[rig], pose_frame=14, joints=(foot,)),
-               PlacedKey(frame=19, pose=poses[rig], pose_frame=18, root_only=True, place=(0.1, 0.6)),
-               PlacedKey(frame=24, pose=poses[rig], pose_frame=24))  # fmt: skip
+    between = (
+        PlacedKey(frame=7, reach={hand: (0.4, 1.2, 0.5)}),
+        PlacedKey(frame=13, pose=poses[rig], pose_frame=14, joints=(foot,)),
+        PlacedKey(frame=19, pose=poses[rig], pose_frame=18, root_only=True, place=(0.1, 0.6)),
+        PlacedKey(frame=24, pose=poses[rig], pose_frame=24),
+    )
     found, done = made_of(KeyRequest((stop, *between, start)))
     rows = key_errors(done.motion, found.motion, found.keys, found.rig)
     assert [row["what"] for row in rows] == ["pose", "limbs", "limbs", "root", "pose", "pose"]
@@ -121,14 +127,17 @@ def test_of_a_key_that_only_reaches_a_pose_would_not_count_and_is_refused(poses,
         KeyRequest((start, PlacedKey(frame=15, reach={"Hand_L": (0.3, 1.3, 0.9)}, **more), stop))
 
 
-@pytest.mark.parametrize(("key", "said"), [
-    (PlacedKey(frame=9, pose="gone.npz"), r"key\[2\]\.pose: gone\.npz"),
-    (PlacedKey(frame=9, pose="clip.mp3"), r"key\[2\]\.pose: clip\.mp3"),
-    (PlacedKey(frame=9, pose_frame=45), r"key\[2\]\.pose_frame: the frame 45 is not one of the pose's 0:45"),
-    (PlacedKey(frame=9, pose_seconds=1.6), r"key\[2\]\.pose_seconds: the frame 48 is not one of the pose's 0:45"),
-    (PlacedKey(frame=9, joints=("Hnad_L",)), r"key\[2\]\.joints: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (PlacedKey(frame=9, reach={"fot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'fot_r'; .* Foot_R"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        (PlacedKey(frame=9, pose="gone.npz"), r"key\[2\]\.pose: gone\.npz"),
+        (PlacedKey(frame=9, pose="clip.mp3"), r"key\[2\]\.pose: clip\.mp3"),
+        (PlacedKey(frame=9, pose_frame=45), r"key\[2\]\.pose_frame: the frame 45 is not one of the pose's 0:45"),
+        (PlacedKey(frame=9, pose_seconds=1.6), r"key\[2\]\.pose_seconds: the frame 48 is not one of the pose's 0:45"),
+        (PlacedKey(frame=9, joints=("Hnad_L",)), r"key\[2\]\.joints: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+        (PlacedKey(frame=9, reach={"fot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'fot_r'; .* Foot_R"),
+    ],
+)
 def test_what_is_not_there_is_named_with_its_key(poses, key, said):
     with pytest.raises(RequestError, match=said):
         keyed(KeyRequest((*first_and_last(poses["bandai"]), key), body=poses["bandai"]))
@@ -146,8 +155,10 @@ def test_a_pose_on_a_skeleton_that_is_no_body_is_refused(poses, tmp_path):
 
 def test_limbs_that_no_one_could_bring_there_in_time_are_named_with_numbers(poses):
     start, stop = first_and_last(poses["bandai"])
-    reaches = (PlacedKey(frame=14, reach={"Hand_L": (0.6, 1.3, 0.5)}),
-               PlacedKey(frame=15, reach={"Hand_L": (-0.4, 1.3, 0.5)}))  # fmt: skip
+    reaches = (
+        PlacedKey(frame=14, reach={"Hand_L": (0.6, 1.3, 0.5)}),
+        PlacedKey(frame=15, reach={"Hand_L": (-0.4, 1.3, 0.5)}),
+    )
     _, done = made_of(KeyRequest((start, *reaches, stop)))
     assert done.notes[0] == "Hand_L needs 30 m/s between frames 14 and 15, which nobody reaches"
     slower = (reaches[0], PlacedKey(frame=17, reach=reaches[1].reach))

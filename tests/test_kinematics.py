@@ -12,8 +12,9 @@ from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
-BRANCHED = Skeleton(("a", "b", "c", "d", "e"), (-1, 0, 0, 1, 3),
-                    torch.randn(5, 3, generator=generator(1), dtype=torch.float64))  # fmt: skip
+BRANCHED = Skeleton(
+    ("a", "b", "c", "d", "e"), (-1, 0, 0, 1, 3), torch.randn(5, 3, generator=generator(1), dtype=torch.float64)
+)
 
 
 def by_matrices(skeleton, root, local):
@@ -111,10 +112,16 @@ def test_the_canonical_skeleton_stands_as_the_conventions_say():
         torch.testing.assert_close(at[mirrored_name(name)] * torch.tensor([-1.0, 1, 1]), at[name], check_dtype=False)
 
 
-@pytest.mark.parametrize(("names", "parents", "rows"), [
-    (("a", "a"), (-1, 0), 2), (("a", "b"), (-1, 1), 2), (("a", "b"), (0, 0), 2), (("a", "b"), (-1, 0), 3),
-    (("a", "b", "c"), (-1, -1, 0), 3),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("names", "parents", "rows"),
+    [
+        (("a", "a"), (-1, 0), 2),
+        (("a", "b"), (-1, 1), 2),
+        (("a", "b"), (0, 0), 2),
+        (("a", "b"), (-1, 0), 3),
+        (("a", "b", "c"), (-1, -1, 0), 3),
+    ],
+)
 def test_trees_that_are_none_are_refused(names, parents, rows):
     with pytest.raises(MapctlError):
         Skeleton(names, parents, torch.zeros(rows, 3, dtype=torch.float64))

@@ -25,22 +25,33 @@ def test_labels_are_the_named_groups_of_the_clip_names():
     found = labels.read(CLIPS, PATTERN)
     assert found.names == ("gait=run", "gait=turn-left", "gait=turn-right", "gait=walk", "style=glad", "style=old")
     held = [{found.names[i] for i in row.nonzero()[:, 0].tolist()} for row in found.held]
-    assert held == [{"gait=walk", "style=glad"}, {"gait=turn-left", "style=glad"}, {"gait=turn-right", "style=old"},
-                    {"gait=run", "style=old"}, set()]  # fmt: skip
+    assert held == [
+        {"gait=walk", "style=glad"},
+        {"gait=turn-left", "style=glad"},
+        {"gait=turn-right", "style=old"},
+        {"gait=run", "style=old"},
+        set(),
+    ]
     assert found.groups.tolist() == [[1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1]]
 
 
 def test_a_mirrored_turn_is_the_other_turn():
     found = labels.read(CLIPS, PATTERN)
     assert [found.names[i] for i in found.mirrored] == [
-        "gait=run", "gait=turn-right", "gait=turn-left", "gait=walk", "style=glad", "style=old",
-    ]  # fmt: skip
+        "gait=run",
+        "gait=turn-right",
+        "gait=turn-left",
+        "gait=walk",
+        "style=glad",
+        "style=old",
+    ]
     only_left = labels.read(CLIPS[:2], PATTERN)
     assert only_left.mirrored == list(range(len(only_left.names)))
 
 
-@pytest.mark.parametrize(("pattern", "message"), [("(", "regular expression"), ("walk", "named groups"),
-                                                  ("(?P<gait>swim)", "match no clip")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("pattern", "message"), [("(", "regular expression"), ("walk", "named groups"), ("(?P<gait>swim)", "match no clip")]
+)
 def test_patterns_that_read_nothing_are_refused(pattern, message):
     with pytest.raises(RequestError, match=message):
         labels.read(CLIPS, pattern)
@@ -103,12 +114,15 @@ def test_a_told_density_begins_where_the_labels_hold():
     assert not torch.allclose(told, untold)
 
 
-@pytest.mark.parametrize(("name", "said"), [
-    ("swim", "prior 'named' knows no gait or style 'swim', only gait: run; style: old"),
-    ("gait=swim", "prior 'named' knows no gait 'swim', only gait: run; style: old"),
-    ("style=run", "prior 'named' knows no style 'run', only gait: run"),
-    ("mood=sad", "prior 'named' knows no gait or style 'mood=sad', only gait: run"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("swim", "prior 'named' knows no gait or style 'swim', only gait: run; style: old"),
+        ("gait=swim", "prior 'named' knows no gait 'swim', only gait: run; style: old"),
+        ("style=run", "prior 'named' knows no style 'run', only gait: run"),
+        ("mood=sad", "prior 'named' knows no gait or style 'mood=sad', only gait: run"),
+    ],
+)
 def test_what_is_not_known_is_called_what_it_may_be(name, said):
     with pytest.raises(RequestError) as refused:
         labelled_density().told([name])
@@ -128,7 +142,8 @@ def test_starts_weigh_as_much_as_the_data_has_of_their_speed():
     found = choose(model, data, count=5, generator=generator())
     assert float(found.weight.sum()) == pytest.approx(1)
     assert found.weight.tolist() == pytest.approx([0.2] * 5)  # each walk has a speed of its own, and all are as long
-    longer = Corpus(data.names, (*data.lengths[:-1], data.lengths[-1] + 100),
-                    torch.cat([data.features, data.features[-100:]]))  # fmt: skip
+    longer = Corpus(
+        data.names, (*data.lengths[:-1], data.lengths[-1] + 100), torch.cat([data.features, data.features[-100:]])
+    )
     weight = choose(model, longer, count=5, generator=generator()).weight
     assert sorted(weight.tolist()) == pytest.approx([1 / 6] * 4 + [2 / 6])

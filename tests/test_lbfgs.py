@@ -54,9 +54,13 @@ def powell(x: Tensor) -> Tensor:
 def wood(x: Tensor) -> Tensor:
     a, b, c, d = x.unbind(-1)
     return (
-        100 * (a**2 - b) ** 2 + (a - 1) ** 2 + (c - 1) ** 2 + 90 * (c**2 - d) ** 2
-        + 10.1 * ((b - 1) ** 2 + (d - 1) ** 2) + 19.8 * (b - 1) * (d - 1)
-    )  # fmt: skip
+        100 * (a**2 - b) ** 2
+        + (a - 1) ** 2
+        + (c - 1) ** 2
+        + 90 * (c**2 - d) ** 2
+        + 10.1 * ((b - 1) ** 2 + (d - 1) ** 2)
+        + 19.8 * (b - 1) * (d - 1)
+    )
 
 
 def himmelblau(x: Tensor) -> Tensor:

@@ -20,8 +20,15 @@ import mapctl
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 COUNTED = re.compile(r"\d+ of \d+ frames late")  # in the page once characters move
 SIZE = {"width": 760, "height": 620}  # small: these machines draw without a graphics card
-SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-            "--disable-background-networking", "--disable-component-update", "--disable-sync"]  # fmt: skip
+SWITCHES = [
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium; .ci/setup browser says how to get it")
 
 
@@ -43,8 +50,11 @@ class Live:
         self.port = port or free_port()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "mapctl.cli", "live", "--port", str(self.port), *map(str, words)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=_hear_ctrl_c,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            preexec_fn=_hear_ctrl_c,
+        )
         self.lines: list[str] = []
         assert self.process.stdout is not None
         while not any("open http" in line for line in self.lines):

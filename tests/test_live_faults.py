@@ -213,9 +213,17 @@ VALUES = (
 
 
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 0.0), "fov": 1.0, "near": 0.1,
-    "far": 9.0, "image_height": 9, "image_width": 9, "look_at": (0.0, 0.0, 1.0), "up_direction": (0.0, 1.0, 0.0),
-}  # fmt: skip
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 0.0),
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 9.0,
+    "image_height": 9,
+    "image_width": 9,
+    "look_at": (0.0, 0.0, 1.0),
+    "up_direction": (0.0, 1.0, 0.0),
+}
 
 
 def controls(show):

@@ -30,19 +30,22 @@ def test_whatever_is_asked_the_orders_are_a_command_within_bounds(first, second)
     assert BOUNDS.changed(orders, {})[0] == orders
 
 
-@pytest.mark.parametrize(("name", "asked", "held", "text"), [
-    ("speed", -5.0, 0.0, "A speed of -5 m/s was raised to 0: it can be 0 to 3.8 m/s."),
-    ("speed", 99, 3.8, "A speed of 99 m/s was lowered to 3.8: it can be 0 to 3.8 m/s."),
-    ("speed", 1e9, 3.8, "A speed of 1e+09 m/s was lowered to 3.8: it can be 0 to 3.8 m/s."),
-    ("speed", math.nan, 1.2, "'nan' is no number; 1.2 holds"),
-    ("speed", "fast", 1.2, "'fast' is no number; 1.2 holds"),
-    ("speed", None, 1.2, "'None' is no number; 1.2 holds"),
-    ("step_length", 0, 0.3, "A step length of 0 m was raised to 0.3: it can be 0.3 to 1.2 m."),
-    ("step_length", 99.0, 1.2, "A step length of 99 m was lowered to 1.2: it can be 0.3 to 1.2 m."),
-    ("heading", 370, 10.0, "A heading of 370 degrees is the same as 10."),
-    ("facing", -540.0, -180.0, "A facing of -540 degrees is the same as "),
-    ("facing", math.inf, None, "'inf' is no number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "asked", "held", "text"),
+    [
+        ("speed", -5.0, 0.0, "A speed of -5 m/s was raised to 0: it can be 0 to 3.8 m/s."),
+        ("speed", 99, 3.8, "A speed of 99 m/s was lowered to 3.8: it can be 0 to 3.8 m/s."),
+        ("speed", 1e9, 3.8, "A speed of 1e+09 m/s was lowered to 3.8: it can be 0 to 3.8 m/s."),
+        ("speed", math.nan, 1.2, "'nan' is no number; 1.2 holds"),
+        ("speed", "fast", 1.2, "'fast' is no number; 1.2 holds"),
+        ("speed", None, 1.2, "'None' is no number; 1.2 holds"),
+        ("step_length", 0, 0.3, "A step length of 0 m was raised to 0.3: it can be 0.3 to 1.2 m."),
+        ("step_length", 99.0, 1.2, "A step length of 99 m was lowered to 1.2: it can be 0.3 to 1.2 m."),
+        ("heading", 370, 10.0, "A heading of 370 degrees is the same as 10."),
+        ("facing", -540.0, -180.0, "A facing of -540 degrees is the same as "),
+        ("facing", math.inf, None, "'inf' is no number"),
+    ],
+)
 def test_what_cannot_be_is_brought_near_and_said_with_what_can(name, asked, held, text):
     orders, refusals = BOUNDS.changed(Orders(), {name: asked})
     value = getattr(orders, name)

@@ -10,8 +10,19 @@ from scenes.live.realtime import Pace
 def step(seconds: float, *, spare: float = 0.03, evaluations: int = 14) -> Delivered:
     """Three frames of a stream."""
     three = np.zeros((3, 3))
-    return Delivered(0.0, seconds, three, np.zeros((3, 21, 4)), np.zeros((3, 2)), np.zeros((0, 21, 3)), (0.0, 1.0), {},
-                     spare, 0.05, evaluations)  # fmt: skip
+    return Delivered(
+        0.0,
+        seconds,
+        three,
+        np.zeros((3, 21, 4)),
+        np.zeros((3, 2)),
+        np.zeros((0, 21, 3)),
+        (0.0, 1.0),
+        {},
+        spare,
+        0.05,
+        evaluations,
+    )
 
 
 def played(pace: Pace, *, begin: float, until: float, every: float = 0.1, spare: float = 0.03) -> list[float]:

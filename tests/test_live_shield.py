@@ -22,24 +22,27 @@ from scenes.live.access import Quiet, may_come, one_line, only_own_pages
 OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 
 
-@pytest.mark.parametrize(("changes", "may"), [
-    ({}, True),
-    ({"Origin": "http://localhost:8080", "Host": "localhost:8080"}, True),
-    ({"Origin": "http://LOCALHOST:8080"}, True),
-    ({"Origin": None, "Upgrade": None}, True),
-    ({"Origin": None}, False),
-    ({"Origin": "http://example.org"}, False),
-    ({"Origin": "http://127.0.0.1:8081"}, False),
-    ({"Origin": "https://127.0.0.1:8080"}, False),
-    ({"Origin": "http://127.0.0.1:8080.example.org"}, False),
-    ({"Origin": "null"}, False),
-    ({"Origin": ""}, False),
-    ({"Origin": "http://example.org", "Upgrade": None}, False),
-    ({"Host": "example.org:8080"}, False),
-    ({"Host": "example.org:8080", "Origin": None, "Upgrade": None}, False),
-    ({"Host": "127.0.0.1"}, False),
-    ({"Host": None}, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "may"),
+    [
+        ({}, True),
+        ({"Origin": "http://localhost:8080", "Host": "localhost:8080"}, True),
+        ({"Origin": "http://LOCALHOST:8080"}, True),
+        ({"Origin": None, "Upgrade": None}, True),
+        ({"Origin": None}, False),
+        ({"Origin": "http://example.org"}, False),
+        ({"Origin": "http://127.0.0.1:8081"}, False),
+        ({"Origin": "https://127.0.0.1:8080"}, False),
+        ({"Origin": "http://127.0.0.1:8080.example.org"}, False),
+        ({"Origin": "null"}, False),
+        ({"Origin": ""}, False),
+        ({"Origin": "http://example.org", "Upgrade": None}, False),
+        ({"Host": "example.org:8080"}, False),
+        ({"Host": "example.org:8080", "Origin": None, "Upgrade": None}, False),
+        ({"Host": "127.0.0.1"}, False),
+        ({"Host": None}, False),
+    ],
+)
 def test_only_pages_of_this_server_may_come(changes, may):
     headers = Headers({name: value for name, value in (OWN | changes).items() if value is not None})
     assert may_come(headers, 8080) is may

@@ -34,14 +34,17 @@ def test_a_header_alone_masks_nothing(read):
     assert read("joint,start,stop\n") == ()
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("joint,start\nlHand,0\n", "needs the columns joint, start, stop, each once; found 'joint,start'"),
-    ("joint,start,stop\nlHand,0,12\nrHand,x,4\n", "line 3: expected a joint and two whole frames"),
-    ("joint,start,stop\nlHand,1.5,4\n", "line 2: expected a joint and two whole frames"),
-    ("joint,start,stop\nlHand,1\n", "line 2: found 2 values where 3 belong"),
-    ("joint,start,stop\nlHand,4,4\n", "line 2: needs 0 <= start < stop, got 4 and 4"),
-    ("joint,start,stop\nlHand,-1,4\n", "line 2: needs 0 <= start < stop, got -1 and 4"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("joint,start\nlHand,0\n", "needs the columns joint, start, stop, each once; found 'joint,start'"),
+        ("joint,start,stop\nlHand,0,12\nrHand,x,4\n", "line 3: expected a joint and two whole frames"),
+        ("joint,start,stop\nlHand,1.5,4\n", "line 2: expected a joint and two whole frames"),
+        ("joint,start,stop\nlHand,1\n", "line 2: found 2 values where 3 belong"),
+        ("joint,start,stop\nlHand,4,4\n", "line 2: needs 0 <= start < stop, got 4 and 4"),
+        ("joint,start,stop\nlHand,-1,4\n", "line 2: needs 0 <= start < stop, got -1 and 4"),
+    ],
+)
 def test_errors_name_the_line(read, text, message):
     with pytest.raises(FileFormatError, match=message.replace(".", r"\.")):
         read(text)
@@ -75,14 +78,17 @@ def test_no_masks_hide_nothing(motion):
     assert not root.any()
 
 
-@pytest.mark.parametrize(("masks", "message"), [
-    ([Mask("lhnad", 0, 3)], "no joint 'lhnad' to mask; the nearest is lHand"),
-    ([Mask("rTigh", 0, 3)], "nearest is rThigh"),
-    ([Mask("lHand", 30, 41)], "the mask of lHand ends at 41, the recording at 40"),
-    ([Mask("lHand", 0, 20), Mask("lHand", 20, 40)], "the masks leave nothing of lHand"),
-    ([Mask(ROOT, 0, 40)], "the masks leave nothing of root position"),
-    ([Mask(ALL, 0, 40)], "the masks leave nothing of"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        ([Mask("lhnad", 0, 3)], "no joint 'lhnad' to mask; the nearest is lHand"),
+        ([Mask("rTigh", 0, 3)], "nearest is rThigh"),
+        ([Mask("lHand", 30, 41)], "the mask of lHand ends at 41, the recording at 40"),
+        ([Mask("lHand", 0, 20), Mask("lHand", 20, 40)], "the masks leave nothing of lHand"),
+        ([Mask(ROOT, 0, 40)], "the masks leave nothing of root position"),
+        ([Mask(ALL, 0, 40)], "the masks leave nothing of"),
+    ],
+)
 def test_masks_that_do_not_fit_are_refused(motion, masks, message):
     with pytest.raises(RequestError, match=message):
         masked(motion, masks)

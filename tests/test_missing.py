@@ -102,8 +102,11 @@ def test_nan_in_an_archive(tmp_path, key):
     motion = on_rig("bandai", 12)
     motion.save(tmp_path / "in.npz")
     hips = motion.skeleton.names.index("Hips")
-    place = {"local_quat_xyzw": (slice(3, 5), hips, 0), "root_position_world": (slice(3, 5), 2),
-             "moving_offsets": (0, slice(3, 5), 1)}[key]  # fmt: skip
+    place = {
+        "local_quat_xyzw": (slice(3, 5), hips, 0),
+        "root_position_world": (slice(3, 5), 2),
+        "moving_offsets": (0, slice(3, 5), 1),
+    }[key]
     lossy = archive_without(tmp_path / "in.npz", tmp_path / "lossy.npz", **{key: place})
     with pytest.raises(FileFormatError, match=rf"{key} at \[.*\]: .*; `mapctl infill` fills in what is lost"):
         mapctl.load(lossy)
@@ -149,13 +152,16 @@ def test_nan_in_a_take_of_acclaim(tmp_path):
     assert_known_where(motion, whole, known)
 
 
-@pytest.mark.parametrize(("lost", "word", "said"), [
-    ([("", 0, 12)], "nan", "every value is nan: nothing is known of the motion"),
-    ([("Hand_L", 3, 4)], "inf", "frame 3, column .*Hand_L Zrotation.*expected a finite number.*got 'inf'$"),
-    ([("Hand_L", 3, 4)], "nothing", "got 'nothing'$"),
-    ([("Hand_L", 3, 4)], "nan1", "got 'nan1'$"),
-    ([("Hand_L", 3, 4)], "1e9", "got '1e9'$"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("lost", "word", "said"),
+    [
+        ([("", 0, 12)], "nan", "every value is nan: nothing is known of the motion"),
+        ([("Hand_L", 3, 4)], "inf", "frame 3, column .*Hand_L Zrotation.*expected a finite number.*got 'inf'$"),
+        ([("Hand_L", 3, 4)], "nothing", "got 'nothing'$"),
+        ([("Hand_L", 3, 4)], "nan1", "got 'nan1'$"),
+        ([("Hand_L", 3, 4)], "1e9", "got '1e9'$"),
+    ],
+)
 def test_what_is_no_number_and_no_nan_is_refused(tmp_path, lost, word, said):
     on_rig("bandai", 12).save(tmp_path / "in.bvh")
     lossy = without(tmp_path / "in.bvh", tmp_path / "lossy.bvh", lost, word=word)

@@ -118,12 +118,7 @@ def test_a_mirror_image_has_every_joint_on_the_other_side():
     bones = CANONICAL.offsets * (1 + 0.2 * torch.rand(21, 1, generator=generator(), dtype=torch.float64))
     motion = random_motion(Skeleton(CANONICAL.names, CANONICAL.parents, bones))
     image = motion.mirror()
-    for name, other in (
-        ("hips", "hips"),
-        ("head", "head"),
-        ("leftHand", "rightHand"),
-        ("rightToes", "leftToes"),
-    ):
+    for name, other in (("hips", "hips"), ("head", "head"), ("leftHand", "rightHand"), ("rightToes", "leftToes")):
         place = motion.joint_positions()[:, CANONICAL.index(name)] * torch.tensor([-1.0, 1, 1])
         torch.testing.assert_close(image.joint_positions()[:, CANONICAL.index(other)], place, atol=1e-9, rtol=0)
 
@@ -134,8 +129,20 @@ def test_a_side_without_partner_cannot_be_mirrored():
         random_motion(one_armed).mirror()
 
 
-@pytest.mark.parametrize("name", ["Toes_R", "Hand_L", "LeftFoot", "mixamorig:LeftUpLeg", "Bip01 R Thigh", "rShldr",
-                                  "LHipJoint", "thigh.l", "footleft"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Toes_R",
+        "Hand_L",
+        "LeftFoot",
+        "mixamorig:LeftUpLeg",
+        "Bip01 R Thigh",
+        "rShldr",
+        "LHipJoint",
+        "thigh.l",
+        "footleft",
+    ],
+)
 def test_sides_named_otherwise_are_not_mirrored_in_silence(name):
     rig = Skeleton(("hips", "leftHand", "rightHand", name), (-1, 0, 0, 0), torch.zeros(4, 3).double())
     with pytest.raises(MapctlError, match=f"cannot tell left from right by the joints {name}; use retarget"):

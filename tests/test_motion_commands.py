@@ -23,8 +23,10 @@ COMMANDS = sorted(WORDS)
 def tiny(tmp_path_factory):
     """The option and the network of each command."""
     folder = tmp_path_factory.mktemp("tiny")
-    files = {"--denoiser": save_tiny_denoiser(folder / "denoiser.safetensors"),
-             "--infiller": save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02)}  # fmt: skip
+    files = {
+        "--denoiser": save_tiny_denoiser(folder / "denoiser.safetensors"),
+        "--infiller": save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02),
+    }
     return {command: (option, files[option]) for command, option in NETWORK.items()}
 
 
@@ -71,18 +73,22 @@ def test_straight_lines_need_no_network(command, source, tmp_path):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(("words", "said"), [
-    (["gone.bvh", "-o", "a.bvh"], "gone.bvh"),
-    (["broken.bvh", "-o", "a.bvh"], "broken.bvh"),
-    (["in.bvh"], "--out"),
-    (["in.bvh", "-o", "a.mp3"], ".mp3"),
-    (["in.bvh", "-o", "gone/a.bvh"], "gone"),
-    (["in.bvh", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
-    (["in.bvh", "-o", "a.bvh", "--video", "p.avi"], ".mp4"),
-    (["in.bvh", "-o", "a.bvh", "--rig", "nobody"], "nobody"),
-    (["in.bvh", "-o", "./in.bvh"], "would be written over what it is made from"),
-    (["in.bvh", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
-], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["gone.bvh", "-o", "a.bvh"], "gone.bvh"),
+        (["broken.bvh", "-o", "a.bvh"], "broken.bvh"),
+        (["in.bvh"], "--out"),
+        (["in.bvh", "-o", "a.mp3"], ".mp3"),
+        (["in.bvh", "-o", "gone/a.bvh"], "gone"),
+        (["in.bvh", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
+        (["in.bvh", "-o", "a.bvh", "--video", "p.avi"], ".mp4"),
+        (["in.bvh", "-o", "a.bvh", "--rig", "nobody"], "nobody"),
+        (["in.bvh", "-o", "./in.bvh"], "would be written over what it is made from"),
+        (["in.bvh", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(command, tiny, source, fails, words, said):
     Path("broken.bvh").write_text("HIERARCHY\nnonsense")
     assert said in fails(command, *words, *WORDS[command], *tiny[command])

@@ -68,21 +68,28 @@ CHANGES = {
     "fewer joints": ({"local_quat_xyzw": QUAT[:, :20]}, r"local_quat_xyzw .* expected .*\(5, 21, 4\)"),
     "fewer frames": ({"local_quat_xyzw": QUAT[:4]}, r"local_quat_xyzw .* expected .*\(5, 21, 4\)"),
     "whole numbers": ({"offsets": np.zeros((21, 3), int)}, "offsets has int64"),
-    "nan": ({"root_position_world": np.full((5, 3), np.nan)},
-            r"root_position_world at \[0, 0\]: expected a finite number"),
+    "nan": (
+        {"root_position_world": np.full((5, 3), np.nan)},
+        r"root_position_world at \[0, 0\]: expected a finite number",
+    ),
     "no rotation": ({"local_quat_xyzw": QUAT * 0}, "no unit quaternion"),
-    "no frames": ({"root_position_world": np.zeros((0, 3)), "local_quat_xyzw": np.zeros((0, 21, 4)),
-                   "moving_offsets": np.zeros((1, 0, 3))}, "at least one frame"),
+    "no frames": (
+        {
+            "root_position_world": np.zeros((0, 3)),
+            "local_quat_xyzw": np.zeros((0, 21, 4)),
+            "moving_offsets": np.zeros((1, 0, 3)),
+        },
+        "at least one frame",
+    ),
     "no rate": ({"fps": np.array([30, 0])}, "does not hold a motion"),
     "negative rate": ({"fps": np.array([-30, 1])}, "-30 frames per second, allowed are"),
     "not a tree": ({"parents": np.full(21, 3)}, "joint 0 must be the root"),
-    "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)},
-                   "unique"),
+    "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)}, "unique"),
     "stray end": ({"end_names": np.array(["a", "b", "c", "d", "e"])}, "joints of the skeleton"),
     "stray joint": ({"moving_joints": np.array([77])}, "joints of the skeleton"),
     "objects": ({"names": np.array([object()] * 21)}, "not a sound .npz archive"),
     "one number": ({"root_position_world": np.array(1.0)}, "root_position_world"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", CHANGES)
@@ -165,9 +172,12 @@ def test_a_full_disk_is_a_request_error_and_leaves_nothing(tmp_path):
 def test_places_that_cannot_be_written_are_named(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder.bvh").mkdir()
-    places = {"missing/out.bvh": "does not exist", "file/out.bvh": "does not exist",
-              "folder.bvh": "is a folder",
-              "x" * 300 + ".bvh": "cannot write"}  # fmt: skip
+    places = {
+        "missing/out.bvh": "does not exist",
+        "file/out.bvh": "does not exist",
+        "folder.bvh": "is a folder",
+        "x" * 300 + ".bvh": "cannot write",
+    }
     for place, words in places.items():
         for attempt in (check_writable, lambda path: write_text(path, "x"), example().save):
             with pytest.raises(RequestError, match=words):

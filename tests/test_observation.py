@@ -16,8 +16,14 @@ from mapctl.terms.trial import Trial
 def trial_of(seed=1) -> Trial:
     features, start = encode(walk(FRAMES, seed=seed))
     features = features.unsqueeze(0)
-    return Trial(features, start, features[..., : LAYOUT.continuous], features[..., 0],
-                 LAYOUT.pick(features, "contacts") > 0.5, torch.zeros(0, 21, 3).double())  # fmt: skip
+    return Trial(
+        features,
+        start,
+        features[..., : LAYOUT.continuous],
+        features[..., 0],
+        LAYOUT.pick(features, "contacts") > 0.5,
+        torch.zeros(0, 21, 3).double(),
+    )
 
 
 def observed(trial: Trial, **changes) -> Observation:
@@ -76,8 +82,13 @@ def test_a_spike_pulls_no_harder_than_an_outlier():
 def test_what_was_not_seen_says_nothing():
     trial = trial_of()
     whole = observed(trial)
-    blind = replace(whole, angles=whole.angles + 3.0, root=whole.root + 1.0, seen=torch.zeros(FRAMES, 21).bool(),
-                    seen_root=torch.zeros(FRAMES).bool())  # fmt: skip
+    blind = replace(
+        whole,
+        angles=whole.angles + 3.0,
+        root=whole.root + 1.0,
+        seen=torch.zeros(FRAMES, 21).bool(),
+        seen_root=torch.zeros(FRAMES).bool(),
+    )
     assert float(blind(trial).abs().max()) == 0
     assert float(blind.residual(trial).abs().max()) == 0
     one = whole.seen.clone()

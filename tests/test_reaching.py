@@ -27,8 +27,9 @@ def reach(motion, targets, *, stray=0.0, turning=None, moving=None):
     all_of_it = torch.ones(motion.num_frames, JOINTS, dtype=torch.bool)
     turning = all_of_it if turning is None else turning
     moving = all_of_it[:, 0] if moving is None else moving
-    return reach_with_body(motion, targets, turning=turning, moving=moving,
-                           stray=torch.full((motion.num_frames,), stray))  # fmt: skip
+    return reach_with_body(
+        motion, targets, turning=turning, moving=moving, stray=torch.full((motion.num_frames,), stray)
+    )
 
 
 def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
@@ -36,8 +37,17 @@ def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
     return motion.joint_positions()[frame, SHOULDER] + torch.tensor([aside, up, ahead]).double()
 
 
-@pytest.mark.parametrize("where", [{"ahead": 0.3}, {"ahead": 0.62}, {"up": -1.1, "ahead": 0.35}, {"aside": 0.55},
-                                   {"up": 0.5}, {"ahead": 0.05, "up": -0.1}])  # fmt: skip
+@pytest.mark.parametrize(
+    "where",
+    [
+        {"ahead": 0.3},
+        {"ahead": 0.62},
+        {"up": -1.1, "ahead": 0.35},
+        {"aside": 0.55},
+        {"up": 0.5},
+        {"ahead": 0.05, "up": -0.1},
+    ],
+)
 def test_a_hand_gets_there_and_standing_feet_stay(where):
     motion = walk(5, cadence=0.0)
     place = beside(motion, 2, **where)
@@ -86,8 +96,10 @@ def test_what_may_not_move_does_not_and_bones_keep_their_lengths():
     kept = ~turning[0]
     assert torch.equal(made.local_quat_xyzw[:, kept], motion.local_quat_xyzw[:, kept])
     assert torch.equal(made.root_position, motion.root_position)
-    bones = [(each[:, 1:] - each[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
-             for each in (made.joint_positions(), motion.joint_positions())]  # fmt: skip
+    bones = [
+        (each[:, 1:] - each[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
+        for each in (made.joint_positions(), motion.joint_positions())
+    ]
     torch.testing.assert_close(*bones, atol=1e-9, rtol=0)
 
 
@@ -120,6 +132,7 @@ def test_joints_that_end_no_limb_are_refused(joint):
 
 def test_nothing_wanted_changes_nothing():
     motion = walk(4)
-    nothing = Targets(torch.randn(4, JOINTS, 3, generator=generator(0)).double(),
-                      torch.zeros(4, JOINTS, dtype=torch.bool))  # fmt: skip
+    nothing = Targets(
+        torch.randn(4, JOINTS, 3, generator=generator(0)).double(), torch.zeros(4, JOINTS, dtype=torch.bool)
+    )
     assert reach(motion, nothing)[0] is motion

@@ -31,8 +31,13 @@ def network_of(config=TINY, *, trained=True, scale=1.0):
     reach = torch.linspace(-0.5, 0.5, channels(config.joints))
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        network = RefinerNetwork(config, mean=features.mean(0), std=features.std(0).clamp(min=0.002),
-                                 reach_mean=reach, reach_std=1 + reach.abs())  # fmt: skip
+        network = RefinerNetwork(
+            config,
+            mean=features.mean(0),
+            std=features.std(0).clamp(min=0.002),
+            reach_mean=reach,
+            reach_std=1 + reach.abs(),
+        )
         if trained:
             torch.nn.init.normal_(network.last.weight, std=scale)
             torch.nn.init.normal_(network.last.bias, std=scale)
@@ -158,8 +163,18 @@ def test_in_float32_too_the_whole_is_its_pieces():
     torch.testing.assert_close(streamed, refiner.refine(features), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("change", [{"width": 0}, {"memory": -1}, {"lookahead": -1}, {"limit": 0.0},
-                                    {"limit": float("nan")}, {"joints": ("tail",)}, {"joints": ()}])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 0},
+        {"memory": -1},
+        {"lookahead": -1},
+        {"limit": 0.0},
+        {"limit": float("nan")},
+        {"joints": ("tail",)},
+        {"joints": ()},
+    ],
+)
 def test_impossible_networks_are_refused(change):
     with pytest.raises(RequestError, match="a refiner needs"):
         replace(TINY, **change)
@@ -193,11 +208,19 @@ def stored_again(path, *, tensors=None, **card):
     checkpoints.save(load_file(path) if tensors is None else tensors, replace(before, **card), path)
 
 
-@pytest.mark.parametrize("config", [
-    {**TINY.as_card(), "width": 7}, {**TINY.as_card(), "width": "wide"}, {**TINY.as_card(), "limit": 0},
-    {**TINY.as_card(), "depth": 2}, {**TINY.as_card(), "joints": ["hips"]}, {**TINY.as_card(), "joints": 3},
-    {**TINY.as_card(), "joints": ["hips", "leftHand", "tail"]}, {},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "config",
+    [
+        {**TINY.as_card(), "width": 7},
+        {**TINY.as_card(), "width": "wide"},
+        {**TINY.as_card(), "limit": 0},
+        {**TINY.as_card(), "depth": 2},
+        {**TINY.as_card(), "joints": ["hips"]},
+        {**TINY.as_card(), "joints": 3},
+        {**TINY.as_card(), "joints": ["hips", "leftHand", "tail"]},
+        {},
+    ],
+)
 def test_a_card_that_does_not_fit_is_refused(stored, config):
     stored_again(stored, config=config)
     with pytest.raises(CheckpointError, match="do not fit its card"):

@@ -25,8 +25,9 @@ from priors.training.recipes.refiner import PAPER, AdversarialSettings, Adversar
 from priors.training.refiner_run import RefinerRequest, command, score, train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
-SETTINGS = AdversarialSettings(rounds=6, window=10, batch=4, warm_up=1, head_start=1, critic_updates=1, history=8,
-                               critic_width=6, critic_around=1)  # fmt: skip
+SETTINGS = AdversarialSettings(
+    rounds=6, window=10, batch=4, warm_up=1, head_start=1, critic_updates=1, history=8, critic_width=6, critic_around=1
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +36,12 @@ def density(tmp_path_factory):
     prior, path = tiny_density(), tmp_path_factory.mktemp("density") / "walks.safetensors"
     starts = prior.starts
     tensors = prior.reference.state_dict() | {
-        "starts.previous": starts.state.previous, "starts.hidden": starts.state.hidden,
-        "starts.cell": starts.state.cell, "starts.speed": starts.speed, "starts.weight": starts.weight,
-    }  # fmt: skip
+        "starts.previous": starts.state.previous,
+        "starts.hidden": starts.state.hidden,
+        "starts.cell": starts.state.cell,
+        "starts.speed": starts.speed,
+        "starts.weight": starts.weight,
+    }
     checkpoints.save(tensors, replace(prior.card, data=prior.card.data | {"match": "walk", "split_seed": 1}), path)
     return str(path)
 
@@ -48,8 +52,16 @@ def request_in(data, density):
 
     def made(out, **changes):
         settings = replace(SETTINGS, **changes.pop("settings", {}))
-        given = {"checkpoint_minutes": 0.0, "report_rounds": 2, "judge_rounds": 4, "samples": 6, "judged": 2,
-                 "seconds": 1.2, "density": density, "config": TINY} | changes  # fmt: skip
+        given = {
+            "checkpoint_minutes": 0.0,
+            "report_rounds": 2,
+            "judge_rounds": 4,
+            "samples": 6,
+            "judged": 2,
+            "seconds": 1.2,
+            "density": density,
+            "config": TINY,
+        } | changes
         return RefinerRequest(data, out, settings=settings, **given)
 
     return made
@@ -94,10 +106,14 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert files == {"cache", "checkpoint.json", "step-6-checkpoint.safetensors", "model.json", path.name}
 
 
-@pytest.mark.parametrize(("variant", "changes"), [
-    ((RefinerConfig(), AdversarialSettings()), {"rounds": 7, "bfloat16": True, "seed": 3}),
-    (PAPER, {"batch": 12, "window": 20}),
-], ids=["ours", "paper"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("variant", "changes"),
+    [
+        ((RefinerConfig(), AdversarialSettings()), {"rounds": 7, "bfloat16": True, "seed": 3}),
+        (PAPER, {"batch": 12, "window": 20}),
+    ],
+    ids=["ours", "paper"],
+)
 def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, variant, changes):
     """What is typed from the card, the command line reads as the request that wrote it."""
     config, recipe = variant
@@ -268,8 +284,19 @@ def begun(tmp_path_factory, data, density):
     return out
 
 
-@pytest.mark.parametrize("change", [{"curve": [3]}, {"curve": None}, {"losses": [{"told": 1}]}, {"losses": None},
-                                    {"settings": []}, {"network": None}, {"data": 3}, {"tensors": "gone"}])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"curve": [3]},
+        {"curve": None},
+        {"losses": [{"told": 1}]},
+        {"losses": None},
+        {"settings": []},
+        {"network": None},
+        {"data": 3},
+        {"tensors": "gone"},
+    ],
+)
 def test_broken_checkpoints_are_refused(tmp_path, request_in, begun, change):
     out = shutil.copytree(begun, tmp_path / "run")
     index = json.loads((out / "checkpoint.json").read_text())

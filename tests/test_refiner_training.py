@@ -20,9 +20,20 @@ from priors.training.recipes import refiner as training
 from priors.training.recipes.refiner import MOMENTS, AdversarialSettings, AdversarialTrainer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
-SETTINGS = AdversarialSettings(rounds=5, window=12, batch=4, warm_up=2, head_start=0, critic_updates=1, history=10,
-                               critic_width=8, critic_around=1, moments=0.0, refiner_rate=1e-3,
-                               critic_rate=1e-3)  # fmt: skip
+SETTINGS = AdversarialSettings(
+    rounds=5,
+    window=12,
+    batch=4,
+    warm_up=2,
+    head_start=0,
+    critic_updates=1,
+    history=10,
+    critic_width=8,
+    critic_around=1,
+    moments=0.0,
+    refiner_rate=1e-3,
+    critic_rate=1e-3,
+)
 SIZE = LAYOUT.continuous
 
 captured = cache(corpus)
@@ -155,14 +166,18 @@ def test_the_history_keeps_its_size_and_gives_half(size, batch):
 def test_the_history_begins_with_what_the_refiner_makes():
     trainer = trainer_of()
     assert trainer.history.windows.shape == (10, 12, LAYOUT.size)
-    places = {tuple(row[:5].tolist()) for clip in (trembling().features, mirror_features(trembling().features))
-              for row in clip}  # fmt: skip
+    places = {
+        tuple(row[:5].tolist())
+        for clip in (trembling().features, mirror_features(trembling().features))
+        for row in clip
+    }
     kept = trainer.history.windows[..., :5].flatten(0, 1)
     assert all(tuple(row) in places for row in kept.tolist())  # an untrained refiner changes nothing
 
 
-@pytest.mark.parametrize(("loss", "updates"), [(0.0099, [2, 4, 5, 5]), (0.0101, [2, 2, 2, 2]), (0.99, [2, 2, 2, 2]),
-                                               (1.01, [2, 1, 1, 1])])  # fmt: skip
+@pytest.mark.parametrize(
+    ("loss", "updates"), [(0.0099, [2, 4, 5, 5]), (0.0101, [2, 2, 2, 2]), (0.99, [2, 2, 2, 2]), (1.01, [2, 1, 1, 1])]
+)
 def test_the_balance_doubles_and_halves_at_the_stated_losses(monkeypatch, loss, updates):
     trainer = trainer_of(warm_up=0, refiner_updates=2, most_updates=5)
     counts = {"refine": 0}
@@ -249,8 +264,9 @@ def test_rounds_go_on_from_a_state_to_the_bit(optimiser, bfloat16):
     assert {weight.dtype for weight in whole.refiner.parameters()} == {torch.float32}
 
 
-@pytest.mark.parametrize("drop", ["refiner-optimiser.0.exp_avg", "critic-optimiser.3.", "generator", "history",
-                                  "critic.last.bias"])  # fmt: skip
+@pytest.mark.parametrize(
+    "drop", ["refiner-optimiser.0.exp_avg", "critic-optimiser.3.", "generator", "history", "critic.last.bias"]
+)
 def test_a_state_that_is_not_whole_is_refused(drop):
     state = trained(trainer_of(), 1).state()
     partial = {name: value for name, value in state.items() if not name.startswith(drop)}
@@ -304,13 +320,20 @@ def test_statistics_are_of_the_captured_clips_with_floors():
     assert float(network.reach_std.min()) == pytest.approx(0.01)  # of the hips, which stay above themselves
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    ({"rounds": 0}, "rounds must be at least 1, got 0"), ({"batch": 0}, "batch must be at least 1"),
-    ({"refiner_updates": 0}, "refiner_updates"), ({"critic_updates": 0}, "critic_updates"),
-    ({"most_updates": 0}, "most_updates"), ({"batch": 1}, "batch of 2 or more"),
-    ({"history": 3}, "must hold a batch of 2 or more, got 3 for 4"),
-    ({"window": 3}, "window must be at least 4, got 3"), ({"optimiser": "sgd"}, "adam or rmsprop, got 'sgd'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"rounds": 0}, "rounds must be at least 1, got 0"),
+        ({"batch": 0}, "batch must be at least 1"),
+        ({"refiner_updates": 0}, "refiner_updates"),
+        ({"critic_updates": 0}, "critic_updates"),
+        ({"most_updates": 0}, "most_updates"),
+        ({"batch": 1}, "batch of 2 or more"),
+        ({"history": 3}, "must hold a batch of 2 or more, got 3 for 4"),
+        ({"window": 3}, "window must be at least 4, got 3"),
+        ({"optimiser": "sgd"}, "adam or rmsprop, got 'sgd'"),
+    ],
+)
 def test_impossible_recipes_are_refused(change, said):
     with pytest.raises(RequestError, match=said):
         replace(SETTINGS, **change)
@@ -366,10 +389,13 @@ def test_moments_alone_bring_feet_and_jerk_nearer_to_the_captured():
     assert mismatch() < 0.95 * before
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"moments": 1.0, "window": 7}, "window must be at least 8 for moments to be compared, got 7"),
-    ({"average": 1.0}, r"average must lie in \[0, 1\), got 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"moments": 1.0, "window": 7}, "window must be at least 8 for moments to be compared, got 7"),
+        ({"average": 1.0}, r"average must lie in \[0, 1\), got 1"),
+    ],
+)
 def test_impossible_moments_and_means_are_refused(change, message):
     with pytest.raises(RequestError, match=message):
         replace(SETTINGS, **change)

@@ -41,9 +41,13 @@ def solution() -> Solution:
 
 def test_everything_is_in_it(solution):
     made = report.build(
-        solution, request={"curve": "line:4"}, seed=3, measures={"sway_cm": math.nan}, seconds=1.0,
+        solution,
+        request={"curve": "line:4"},
+        seed=3,
+        measures={"sway_cm": math.nan},
+        seconds=1.0,
         prior={"name": "tiny", "licence": "none", "quality": {"mocap": {"sway_cm": {"mean": 1.9}}}},
-    )  # fmt: skip
+    )
     made = json.loads(report.as_json(made))
     assert made["request"] == {"curve": "line:4"}
     assert made["seed"] == 3

@@ -66,8 +66,12 @@ def test_canonical_joints_are_where_the_rigs_are(rig):
 @each_rig
 def test_the_t_pose_comes_out_as_identity(rig):
     rigmap = retarget.map_rig(SKELETONS[rig])
-    tpose = Motion(rigmap.skeleton, random_on(rig).fps, torch.zeros(1, 3).double(),
-                   torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4))  # fmt: skip
+    tpose = Motion(
+        rigmap.skeleton,
+        random_on(rig).fps,
+        torch.zeros(1, 3).double(),
+        torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4),
+    )
     on_rig = retarget.from_canonical(tpose, rigmap)
     world = on_rig.joint_rotations()[0]
     for c, joint in enumerate(rigmap.joint_of):

@@ -25,8 +25,9 @@ from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.terms import Footing
 
-QUICK = FollowSettings(window=WindowSettings(frames=10, overlap=4, past=12),
-                       method=LatentMethod(rounds=1, budget=Budget(evaluations=5)))  # fmt: skip
+QUICK = FollowSettings(
+    window=WindowSettings(frames=10, overlap=4, past=12), method=LatentMethod(rounds=1, budget=Budget(evaluations=5))
+)
 SIZE = 1.3
 
 
@@ -92,10 +93,17 @@ def told_rig(request, tmp_path):
     return tmp_path / "ours.toml"
 
 
-@pytest.mark.parametrize(("job", "told_rig"), [
-    *(("convert", rig) for rig in ("mixamo", "Bandai-Namco", "cmu-daz", "iclone", "TOML")),
-    ("follow", "TOML"), ("steer", "mixamo"), ("generate", "TOML"), ("run", "iclone"),
-], indirect=["told_rig"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("job", "told_rig"),
+    [
+        *(("convert", rig) for rig in ("mixamo", "Bandai-Namco", "cmu-daz", "iclone", "TOML")),
+        ("follow", "TOML"),
+        ("steer", "mixamo"),
+        ("generate", "TOML"),
+        ("run", "iclone"),
+    ],
+    indirect=["told_rig"],
+)
 def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_path):
     jobs = words_of(tmp_path, prior)
     person(1.0).save(tmp_path / "in.bvh")
@@ -201,13 +209,23 @@ def test_the_canonical_body_is_not_scaled_at_all():
 def test_twice_the_legs_make_twice_the_way():
     """The same walk, of everything twice as long: a prior cannot tell it from its own."""
     density, double = tiny_density(), Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 2)
-    small = controllers.following.follow(density, curves.circle(radius=2.0), seconds=1.0, speed=1.0, settings=QUICK,
-                               generator=generator())  # fmt: skip
+    small = controllers.following.follow(
+        density, curves.circle(radius=2.0), seconds=1.0, speed=1.0, settings=QUICK, generator=generator()
+    )
     footing = Footing(sigma_speed=0.06, sigma_height=0.02, sigma_below=0.01, rest_height=2 * TOE_REST_HEIGHT)
-    twice = {name: 2 * getattr(QUICK, name) for name in
-             ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")}  # fmt: skip
-    large = controllers.following.follow(density, curves.circle(radius=4.0), seconds=1.0, speed=2.0, skeleton=double,
-                               settings=replace(QUICK, footing=footing, **twice), generator=generator())  # fmt: skip
+    twice = {
+        name: 2 * getattr(QUICK, name)
+        for name in ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")
+    }
+    large = controllers.following.follow(
+        density,
+        curves.circle(radius=4.0),
+        seconds=1.0,
+        speed=2.0,
+        skeleton=double,
+        settings=replace(QUICK, footing=footing, **twice),
+        generator=generator(),
+    )
     assert large.motion.skeleton is double
     places = large.motion.joint_positions() / 2
     torch.testing.assert_close(places, small.motion.joint_positions(), atol=0.02, rtol=0)
@@ -217,8 +235,9 @@ def test_twice_the_legs_make_twice_the_way():
 
 def test_a_tall_character_is_steered_in_its_own_metres():
     settings = steer.SteerSettings(horizon=10, evaluations=3, footing=Footing(rest_height=SIZE * TOE_REST_HEIGHT))
-    state, first = steer.begin(tiny_density(), Command(1.3, 0.0), generator=generator(), settings=settings,
-                               at=(1.0, 2.0), skeleton=taller())  # fmt: skip
+    state, first = steer.begin(
+        tiny_density(), Command(1.3, 0.0), generator=generator(), settings=settings, at=(1.0, 2.0), skeleton=taller()
+    )
     torch.testing.assert_close(first.motion.root_position[0, ::2], torch.tensor([1.0, 2.0]).double(), atol=1e-5, rtol=0)
     state, frames = steer.step(state, Command(1.3, 0.0))
     assert state.person.scale == pytest.approx(SIZE)
@@ -231,8 +250,9 @@ def test_a_tall_character_is_steered_in_its_own_metres():
 def test_a_tall_character_goes_on_where_its_clip_ends():
     clip = person(SIZE, 40)
     settings = GenerateSettings(finishing=None)
-    drawn = generate(tiny_density(), seconds=0.5, generator=generator(), settings=settings, start_clip=clip,
-                              skeleton=clip.skeleton)  # fmt: skip
+    drawn = generate(
+        tiny_density(), seconds=0.5, generator=generator(), settings=settings, start_clip=clip, skeleton=clip.skeleton
+    )
     assert float((drawn.root_position[0] - clip.root_position[-1]).norm()) < 0.1
     assert drawn.skeleton is clip.skeleton
 

@@ -27,11 +27,33 @@ RESTS = {
     "no pose, bones along x": Make({}, bones_along_x=True, size=0.8),
     "no pose, Z up": Make({}, bones_along_x=True, zup=True),
 }
-INVENTED = dict(zip(CANONICAL.names, [
-    "Rumpf_Pelvis", "belly", "upperBack", "nape_neck", "skull",
-    *(f"{part}.{side}" for side in "LR" for part in
-      ("collarbone", "humerus", "elbow", "wrist", "thighbone", "kneejoint", "anklejoint", "toe_root")),
-], strict=True))  # fmt: skip
+INVENTED = dict(
+    zip(
+        CANONICAL.names,
+        [
+            "Rumpf_Pelvis",
+            "belly",
+            "upperBack",
+            "nape_neck",
+            "skull",
+            *(
+                f"{part}.{side}"
+                for side in "LR"
+                for part in (
+                    "collarbone",
+                    "humerus",
+                    "elbow",
+                    "wrist",
+                    "thighbone",
+                    "kneejoint",
+                    "anklejoint",
+                    "toe_root",
+                )
+            ),
+        ],
+        strict=True,
+    )
+)
 NONSENSE = {name: f"bone_{number}" for number, name in enumerate(CANONICAL.names)}
 
 
@@ -90,9 +112,15 @@ def test_every_preset_there_and_back(preset, version, rest):
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(
-    preset=st.sampled_from(PRESETS[2:]), size=st.floats(0.6, 1.7), arms=st.floats(0, 80), zup=st.booleans(),
-    quarters=st.integers(0, 3), extras=st.booleans(), root=st.sampled_from([None, "Reference"]), data=st.data(),
-)  # fmt: skip
+    preset=st.sampled_from(PRESETS[2:]),
+    size=st.floats(0.6, 1.7),
+    arms=st.floats(0, 80),
+    zup=st.booleans(),
+    quarters=st.integers(0, 3),
+    extras=st.booleans(),
+    root=st.sampled_from([None, "Reference"]),
+    data=st.data(),
+)
 def test_whatever_the_rest_pose_it_comes_back(preset, size, arms, zup, quarters, extras, root, data):
     wish = Make(names_of(preset), size, arms, zup=zup, turned_deg=90.0 * quarters, extras=extras, root=root)
     made, wanted = make(wish), person(size, 5)
@@ -185,8 +213,11 @@ def test_a_clip_that_begins_with_a_t_pose_shows_what_its_zero_pose_does_not():
     ]
     still = torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4)
     begins = replace(wanted, root_position=wanted.root_position[:1], local_quat_xyzw=still).join(wanted)
-    strange = replace(made, skeleton=replace(made.skeleton, offsets=torch.stack(offsets), end_offsets={}),
-                      tpose={c: turned[own] for c, own in made.joint.items()})  # fmt: skip
+    strange = replace(
+        made,
+        skeleton=replace(made.skeleton, offsets=torch.stack(offsets), end_offsets={}),
+        tpose={c: turned[own] for c, own in made.joint.items()},
+    )
     motion = strange.motion(begins)
     canonical, rigmap = retarget.to_canonical(motion)
     assert (rigmap.rest, rigmap.tpose_from) == ("neither", "frame 0")

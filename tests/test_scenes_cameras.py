@@ -84,9 +84,8 @@ def test_zoom_shows_things_larger():
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"elevation_deg": 95.0}, "0 to 89"), ({"zoom": 0.0}, "zoom"),
-     ({"fov_deg": float("nan")}, "fov_deg")],
-)  # fmt: skip
+    [({"elevation_deg": 95.0}, "0 to 89"), ({"zoom": 0.0}, "zoom"), ({"fov_deg": float("nan")}, "fov_deg")],
+)
 def test_impossible_cameras_are_refused(change, words):
     with pytest.raises(RequestError, match=words):
         CameraSettings(**change)

@@ -24,22 +24,10 @@ WRONG = {
     "empty": ("", "actors: this key is needed"),
     "no actors": (OUT + "actors = []", "actors: "),
     "no outputs": (ACTOR, "outputs: this key is needed"),
-    "unknown key": (
-        OUT + "colour = 'red'\n" + ACTOR,
-        "colour: there is no such key; allowed: actors,",
-    ),
-    "unknown actor key": (
-        OUT + ACTOR + "vel = 2",
-        "actors[0].vel: there is no such key; allowed: curve,",
-    ),
-    "unknown camera key": (
-        OUT + ACTOR + "[camera]\nlens = 3",
-        "camera.lens: there is no such key; allowed: kind,",
-    ),
-    "speed is text": (
-        OUT + ACTOR + "speed = 'fast'",
-        'actors[0].speed: input should be a valid number, got "fast"',
-    ),
+    "unknown key": (OUT + "colour = 'red'\n" + ACTOR, "colour: there is no such key; allowed: actors,"),
+    "unknown actor key": (OUT + ACTOR + "vel = 2", "actors[0].vel: there is no such key; allowed: curve,"),
+    "unknown camera key": (OUT + ACTOR + "[camera]\nlens = 3", "camera.lens: there is no such key; allowed: kind,"),
+    "speed is text": (OUT + ACTOR + "speed = 'fast'", 'actors[0].speed: input should be a valid number, got "fast"'),
     "seed is a fraction": (OUT + ACTOR + "seed = 1.5", "actors[0].seed: "),
     "negative speed": (OUT + ACTOR + "speed = -1", "actors[0].speed: input should be greater than 0, got -1"),
     "not a number": (OUT + ACTOR + "seconds = nan", "actors[0].seconds: "),
@@ -49,14 +37,8 @@ WRONG = {
     "colour": (OUT + ACTOR + "colour = 'reddish'", "actors[0].colour: colour must be #rrggbb or one of"),
     "same name": (OUT + (ACTOR + "name = 'a'\n") * 2, "actors[1].name: 'a' is taken"),
     "name with a slash": (OUT + ACTOR + "name = 'a/b'", "actors[0].name: "),
-    "camera kind": (
-        OUT + ACTOR + "[camera]\nkind = 'side'",
-        "camera.kind: input should be 'fixed', 'follow' or 'top'",
-    ),
-    "camera below ground": (
-        OUT + ACTOR + "[camera]\nelevation_deg = -5",
-        "camera: the camera's elevation_deg must be",
-    ),
+    "camera kind": (OUT + ACTOR + "[camera]\nkind = 'side'", "camera.kind: input should be 'fixed', 'follow' or 'top'"),
+    "camera below ground": (OUT + ACTOR + "[camera]\nelevation_deg = -5", "camera: the camera's elevation_deg must be"),
     "ending": ("outputs = ['a.avi']\n" + ACTOR, "outputs[0]: 'a.avi' must end in one of .mp4"),
     "folder": ("outputs = ['../a.mp4']\n" + ACTOR, "outputs[0]: "),
     "twice": ("outputs = ['a.mp4', 'a.mp4']\n" + ACTOR, "outputs[1]: "),
@@ -120,10 +102,7 @@ def test_place_turns_about_the_origin_and_then_moves(turn, tmp_path):
 
 def test_place_keeps_the_height_of_curves_in_space(tmp_path):
     (tmp_path / "stairs.csv").write_text("x,y,z\n0,0,0\n0,1,2\n1,2,3\n")
-    flat, space = (
-        curves.read(tmp_path / "stairs.csv"),
-        place(Actor(curve="stairs.csv", turn_deg=90.0), tmp_path),
-    )
+    flat, space = (curves.read(tmp_path / "stairs.csv"), place(Actor(curve="stairs.csv", turn_deg=90.0), tmp_path))
     assert space.points[:, 1].numpy() == pytest.approx(flat.points[:, 1].numpy())
     assert space.points[:, 0].numpy() == pytest.approx(flat.points[:, 2].numpy())
     assert space.length == pytest.approx(flat.length)

@@ -47,10 +47,7 @@ def read_mp4(path):
 def near(picture, colour: str, tolerance: float) -> np.ndarray:
     """Columns of the pixels whose hue is about the colour's."""
     pixels = picture.reshape(-1, 3) / 255
-    chroma, wanted = (
-        pixels - pixels.mean(axis=1, keepdims=True),
-        colours.rgb(colour) - colours.rgb(colour).mean(),
-    )
+    chroma, wanted = (pixels - pixels.mean(axis=1, keepdims=True), colours.rgb(colour) - colours.rgb(colour).mean())
     cosine = chroma @ wanted / (np.linalg.norm(chroma, axis=1) * np.linalg.norm(wanted) + 1e-9)
     alike = (cosine > tolerance) & (np.linalg.norm(chroma, axis=1) > 0.25)
     return np.flatnonzero(alike) % picture.shape[1]
@@ -139,13 +136,7 @@ def test_a_gif_keeps_the_motions_time(fps, shown, tmp_path):
 def test_several_outputs_come_from_one_call_and_progress_counts_frames(tmp_path):
     seen = []
     outputs = [tmp_path / name for name in ("a.mp4", "a.gif", "a.png")]
-    film(
-        [Shot(walk(4))],
-        outputs,
-        size=SMALL,
-        renderer="stick",
-        progress=lambda done, of: seen.append((done, of)),
-    )
+    film([Shot(walk(4))], outputs, size=SMALL, renderer="stick", progress=lambda done, of: seen.append((done, of)))
     assert all(path.stat().st_size > 100 for path in outputs)
     assert seen == [(k, 4) for k in (1, 2, 3, 4)]
 
@@ -185,11 +176,7 @@ def test_feet_that_stand_are_marked_and_others_are_not():
 
 @pytest.mark.parametrize(
     ("out", "size", "words"),
-    [
-        ("a.avi", SMALL, "allowed: .mp4, .gif, .png"),
-        ("gone/a.mp4", SMALL, "does not exist"),
-        ("a.mp4", (4, 4), "size"),
-    ],
+    [("a.avi", SMALL, "allowed: .mp4, .gif, .png"), ("gone/a.mp4", SMALL, "does not exist"), ("a.mp4", (4, 4), "size")],
 )
 def test_impossible_outputs_are_refused_before_any_work(out, size, words, tmp_path):
     with pytest.raises(RequestError, match=words):

@@ -59,9 +59,13 @@ def poses_of(motion, contacts, dtype=torch.float32, sigma=0.05):
     guide = Guide(guide.root.to(dtype), guide.heading.to(dtype), guide.angles.to(dtype), guide.contacts)
     width = guide.packed().shape[1]
     return Poses(
-        guide, torch.full((len(guide.root), width), sigma, dtype=dtype), Place(guide.root[0, ::2], guide.heading[0]),
-        torch.zeros(0, CANONICAL.num_joints, 3, dtype=dtype), torch.zeros(2, dtype=torch.bool), CANONICAL,
-    )  # fmt: skip
+        guide,
+        torch.full((len(guide.root), width), sigma, dtype=dtype),
+        Place(guide.root[0, ::2], guide.heading[0]),
+        torch.zeros(0, CANONICAL.num_joints, 3, dtype=dtype),
+        torch.zeros(2, dtype=torch.bool),
+        CANONICAL,
+    )
 
 
 def test_without_unknowns_the_poses_are_the_guides():
@@ -247,9 +251,11 @@ def test_toes_that_slide_unseen_are_lifted_and_those_that_were_seen_are_not():
     seen[15:45] = False
     capture = replace(capture, seen=seen[None, :, None].expand_as(capture.seen), seen_root=seen[None])
     heights = [
-        stand(motion, odds(motion, -5.0, -5.0), capture, replace(QUICK, clearance=clearance, ease=5.0)).motion
-        .joint_positions()[:, TOE, 1] for clearance in (None, Clearance())
-    ]  # fmt: skip
+        stand(
+            motion, odds(motion, -5.0, -5.0), capture, replace(QUICK, clearance=clearance, ease=5.0)
+        ).motion.joint_positions()[:, TOE, 1]
+        for clearance in (None, Clearance())
+    ]
     lifts = heights[1] - heights[0]
     assert float(lifts[25:35].min()) > 0.01
     assert float(lifts[seen].abs().max()) < 2e-3

@@ -22,8 +22,9 @@ def steer(prior, tmp_path):
 
     def run(script: str, *words: object) -> int:
         (tmp_path / "c.csv").write_text(script)
-        return cli.main(["steer", str(tmp_path / "c.csv"), "-o", str(tmp_path / "a.bvh"), "--prior", prior,
-                         *map(str, words)])  # fmt: skip
+        return cli.main(
+            ["steer", str(tmp_path / "c.csv"), "-o", str(tmp_path / "a.bvh"), "--prior", prior, *map(str, words)]
+        )
 
     return run
 
@@ -84,11 +85,14 @@ def test_speeds_that_nobody_runs_are_lowered_and_said(steer, capsys):
     assert steer(fast, "--strict") == 3
 
 
-@pytest.mark.parametrize(("script", "message"), [
-    ("time_s,speed_mps\n0,1\n", "line 1: has no column heading_deg"),
-    ("time_s,speed_mps,heading_deg\n0,1,0\n0,1,0\n", "line 3: time_s must rise"),
-    ("time_s,speed_mps,heading_deg\n0,nan,0\n", "line 2: speed_mps must be a number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        ("time_s,speed_mps\n0,1\n", "line 1: has no column heading_deg"),
+        ("time_s,speed_mps,heading_deg\n0,1,0\n0,1,0\n", "line 3: time_s must rise"),
+        ("time_s,speed_mps,heading_deg\n0,nan,0\n", "line 2: speed_mps must be a number"),
+    ],
+)
 def test_bad_scripts_are_named_and_nothing_is_written(steer, tmp_path, capsys, script, message):
     assert steer(script) == 2
     assert message in capsys.readouterr().err

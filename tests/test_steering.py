@@ -77,16 +77,19 @@ def test_angles_of_many_turns_are_the_same_direction_and_others_stay_to_the_bit(
     assert Command(1.0, 5.9, -6.1).within(3.0)[0] == Command(1.0, 5.9, -6.1)
 
 
-@pytest.mark.parametrize(("wrong", "message"), [
-    (lambda: Command(-1, 0), "speed must be"),
-    (lambda: Command(math.nan, 0), "speed must be"),
-    (lambda: Command(1, math.inf), "heading must be"),
-    (lambda: Command(1, 0, math.nan), "facing must be"),
-    (lambda: Command(1, 0, turning=math.inf), "turning must be"),
-    (lambda: CommandTrack((), ()), "at least one"),
-    (lambda: CommandTrack((1.0, 1.0), (Command(1, 0),) * 2), "must rise, got 1 s after 1 s"),
-    (lambda: Limits(turn_rate=0), "turn_rate must be positive"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: Command(-1, 0), "speed must be"),
+        (lambda: Command(math.nan, 0), "speed must be"),
+        (lambda: Command(1, math.inf), "heading must be"),
+        (lambda: Command(1, 0, math.nan), "facing must be"),
+        (lambda: Command(1, 0, turning=math.inf), "turning must be"),
+        (lambda: CommandTrack((), ()), "at least one"),
+        (lambda: CommandTrack((1.0, 1.0), (Command(1, 0),) * 2), "must rise, got 1 s after 1 s"),
+        (lambda: Limits(turn_rate=0), "turn_rate must be positive"),
+    ],
+)
 def test_what_cannot_be_is_refused(wrong, message):
     with pytest.raises(RequestError, match=message):
         wrong()
@@ -105,7 +108,9 @@ def test_columns_in_any_order_with_a_facing_that_may_be_empty(read):
     track = read("\ufeffheading_deg, time_s,speed_mps,facing_deg\r\n90,0,1.2,\r\n\r\n0,2.5,0,-90\r\n")
     assert track.times == (0, 2.5)
     assert [(c.speed, c.heading, c.facing) for c in track.commands] == [
-        (1.2, pytest.approx(math.pi / 2), None), (0, 0, pytest.approx(-math.pi / 2))]  # fmt: skip
+        (1.2, pytest.approx(math.pi / 2), None),
+        (0, 0, pytest.approx(-math.pi / 2)),
+    ]
 
 
 def test_turning_gait_and_style_may_be_left_empty(read):
@@ -114,25 +119,29 @@ def test_turning_gait_and_style_may_be_left_empty(read):
     assert [command.told for command in track.commands] == [("run",), ("elderly",), ()]
     lowered, _ = track.clamped(0.5)
     assert [(c.turning, c.told, c.speed) for c in lowered.commands] == [
-        (c.turning, c.told, 0.5) for c in track.commands]  # fmt: skip
+        (c.turning, c.told, 0.5) for c in track.commands
+    ]
 
 
-@pytest.mark.parametrize(("text", "line", "message"), [
-    ("", None, "the file is empty"),
-    ("\n\n", 1, "has no column time_s, speed_mps, heading_deg"),
-    ("time_s,heading_deg\n0,1\n", 1, "has no column speed_mps"),
-    ("time_s,speed_mps,heading_deg,mood\n0,1,0,run\n", 1, "found the columns"),
-    ("time_s,speed_mps,heading_deg,turn_deg_s\n0,1,0,fast\n", 2, "turn_deg_s must be a number"),
-    ("time_s,speed_mps,heading_deg,time_s\n0,1,0,1\n", 1, "each once"),
-    ("time_s,speed_mps,heading_deg\n", None, "holds no commands"),
-    ("time_s,speed_mps,heading_deg\n0,1\n", 2, "found 2 values where 3 belong"),
-    ("time_s,speed_mps,heading_deg\n0,nan,0\n", 2, "speed_mps must be a number, got"),
-    ("time_s,speed_mps,heading_deg\n0,1,inf\n", 2, "heading_deg must be a number"),
-    ("time_s,speed_mps,heading_deg\n0,fast,0\n", 2, "speed_mps must be a number, got"),
-    ("time_s,speed_mps,heading_deg\n0,-1,0\n", 2, "between 0 and 1000"),
-    ("time_s,speed_mps,heading_deg\n2,1,0\n1,1,0\n", 3, "time_s must rise, got 1 after 2"),
-    ("time_s,speed_mps,heading_deg\n-1,1,0\n", 2, "time_s must lie"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("", None, "the file is empty"),
+        ("\n\n", 1, "has no column time_s, speed_mps, heading_deg"),
+        ("time_s,heading_deg\n0,1\n", 1, "has no column speed_mps"),
+        ("time_s,speed_mps,heading_deg,mood\n0,1,0,run\n", 1, "found the columns"),
+        ("time_s,speed_mps,heading_deg,turn_deg_s\n0,1,0,fast\n", 2, "turn_deg_s must be a number"),
+        ("time_s,speed_mps,heading_deg,time_s\n0,1,0,1\n", 1, "each once"),
+        ("time_s,speed_mps,heading_deg\n", None, "holds no commands"),
+        ("time_s,speed_mps,heading_deg\n0,1\n", 2, "found 2 values where 3 belong"),
+        ("time_s,speed_mps,heading_deg\n0,nan,0\n", 2, "speed_mps must be a number, got"),
+        ("time_s,speed_mps,heading_deg\n0,1,inf\n", 2, "heading_deg must be a number"),
+        ("time_s,speed_mps,heading_deg\n0,fast,0\n", 2, "speed_mps must be a number, got"),
+        ("time_s,speed_mps,heading_deg\n0,-1,0\n", 2, "between 0 and 1000"),
+        ("time_s,speed_mps,heading_deg\n2,1,0\n1,1,0\n", 3, "time_s must rise, got 1 after 2"),
+        ("time_s,speed_mps,heading_deg\n-1,1,0\n", 2, "time_s must lie"),
+    ],
+)
 def test_bad_files_are_named_with_their_line(read, text, line, message):
     with pytest.raises(FileFormatError, match=message) as told:
         read(text)

@@ -14,9 +14,15 @@ def trial(contacts, *, before=None, contacts_before=(False, False)) -> Trial:
     features, start = encode(motion)
     joints = motion.joint_positions()
     past = joints[:0] if before is None else joints[:1]
-    return Trial(features[1:].unsqueeze(0), start, features.new_zeros(1, len(contacts), LAYOUT.continuous),
-                 features.new_zeros(1, len(contacts)), torch.tensor(contacts).unsqueeze(0).bool(), past,
-                 contacts_before=torch.tensor(contacts_before))  # fmt: skip
+    return Trial(
+        features[1:].unsqueeze(0),
+        start,
+        features.new_zeros(1, len(contacts), LAYOUT.continuous),
+        features.new_zeros(1, len(contacts)),
+        torch.tensor(contacts).unsqueeze(0).bool(),
+        past,
+        contacts_before=torch.tensor(contacts_before),
+    )
 
 
 def toes(of: Trial, frame: int, foot: int):

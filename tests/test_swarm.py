@@ -34,11 +34,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def same(a: SwarmResult, b: SwarmResult) -> bool:
-    return torch.equal(a.x, b.x) and (a.energy, a.evaluations, a.history) == (
-        b.energy,
-        b.evaluations,
-        b.history,
-    )
+    return torch.equal(a.x, b.x) and (a.energy, a.evaluations, a.history) == (b.energy, b.evaluations, b.history)
 
 
 @pytest.mark.parametrize("neighbours", [None, 4])
@@ -86,11 +82,7 @@ def test_start_is_the_first_particle_so_the_result_is_never_worse():
 def test_draws_have_the_spread_asked_for_by_unknown():
     spread, seen = torch.tensor([0.1, 10.0]), []
     best_of(
-        lambda x: (seen.append(x), sphere(x))[1],
-        start=torch.ones(2),
-        spread=spread,
-        count=4000,
-        generator=seeded(),
+        lambda x: (seen.append(x), sphere(x))[1], start=torch.ones(2), spread=spread, count=4000, generator=seeded()
     )
     torch.testing.assert_close(seen[0].std(0), spread, rtol=0.05, atol=0.0)
     torch.testing.assert_close((seen[0].mean(0) - 1) / spread, torch.zeros(2), rtol=0.0, atol=0.06)

@@ -33,8 +33,15 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     place = Place(ground[-1].to(dtype), heading[-1].to(dtype))
     before = motion.joint_positions()[PAST - past : PAST].to(dtype)
     planted = torch.tensor([True, False])
-    return Trial(features.to(dtype), place, draw[..., 1:].to(dtype), 30 * draw[..., 0].to(dtype), bits, before,
-                 contacts_before=planted)  # fmt: skip
+    return Trial(
+        features.to(dtype),
+        place,
+        draw[..., 1:].to(dtype),
+        30 * draw[..., 0].to(dtype),
+        bits,
+        before,
+        contacts_before=planted,
+    )
 
 
 def rows(whole, picked):
@@ -154,8 +161,10 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
     if "curve" in names:
         term = replace(term, curve=moved_curve(term.curve, turn, shift))
     if "velocities" in names:
-        turned = {name: rotate_ground(getattr(term, name), angle.expand(len(getattr(term, name))))
-                  for name in ("velocities", "velocities_before")}  # fmt: skip
+        turned = {
+            name: rotate_ground(getattr(term, name), angle.expand(len(getattr(term, name))))
+            for name in ("velocities", "velocities_before")
+        }
         term = replace(term, facing=None if term.facing is None else term.facing + turn, **turned)
     if "root" in names:
         root = term.root.clone()

@@ -51,8 +51,11 @@ def test_where_in_the_world_and_what_lies_between_the_keys_tells_nothing():
 def test_a_child_takes_as_long_as_a_giant():
     """Metres are told in the body's own."""
     motion = walk(90)
-    large = replace(motion, root_position=1.4 * motion.root_position,
-                    skeleton=replace(motion.skeleton, offsets=1.4 * motion.skeleton.offsets))  # fmt: skip
+    large = replace(
+        motion,
+        root_position=1.4 * motion.root_position,
+        skeleton=replace(motion.skeleton, offsets=1.4 * motion.skeleton.offsets),
+    )
     small, big = suggest(motion, KEYS), suggest(large, KEYS)
     assert frames(small) == frames(big)
     for one, other in zip(small, big, strict=True):

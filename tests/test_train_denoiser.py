@@ -57,8 +57,9 @@ def test_windows_are_clips_mirrored_half_of_the_time():
 
 def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
     clip = corpus(1, 60).features
-    uneven = Corpus(("big/a", "big/b", "big/c", "small/d"), (60, 60, 60, 30),
-                    torch.cat([clip, clip, clip, clip[:30] + 100]))  # fmt: skip
+    uneven = Corpus(
+        ("big/a", "big/b", "big/c", "small/d"), (60, 60, 60, 30), torch.cat([clip, clip, clip, clip[:30] + 100])
+    )
 
     def share(evenness):
         windows = Windows(uneven, replace(SETTINGS, batch=600, evenness=evenness)).draw(generator())
@@ -95,8 +96,9 @@ def test_positions_of_a_clean_capture_are_those_of_its_motion():
 def test_a_perfect_proposal_costs_nothing_but_contacts():
     from tiny_denoiser import network
 
-    clean = replace(SETTINGS, corruption=CorruptionSettings(
-        clean=1.0, markers=0.0, spikes=0.0, dropout=0.0, limb=0.0, gap=0.0))  # fmt: skip
+    clean = replace(
+        SETTINGS, corruption=CorruptionSettings(clean=1.0, markers=0.0, spikes=0.0, dropout=0.0, limb=0.0, gap=0.0)
+    )
     parts = losses(network(), corpus(1, 30).features[None], clean, generator())
     assert parts["error_cm"] < 0.05
     assert parts["angles_deg"] < 0.01

@@ -30,9 +30,29 @@ def test_what_is_not_asked_for_is_the_measured_recipe():
 
 
 def test_every_option_reaches_the_trainer():
-    given = requested("--density", "mine", "--match", "walk", "--steps", "7", "--batch", "6", "--window", "20",
-                      "--seed", "3", "--bfloat16", "--resume", "--licence", "CC0", "--device", "cpu", "--strict-data",
-                      "--minutes-between-checkpoints", "0.5")  # fmt: skip
+    given = requested(
+        "--density",
+        "mine",
+        "--match",
+        "walk",
+        "--steps",
+        "7",
+        "--batch",
+        "6",
+        "--window",
+        "20",
+        "--seed",
+        "3",
+        "--bfloat16",
+        "--resume",
+        "--licence",
+        "CC0",
+        "--device",
+        "cpu",
+        "--strict-data",
+        "--minutes-between-checkpoints",
+        "0.5",
+    )
     assert (given.density, given.match, given.resume, given.licence) == ("mine", "walk", True, "CC0")
     assert (given.checkpoint_minutes, given.strict_data) == (0.5, True)
     assert given.settings == replace(
@@ -47,8 +67,20 @@ def test_help_names_what_a_refiner_takes(capsys):
         cli.main(["train", "--help"])
     assert stop.value.code == 0
     told = capsys.readouterr().out
-    for word in ("refiner", "--density", "--match", "--steps", "--batch", "--window", "--seed", "--paper",
-                 "--bfloat16", "--resume", "--minutes-between-checkpoints", "--licence"):  # fmt: skip
+    for word in (
+        "refiner",
+        "--density",
+        "--match",
+        "--steps",
+        "--batch",
+        "--window",
+        "--seed",
+        "--paper",
+        "--bfloat16",
+        "--resume",
+        "--minutes-between-checkpoints",
+        "--licence",
+    ):
         assert word in told
 
 
@@ -58,8 +90,9 @@ def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
     def tiny(request, say, *, warn):
         settings = replace(request.settings, window=10, batch=4, history=8, head_start=1, warm_up=1, critic_width=6)
         config = RefinerConfig(width=6, memory=5)
-        return train(replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say,
-                     warn=warn)  # fmt: skip
+        return train(
+            replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say, warn=warn
+        )
 
     monkeypatch.setattr(refiner_run, "train", tiny)
     data, prior = write_corpus(tmp_path / "data"), str(save_tiny_prior(tmp_path / "tiny.safetensors"))

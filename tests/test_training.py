@@ -33,8 +33,18 @@ def short_free_runs(monkeypatch):
 def request_in(out, data, **changes):
     """Checkpoints at every step, so that a kill can come anywhere."""
     settings = replace(SETTINGS, **changes.pop("settings", {}))
-    return TrainRequest(data, out, config=TINY, settings=settings, device="cpu", checkpoint_minutes=0.0,
-                        report_steps=1, validate_steps=2, starts=4, **changes)  # fmt: skip
+    return TrainRequest(
+        data,
+        out,
+        config=TINY,
+        settings=settings,
+        device="cpu",
+        checkpoint_minutes=0.0,
+        report_steps=1,
+        validate_steps=2,
+        starts=4,
+        **changes,
+    )
 
 
 def killer(step):
@@ -148,8 +158,20 @@ def test_copied_data_are_the_same_data(tmp_path, data, begun):
     assert train(request_in(copied(begun, tmp_path / "run"), elsewhere, resume=True)).exists()
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[]", "null", "[" * 100_000, '{"tensors": "gone"}', '{"curve": 3}',
-                                     '{"curve": [3]}', '{"curve": [], "settings": 3}'])  # fmt: skip
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{}",
+        "[]",
+        "null",
+        "[" * 100_000,
+        '{"tensors": "gone"}',
+        '{"curve": 3}',
+        '{"curve": [3]}',
+        '{"curve": [], "settings": 3}',
+    ],
+)
 def test_a_broken_checkpoint_is_refused(tmp_path, data, content):
     out = tmp_path / "run"
     out.mkdir()
@@ -158,10 +180,20 @@ def test_a_broken_checkpoint_is_refused(tmp_path, data, content):
         train(request_in(out, data, resume=True))
 
 
-@pytest.mark.parametrize(("key", "value"), [
-    ("tensors", None), ("tensors", "checkpoint.json"), ("step", None), ("step", "three"), ("step", []), ("curve", None),
-    ("settings", []), ("network", None), ("data", "all"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("tensors", None),
+        ("tensors", "checkpoint.json"),
+        ("step", None),
+        ("step", "three"),
+        ("step", []),
+        ("curve", None),
+        ("settings", []),
+        ("network", None),
+        ("data", "all"),
+    ],
+)
 def test_a_malformed_index_is_refused(tmp_path, data, begun, key, value):
     out = copied(begun, tmp_path / "run")
     index = json.loads((out / "checkpoint.json").read_text())
@@ -213,14 +245,17 @@ def test_what_is_not_finite_is_null_in_the_curve(tmp_path, data, monkeypatch):
         json.loads(file.read_text(), parse_constant=pytest.fail)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"settings": {"steps": 0}}, "steps must be at least 1, got 0"),
-    ({"settings": {"batch": -1}}, "batch must be at least 1, got -1"),
-    ({"settings": {"window": 0}}, "window must be at least 1, got 0"),
-    ({"settings": {"optimiser": "sgd"}}, "optimiser must be adam or rmsprop, got 'sgd'"),
-    ({"settings": {"schedule": "none"}}, "schedule must be cosine or epochs, got 'none'"),
-    ({"starts": 0}, "starts must be at least 1, got 0"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"settings": {"steps": 0}}, "steps must be at least 1, got 0"),
+        ({"settings": {"batch": -1}}, "batch must be at least 1, got -1"),
+        ({"settings": {"window": 0}}, "window must be at least 1, got 0"),
+        ({"settings": {"optimiser": "sgd"}}, "optimiser must be adam or rmsprop, got 'sgd'"),
+        ({"settings": {"schedule": "none"}}, "schedule must be cosine or epochs, got 'none'"),
+        ({"starts": 0}, "starts must be at least 1, got 0"),
+    ],
+)
 def test_impossible_recipes_are_refused(tmp_path, data, change, message):
     with pytest.raises(RequestError, match=message):
         replace(request_in(tmp_path, data, settings=change.pop("settings", {})), **change)
@@ -276,8 +311,23 @@ def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
 
 def test_a_clip_that_cannot_be_used_is_named(tmp_path):
     # One joint that moves is a motion, but nobody's.
-    head = ["HIERARCHY", "ROOT Ball", "{", "OFFSET 0 0 0", "CHANNELS 3 Xposition Yposition Zposition", "End Site", "{",
-            "OFFSET 0 10 0", "}", "}", "MOTION", "Frames: 2", "Frame Time: 0.033333", "0 0 0", "1 0 0"]  # fmt: skip
+    head = [
+        "HIERARCHY",
+        "ROOT Ball",
+        "{",
+        "OFFSET 0 0 0",
+        "CHANNELS 3 Xposition Yposition Zposition",
+        "End Site",
+        "{",
+        "OFFSET 0 10 0",
+        "}",
+        "}",
+        "MOTION",
+        "Frames: 2",
+        "Frame Time: 0.033333",
+        "0 0 0",
+        "1 0 0",
+    ]
     (tmp_path / "odd.bvh").write_text("\n".join(head) + "\n")
     with pytest.raises(MapctlError, match=r"odd\.bvh: "):
         corpora.read(tmp_path, match="", cache=tmp_path / "cache")

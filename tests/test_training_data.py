@@ -156,8 +156,9 @@ def model(request, monkeypatch):
     if request.param in tiny:
         runs, config = tiny[request.param]
         train = runs.train
-        monkeypatch.setattr(runs, "train", lambda request, *words, **options:
-                            train(replace(request, config=config), *words, **options))  # fmt: skip
+        monkeypatch.setattr(
+            runs, "train", lambda request, *words, **options: train(replace(request, config=config), *words, **options)
+        )
     return (request.param, *MODELS[request.param])
 
 

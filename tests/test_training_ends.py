@@ -52,16 +52,42 @@ class Model:
 
 def _density(data, out, prior):
     settings = lstm_gmm.TrainingSettings(steps=6, batch=4, window=20)
-    return run.TrainRequest(data, out, config=LstmGmmConfig(width=8, components=2), settings=settings, device="cpu",
-                            validate_steps=2, starts=4)  # fmt: skip
+    return run.TrainRequest(
+        data,
+        out,
+        config=LstmGmmConfig(width=8, components=2),
+        settings=settings,
+        device="cpu",
+        validate_steps=2,
+        starts=4,
+    )
 
 
 def _refiner(data, out, prior):
-    settings = refiner.AdversarialSettings(rounds=6, window=10, batch=4, warm_up=1, head_start=1, critic_updates=1,
-                                           history=8, critic_width=6, critic_around=1)  # fmt: skip
+    settings = refiner.AdversarialSettings(
+        rounds=6,
+        window=10,
+        batch=4,
+        warm_up=1,
+        head_start=1,
+        critic_updates=1,
+        history=8,
+        critic_width=6,
+        critic_around=1,
+    )
     config = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
-    return refiner_run.RefinerRequest(data, out, density=prior, config=config, settings=settings, samples=6, judged=2,
-                                      seconds=1.2, report_rounds=2, judge_rounds=2)  # fmt: skip
+    return refiner_run.RefinerRequest(
+        data,
+        out,
+        density=prior,
+        config=config,
+        settings=settings,
+        samples=6,
+        judged=2,
+        seconds=1.2,
+        report_rounds=2,
+        judge_rounds=2,
+    )
 
 
 def _windowed(runs, request, config):
@@ -242,8 +268,27 @@ def test_ended_before_the_first_step_it_saves_nothing(tmp_path, model, request_i
 
 
 def train_words(data, out, *words):
-    return ("train", "lstm-gmm", "--data", data, "-o", out, "--steps", 6, "--batch", 4, "--window", 20, "--width", 8,
-            "--components", 2, "--device", "cpu", *words)  # fmt: skip
+    return (
+        "train",
+        "lstm-gmm",
+        "--data",
+        data,
+        "-o",
+        out,
+        "--steps",
+        6,
+        "--batch",
+        4,
+        "--window",
+        20,
+        "--width",
+        8,
+        "--components",
+        2,
+        "--device",
+        "cpu",
+        *words,
+    )
 
 
 def test_the_command_says_in_one_line_how_to_go_on(tmp_path, data, monkeypatch, capsys):
@@ -280,8 +325,24 @@ def test_the_command_says_where_nothing_is_saved(tmp_path, data, monkeypatch, ca
 
 
 def test_every_option_is_in_the_line():
-    words = ["train", "denoiser", "--data", "my data", "-o", "run", "--match=-walk", "--width", "7", "--quiet",
-             "--skip-first", "--learning-rate", "0.0003", "--seed", "0", "--strict-data"]  # fmt: skip
+    words = [
+        "train",
+        "denoiser",
+        "--data",
+        "my data",
+        "-o",
+        "run",
+        "--match=-walk",
+        "--width",
+        "7",
+        "--quiet",
+        "--skip-first",
+        "--learning-rate",
+        "0.0003",
+        "--seed",
+        "0",
+        "--strict-data",
+    ]
     given = cli.parse(words)
     assert isinstance(given, Train)
     assert cli.parse(resumption.words(given)[1:]) == given

@@ -23,8 +23,9 @@ HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
 def made_of(motion, frames, *, method="infiller", drawn=0.02, **told):
-    return tween(motion, Keys.of(tuple(frames), **told), tiny_infiller(drawn=drawn),
-                 settings=InfillSettings(method=method))  # fmt: skip
+    return tween(
+        motion, Keys.of(tuple(frames), **told), tiny_infiller(drawn=drawn), settings=InfillSettings(method=method)
+    )
 
 
 def frames_of(fps):
@@ -189,19 +190,26 @@ def test_the_same_comes_twice():
     assert same(first, second)
 
 
-@pytest.mark.parametrize(("keys", "message"), [
-    (Keys((0,)), "at least two keys, got 1"), (Keys((7, 7, 7)), "at least two keys, got 1"),
-    (Keys(()), "at least two keys, got 0"),
-    (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
-    (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
-    (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (Keys.of((0, 20, 44), limbs=("Foot_R", "foott_l")), "no hand or foot 'foott_l'; the nearest is Foot_L"),
-    (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
-    (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
-    (Keys((Key(0, root_only=True), 20, 44)), "first and the last key are whole poses; that at frame 0 tells the root"),
-    (Keys((0, 20, Key(44, limbs=("Hand_L",)))), "that at frame 44 tells the limbs only"),
-    (Keys((0, Key(20, places={"Hnad_L": (0.0, 1.0, 0.0)}), 44)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (Keys((0,)), "at least two keys, got 1"),
+        (Keys((7, 7, 7)), "at least two keys, got 1"),
+        (Keys(()), "at least two keys, got 0"),
+        (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
+        (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
+        (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+        (Keys.of((0, 20, 44), limbs=("Foot_R", "foott_l")), "no hand or foot 'foott_l'; the nearest is Foot_L"),
+        (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
+        (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
+        (
+            Keys((Key(0, root_only=True), 20, 44)),
+            "first and the last key are whole poses; that at frame 0 tells the root",
+        ),
+        (Keys((0, 20, Key(44, limbs=("Hand_L",)))), "that at frame 44 tells the limbs only"),
+        (Keys((0, Key(20, places={"Hnad_L": (0.0, 1.0, 0.0)}), 44)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+    ],
+)
 def test_keys_that_cannot_be_are_refused(keys, message):
     with pytest.raises(RequestError, match=message):
         tween(on_rig("bandai", 45), keys, tiny_infiller())
@@ -255,9 +263,10 @@ def test_neighbouring_keys_that_no_hips_could_join_are_named_with_numbers(told):
     assert made_of(leaping, (0, 20, 21, 44), limbs=("Hand_L",)).notes[:1] != done.notes
 
 
-@pytest.mark.parametrize(("joint", "told", "said"), [
-    ("UpperArm_L", {}, True), ("UpperArm_L", {"root_only": True}, False), ("Hips", {"root_only": True}, True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("joint", "told", "said"),
+    [("UpperArm_L", {}, True), ("UpperArm_L", {"root_only": True}, False), ("Hips", {"root_only": True}, True)],
+)
 def test_neighbouring_keys_that_no_joint_could_join_are_named_with_numbers(joint, told, said):
     motion = on_rig("bandai", 45)
     half, quats = torch.tensor(0.75).double(), motion.local_quat_xyzw.clone()

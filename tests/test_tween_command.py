@@ -72,9 +72,9 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     assert told.err == ""
 
 
-@pytest.mark.parametrize(("words", "what"), [
-    ([], "pose"), (["--joints", "Hand_L, Foot_R"], "limbs"), (["--root-only"], "root"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "what"), [([], "pose"), (["--joints", "Hand_L, Foot_R"], "limbs"), (["--root-only"], "root")]
+)
 def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_path, words, what):
     report = tmp_path / "r.json"
     words = [*words, "--keyframes", "0,16,33,44", "--method", "infiller", "--report", report, "--quiet"]
@@ -96,24 +96,31 @@ def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_pat
     assert {"footing", "keyframe", "likelihood"} <= set(json.loads(report.read_text())["ledger"])
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (["in.bvh", "-o", "a.bvh"], "--keyframes"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "9"], "at least two keys, got 1"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "9,9"], "at least two keys, got 1"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,45"], "the key 45 is not one of the motion's frames 0:45"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,1.5s"], "the key 45 is not one of the motion's frames 0:45"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,x"], "a frame is a whole number from 0, or seconds as in 1.5s"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,,9"], "a frame is a whole number from 0"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", "Hnad_L"], "no hand or foot 'Hnad_L'; the"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", ""], "no hand or foot ''"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L", "--root-only"], "choose one"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "best"], "--method"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L"], "--joints is about keys between"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "9,0,9", "--root-only"], "--root-only is about keys between"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--prior", "x"], "leave --prior out"),
-    (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--prior", "general"], "leave --prior out"),
-    (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),
-], ids=lambda value: " ".join(value) if isinstance(value, list) else "")  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["in.bvh", "-o", "a.bvh"], "--keyframes"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "9"], "at least two keys, got 1"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "9,9"], "at least two keys, got 1"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,45"], "the key 45 is not one of the motion's frames 0:45"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,1.5s"], "the key 45 is not one of the motion's frames 0:45"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,x"], "a frame is a whole number from 0, or seconds as in 1.5s"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,,9"], "a frame is a whole number from 0"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", "Hnad_L"], "no hand or foot 'Hnad_L'; the"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", ""], "no hand or foot ''"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L", "--root-only"], "choose one"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "best"], "--method"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L"], "--joints is about keys between"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "9,0,9", "--root-only"], "--root-only is about keys between"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--prior", "x"], "leave --prior out"),
+        (
+            ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--prior", "general"],
+            "leave --prior out",
+        ),
+        (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, source, words, said):
     Path("in.bvh").write_bytes(source.read_bytes())
     assert said in fails("tween", *words, "--infiller", tiny)

@@ -65,8 +65,12 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
     assert made.skeleton.names == mapctl.load(folder / "keys" / "walk.bvh").skeleton.names
     assert made.root_position.isfinite().all()
     told = json.loads(Path("r.json").read_text())
-    assert [(row["frame"], row["what"]) for row in told["keys"]] == [(0, "pose"), (15, "limbs"), (22, "root"),
-                                                                    (40, "pose")]  # fmt: skip
+    assert [(row["frame"], row["what"]) for row in told["keys"]] == [
+        (0, "pose"),
+        (15, "limbs"),
+        (22, "root"),
+        (40, "pose"),
+    ]
     assert all(row["missed_cm"] < 0.1 for row in told["keys"])
     canonical = retarget.to_canonical(made)[0]
     hand = canonical.joint_positions()[15, canonical.skeleton.index("leftHand")]
@@ -94,7 +98,9 @@ def test_timing_is_suggested_for_frames_of_a_clip_too(folder, capsys):
     words = ["-o", "out.bvh", "--keyframes", "0,3,44", "--method", "slerp", "--suggest-timing"]
     assert run("tween", folder / "keys" / "walk.bvh", *words) == 0
     assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()[-3:] if line.strip()] == [
-        ["0", "3", "3"], ["3", "44", "41"]]  # fmt: skip
+        ["0", "3", "3"],
+        ["3", "44", "41"],
+    ]
 
 
 def test_the_same_bytes_come_twice_and_quiet_says_nothing(tween, folder, capsys):
@@ -129,20 +135,24 @@ def test_the_example_runs_on_a_clip_of_its_name(tween, folder):
     assert {row["what"] for row in told["keys"]} == {"pose", "limbs", "root"}
 
 
-@pytest.mark.parametrize(("text", "words", "said"), [
-    (GOOD.replace("place =", "plaec ="), [], "key[3].plaec: there is no such key; the nearest is place"),
-    (GOOD.replace("Hand_L", "Hnad_L"), [], "key[1].reach: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-    (GOOD.replace("other.bvh", "gone.bvh"), [], "gone.bvh"),
-    (GOOD.replace("walk.bvh", "gone.bvh"), [], "body: "),
-    (GOOD.replace("pose_frame = 20", "pose_frame = 45"), [], "the frame 45 is not one of the pose's 0:45"),
-    (GOOD.replace("frame = 22", "frame = 40"), [], "key[3]: key[2] is at frame 40 already"),
-    (GOOD.replace("[0.3, 1.5]", "[0.3, nan]"), [], "key[3].place[1]: "),
-    ("", [], "key: this key is needed"),
-    (GOOD, ["--keyframes", "0,9"], "--keyframes is for motion files; "),
-    (GOOD, ["--joints", "Hand_L"], "--joints is for motion files; "),
-    (GOOD, ["--root-only"], "--root-only is for motion files; "),
-    (GOOD, ["--rig", "nobody"], "nobody"),
-], ids=range(12))  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "words", "said"),
+    [
+        (GOOD.replace("place =", "plaec ="), [], "key[3].plaec: there is no such key; the nearest is place"),
+        (GOOD.replace("Hand_L", "Hnad_L"), [], "key[1].reach: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+        (GOOD.replace("other.bvh", "gone.bvh"), [], "gone.bvh"),
+        (GOOD.replace("walk.bvh", "gone.bvh"), [], "body: "),
+        (GOOD.replace("pose_frame = 20", "pose_frame = 45"), [], "the frame 45 is not one of the pose's 0:45"),
+        (GOOD.replace("frame = 22", "frame = 40"), [], "key[3]: key[2] is at frame 40 already"),
+        (GOOD.replace("[0.3, 1.5]", "[0.3, nan]"), [], "key[3].place[1]: "),
+        ("", [], "key: this key is needed"),
+        (GOOD, ["--keyframes", "0,9"], "--keyframes is for motion files; "),
+        (GOOD, ["--joints", "Hand_L"], "--joints is for motion files; "),
+        (GOOD, ["--root-only"], "--root-only is for motion files; "),
+        (GOOD, ["--rig", "nobody"], "nobody"),
+    ],
+    ids=range(12),
+)
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(tween, folder, capsys, text, words, said):
     keys = folder / "keys" / "keys.toml"
     keys.write_text(text)

@@ -30,9 +30,15 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 
 FRAMES, KEYS = 45, (0, 20, 23, 44)
-QUICK = RolloutSettings(ahead=4, method=LatentMethod(
-    rounds=1, lbfgs=LbfgsSettings(max_iterations=6), budget=Budget(evaluations=20),
-    proposal=Swarm(SwarmSettings(particles=4, iterations=2))))  # fmt: skip
+QUICK = RolloutSettings(
+    ahead=4,
+    method=LatentMethod(
+        rounds=1,
+        lbfgs=LbfgsSettings(max_iterations=6),
+        budget=Budget(evaluations=20),
+        proposal=Swarm(SwarmSettings(particles=4, iterations=2)),
+    ),
+)
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +65,15 @@ def command(tmp_path_factory, prior_file):
 
 
 def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
-    return variations(motion, Keys.of(keys, **told), tiny_infiller(drawn=0.02), count, rollable=[prior],
-                      generator=generator(seed), rolling=QUICK)  # fmt: skip
+    return variations(
+        motion,
+        Keys.of(keys, **told),
+        tiny_infiller(drawn=0.02),
+        count,
+        rollable=[prior],
+        generator=generator(seed),
+        rolling=QUICK,
+    )
 
 
 @pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("daz", 60)])
@@ -130,8 +143,9 @@ def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     assert float(apart[:2].max()) < 1e-3
     assert float(apart[frames[0] + 3 :].min()) > 1e-4
     assert [note.split(",")[0].rpartition("extended ")[2] for note in made.notes] == [
-        "backwards by the infiller", f"by the density {prior.name}",
-    ]  # fmt: skip
+        "backwards by the infiller",
+        f"by the density {prior.name}",
+    ]
     assert plain.notes[1].split(",")[0].endswith("extended by the infiller")
     again = fill(extending=[prior])
     assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
@@ -150,9 +164,7 @@ def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(
             return self
 
     done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], extending=[Stern()])
-    assert done.notes == (
-        "a gap at the end: the motion is extended by the infiller, with nothing after it to meet",
-    )  # fmt: skip
+    assert done.notes == ("a gap at the end: the motion is extended by the infiller, with nothing after it to meet",)
 
 
 def test_what_leaves_nothing_to_vary_is_refused(prior):
@@ -169,8 +181,9 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
 @pytest.mark.parametrize("keys", [KEYS, (0, 44)])
 def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     motion = on_rig("canonical", FRAMES)
-    made = best_of(motion, Keys(keys), tiny_infiller(drawn=0.02), 4, rollable=[prior], generator=generator(0),
-                   rolling=QUICK)  # fmt: skip
+    made = best_of(
+        motion, Keys(keys), tiny_infiller(drawn=0.02), 4, rollable=[prior], generator=generator(0), rolling=QUICK
+    )
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
     told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
     assert list(told) == ["infiller", "slerp", "rollout 1", "rollout 2"]
@@ -229,20 +242,24 @@ def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, 
         assert mapctl.load(row["file"]).num_frames == FRAMES
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (["--variations", 0], "--variations must be 1 to 1000, got 0"),
-    (["--variations", 1001], "--variations must be 1 to 1000, got 1001"),
-    (["--variations", 2, "--seed", -1], "seed"),
-    (["--seed", 1], "--seed is of what is drawn"),
-    (["--seed", 1, "--best-of", 2], "--seed is of what is drawn"),
-    (["--best-of", 0], "--best-of must be 1 to 1000, got 0"),
-    (["--best-of", 3, "--variations", 2], "choose one"),
-    (["--best-of", 3, "--method", "slerp"], "one answer only"),
-    (["--variations", 2, "--suggest-timing"], "--suggest-timing tells of one answer"),
-    (["--variations", 2, "--method", "slerp"], "one answer only"),
-    (["--variations", 2, "--video", "v.png"], "one answer"),
-    (["--variations", 2, "--report", "out_001.bvh"], "asked for twice"),
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--variations", 0], "--variations must be 1 to 1000, got 0"),
+        (["--variations", 1001], "--variations must be 1 to 1000, got 1001"),
+        (["--variations", 2, "--seed", -1], "seed"),
+        (["--seed", 1], "--seed is of what is drawn"),
+        (["--seed", 1, "--best-of", 2], "--seed is of what is drawn"),
+        (["--best-of", 0], "--best-of must be 1 to 1000, got 0"),
+        (["--best-of", 3, "--variations", 2], "choose one"),
+        (["--best-of", 3, "--method", "slerp"], "one answer only"),
+        (["--variations", 2, "--suggest-timing"], "--suggest-timing tells of one answer"),
+        (["--variations", 2, "--method", "slerp"], "one answer only"),
+        (["--variations", 2, "--video", "v.png"], "one answer"),
+        (["--variations", 2, "--report", "out_001.bvh"], "asked for twice"),
+    ],
+    ids=str,
+)
 def test_what_cannot_be_is_said_and_nothing_is_written(command, source, tmp_path, monkeypatch, capsys, words, said):
     monkeypatch.chdir(tmp_path)
     assert command(source, "-o", "out.bvh", "--keyframes", "0,20,44", *words) == 2

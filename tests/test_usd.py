@@ -108,9 +108,13 @@ def test_names_become_paths_of_letters_and_digits():
     names = ("mixamorig:Hips", "a b", "a_b", "2 legs", "Füße", "a-b")
     skeleton = Skeleton(names, (-1, 0, 0, 0, 1, 0), CANONICAL.offsets[:6])
     assert usd.joint_paths(skeleton) == [
-        "mixamorig_Hips", "mixamorig_Hips/a_b", "mixamorig_Hips/a_b_2", "mixamorig_Hips/_2_legs",
-        "mixamorig_Hips/a_b/F__e", "mixamorig_Hips/a_b_3",
-    ]  # fmt: skip
+        "mixamorig_Hips",
+        "mixamorig_Hips/a_b",
+        "mixamorig_Hips/a_b_2",
+        "mixamorig_Hips/_2_legs",
+        "mixamorig_Hips/a_b/F__e",
+        "mixamorig_Hips/a_b_3",
+    ]
 
 
 @needs_usd

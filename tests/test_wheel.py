@@ -22,13 +22,7 @@ ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.sta
 
 def run(*command: str | Path, cwd: Path) -> str:
     done = subprocess.run(
-        command,
-        cwd=cwd,
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        stdin=subprocess.DEVNULL,
+        command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=240, stdin=subprocess.DEVNULL
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout.strip()

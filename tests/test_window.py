@@ -58,9 +58,12 @@ METHODS = {
     "zero start": METHOD,
     "best of": replace(METHOD, proposal=BestOf(count=4)),
     "swarm": replace(METHOD, proposal=Swarm(SwarmSettings(particles=4, iterations=1))),
-    "states": StateMethod(DENSITY.feature_std[: LAYOUT.continuous], DENSITY.feature_mean[: LAYOUT.continuous],
-                          budget=Budget(evaluations=12)),
-}  # fmt: skip
+    "states": StateMethod(
+        DENSITY.feature_std[: LAYOUT.continuous],
+        DENSITY.feature_mean[: LAYOUT.continuous],
+        budget=Budget(evaluations=12),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -141,9 +144,12 @@ def test_a_deadline_stops_with_what_there_is():
 
 
 def test_a_deadline_reaches_into_a_window():
-    endless = LatentMethod(lbfgs=LbfgsSettings(max_iterations=10**6, gradient_tolerance=0.0,
-                                               relative_energy_tolerance=-1.0, max_trials=10**6),
-                           budget=Budget())  # fmt: skip
+    endless = LatentMethod(
+        lbfgs=LbfgsSettings(
+            max_iterations=10**6, gradient_tolerance=0.0, relative_energy_tolerance=-1.0, max_trials=10**6
+        ),
+        budget=Budget(),
+    )
     began = time.monotonic()
     done, outcome = solve(80, method=endless, deadline=began + 0.5)
     assert outcome is Outcome.BUDGET

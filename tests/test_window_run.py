@@ -57,13 +57,27 @@ class Model:
 
 
 MODELS = (
-    Model(denoiser_run, denoiser_run.DenoiserRequest, windows.request, priors.load_denoiser,
-          tiny_denoiser.CONFIG, replace(tiny_denoiser.CONFIG, width=7), DenoiserSettings(),
-          (("--width", "12"), DenoiserConfig(width=12))),
-    Model(infiller_run, infiller_run.InfillerRequest, windows.request, priors.load_infiller,
-          tiny_infiller.CONFIG, replace(tiny_infiller.CONFIG, kernel=5), InfillerSettings(),
-          (("--architecture", "manifold"), InfillerConfig(architecture="manifold"))),
-)  # fmt: skip
+    Model(
+        denoiser_run,
+        denoiser_run.DenoiserRequest,
+        windows.request,
+        priors.load_denoiser,
+        tiny_denoiser.CONFIG,
+        replace(tiny_denoiser.CONFIG, width=7),
+        DenoiserSettings(),
+        (("--width", "12"), DenoiserConfig(width=12)),
+    ),
+    Model(
+        infiller_run,
+        infiller_run.InfillerRequest,
+        windows.request,
+        priors.load_infiller,
+        tiny_infiller.CONFIG,
+        replace(tiny_infiller.CONFIG, kernel=5),
+        InfillerSettings(),
+        (("--architecture", "manifold"), InfillerConfig(architecture="manifold")),
+    ),
+)
 
 
 @pytest.fixture(params=MODELS, ids=lambda model: model.name)
@@ -160,8 +174,9 @@ def test_a_run_may_begin_with_the_weights_of_another(tmp_path, model, request_in
 def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, model, request_in, monkeypatch):
     trainer = model.runs.KIND.trainer
     step = trainer.train_step
-    monkeypatch.setattr(trainer, "train_step",
-                        lambda trainer: step(trainer) | ({"loss": math.nan} if trainer.step == 3 else {}))  # fmt: skip
+    monkeypatch.setattr(
+        trainer, "train_step", lambda trainer: step(trainer) | ({"loss": math.nan} if trainer.step == 3 else {})
+    )
     with pytest.raises(MapctlError, match="diverged at step 3"):
         model.runs.train(request_in(tmp_path / "run"))
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 2
@@ -179,17 +194,41 @@ def test_every_option_reaches_the_trainer(model):
     assert (given.config, given.settings) == (type(model.tiny)(), model.usual)
     assert (given.data, given.out, given.match, given.resume) == (Path("data"), Path("run"), "", False)
     words, config = model.shape
-    given = requested(model, "--match", "walk", "--steps", "7", "--batch", "6", "--window", "40", "--seed", "0",
-                      "--learning-rate", "0.01", "--bfloat16", "--resume", "--licence", "CC0",
-                      "--skip-first", "--minutes-between-checkpoints", "0.5", *words)  # fmt: skip
+    given = requested(
+        model,
+        "--match",
+        "walk",
+        "--steps",
+        "7",
+        "--batch",
+        "6",
+        "--window",
+        "40",
+        "--seed",
+        "0",
+        "--learning-rate",
+        "0.01",
+        "--bfloat16",
+        "--resume",
+        "--licence",
+        "CC0",
+        "--skip-first",
+        "--minutes-between-checkpoints",
+        "0.5",
+        *words,
+    )
     assert (given.match, given.resume, given.licence, given.skip_first) == ("walk", True, "CC0", True)
     assert (given.checkpoint_minutes, given.config) == (0.5, config)
-    assert given.settings == replace(model.usual, steps=7, batch=6, window=40, seed=0, learning_rate=0.01,
-                                     bfloat16=True)  # fmt: skip
+    assert given.settings == replace(
+        model.usual, steps=7, batch=6, window=40, seed=0, learning_rate=0.01, bfloat16=True
+    )
 
 
-@pytest.mark.parametrize("words", [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"],
-                                   ["--paper"]], ids=lambda words: words[0])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"], ["--paper"]],
+    ids=lambda words: words[0],
+)
 def test_options_of_other_models_are_refused(model, words):
     with pytest.raises(RequestError, match=f"{words[0]} is for other models; an? {model.name} has no such option"):
         requested(model, *words)
@@ -201,12 +240,21 @@ def test_a_shape_that_only_another_model_has_is_refused(model):
         requested(model, *other.shape[0])
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    (["--steps", "0"], "--steps must be at least 1, got 0"), (["--batch", "-2"], "--batch must be at least 1"),
-    (["--window", "0"], "--window must be at least 1"), (["--window", "8"], "window must be at least"),
-    (["--seed", "-1"], "seed"), (["--learning-rate", "2"], "learning rate"), (["--learning-rate", "0"], "learning"),
-    (["--minutes-between-checkpoints", "0"], "minutes between"), (["--device", "cuda"], "leave --device out"),
-], ids=lambda value: value[0] if isinstance(value, list) else "")  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--steps", "0"], "--steps must be at least 1, got 0"),
+        (["--batch", "-2"], "--batch must be at least 1"),
+        (["--window", "0"], "--window must be at least 1"),
+        (["--window", "8"], "window must be at least"),
+        (["--seed", "-1"], "seed"),
+        (["--learning-rate", "2"], "learning rate"),
+        (["--learning-rate", "0"], "learning"),
+        (["--minutes-between-checkpoints", "0"], "minutes between"),
+        (["--device", "cuda"], "leave --device out"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
 def test_numbers_that_make_no_sense_are_refused(model, words, message):
     with pytest.raises(RequestError, match=message):
         requested(model, *words)
@@ -214,8 +262,7 @@ def test_numbers_that_make_no_sense_are_refused(model, words, message):
 
 def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, model):
     settings = replace(model.usual, steps=7, bfloat16=True, seed=3, learning_rate=2e-4)
-    wanted = model.request(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings,
-                           skip_first=True)  # fmt: skip
+    wanted = model.request(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings, skip_first=True)
     words = command(wanted, model.runs.KIND).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path))
     given = cli.parse(words.split()[1:])
     assert isinstance(given, Train)

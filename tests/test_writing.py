@@ -57,12 +57,18 @@ def _checkpoint(path):
 
 
 WRITERS = {
-    "a.bvh": _save, "a.npz": _save, "a.glb": _save, "stream.bvh": _stream,
-    "a.mp4": _film(mp4_writer), "a.gif": _film(gif_writer), "a.png": lambda path: save_png(path, PICTURE),
+    "a.bvh": _save,
+    "a.npz": _save,
+    "a.glb": _save,
+    "stream.bvh": _stream,
+    "a.mp4": _film(mp4_writer),
+    "a.gif": _film(gif_writer),
+    "a.png": lambda path: save_png(path, PICTURE),
     "a.json": lambda path: report.write({"values": list(range(9000))}, path),
-    "a.safetensors": lambda path: write_tensors(path, TENSORS), "model.safetensors": _card,
+    "a.safetensors": lambda path: write_tensors(path, TENSORS),
+    "model.safetensors": _card,
     "step-1-checkpoint.safetensors": _checkpoint,
-} | ({"a.usda": _save, "a.usdc": _save} if usd.is_installed() else {})  # fmt: skip
+} | ({"a.usda": _save, "a.usdc": _save} if usd.is_installed() else {})
 
 
 @pytest.fixture(params=WRITERS)

@@ -24,9 +24,12 @@ from mapctl.recording.inspection import Examined, examine
 Row = dict[str, Any]
 
 KINDS: Mapping[str, str] = {
-    "walks": r"bandai.*_walk_", "turning walks": r"bandai.*_walk-turn", "runs": r"bandai.*_(run|dash)_",
-    "gestures, dance, fights": r"bandai", "CMU, 120 fps": r"cmu",
-}  # fmt: skip
+    "walks": r"bandai.*_walk_",
+    "turning walks": r"bandai.*_walk-turn",
+    "runs": r"bandai.*_(run|dash)_",
+    "gestures, dance, fights": r"bandai",
+    "CMU, 120 fps": r"cmu",
+}
 """Clips by the first pattern that their path holds."""
 STANDARD = "5 degrees, 2 cm, 1 % spikes"
 """The condition of the table by kind."""
@@ -57,9 +60,13 @@ def shortened(motion: Motion, *, skip_first: bool) -> Motion:
 
 
 def table(
-    clips: Sequence[Clip], denoiser: Denoiser, *, infiller: Inbetweener | None = None, densities: Sequence[Any] = (),
+    clips: Sequence[Clip],
+    denoiser: Denoiser,
+    *,
+    infiller: Inbetweener | None = None,
+    densities: Sequence[Any] = (),
     progress: Callable[[int, int], None] | None = None,
-) -> list[Row]:  # fmt: skip
+) -> list[Row]:
     """By condition over all clips, then by kind of clip in the standard condition, then clean clips."""
     rows, done, conditions = [], 0, list(CONDITIONS)
     by_kind: dict[str, list[Row]] = {}
@@ -85,9 +92,12 @@ def table(
 
 
 def judged(
-    truth: Motion, spoilt: Spoilt, denoiser: Denoiser, densities: Sequence[Any] = (),
+    truth: Motion,
+    spoilt: Spoilt,
+    denoiser: Denoiser,
+    densities: Sequence[Any] = (),
     infiller: Inbetweener | None = None,
-) -> Row:  # fmt: skip
+) -> Row:
     """Mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside mocap's,
     milliseconds a frame; where joints are masked and there is an infiller, its error too.
     """
@@ -101,13 +111,19 @@ def judged(
     ours, mocap = metrics.measure(done.motion), metrics.measure(truth)
     out = _error(truth, done.motion)
     return {
-        "in_cm": _error(truth, spoilt.motion), "out_cm": out, "butterworth_cm": butterworth, "savgol_cm": savgol,
+        "in_cm": _error(truth, spoilt.motion),
+        "out_cm": out,
+        "butterworth_cm": butterworth,
+        "savgol_cm": savgol,
         "infiller_cm": filled,
-        "ratio": out / min(butterworth, savgol), "contact_f1": contact_f1(truth, done),
-        "skate_cm_s": ours["skate_cm_s"], "mocap_skate": mocap["skate_cm_s"],
-        "jitter_ratio": ours["jitter_m_s3"] / mocap["jitter_m_s3"], "believed": float(done.believed.mean()),
+        "ratio": out / min(butterworth, savgol),
+        "contact_f1": contact_f1(truth, done),
+        "skate_cm_s": ours["skate_cm_s"],
+        "mocap_skate": mocap["skate_cm_s"],
+        "jitter_ratio": ours["jitter_m_s3"] / mocap["jitter_m_s3"],
+        "believed": float(done.believed.mean()),
         "ms_30fps_frame": 1000 * seconds / (truth.seconds * PRIOR_FPS),
-    }  # fmt: skip
+    }
 
 
 def best_filters(truth: Motion, examined: Examined) -> tuple[float, float]:
@@ -146,8 +162,12 @@ def _filtered(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion:
 
     quats = over(rotations.sign_continuous(motion.local_quat_xyzw))
     moving = {joint: over(values) for joint, values in motion.moving_offsets.items()}
-    return replace(motion, root_position=over(motion.root_position), moving_offsets=moving,
-                   local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))  # fmt: skip
+    return replace(
+        motion,
+        root_position=over(motion.root_position),
+        moving_offsets=moving,
+        local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1),
+    )
 
 
 def _error(truth: Motion, other: Motion) -> float:

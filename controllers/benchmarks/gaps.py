@@ -24,9 +24,12 @@ Row = dict[str, Any]
 
 
 def table(
-    kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener, densities: Sequence[Any], *,
+    kinds: Mapping[str, Sequence[Motion]],
+    infiller: Inbetweener,
+    densities: Sequence[Any],
+    *,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Row]:  # fmt: skip
+) -> list[Row]:
     """Of the middle of clips (canonical, at the prior's rate) that lack so many frames: quantiles over clips of the
     mean error of all joints in the world, by who answered and whether the body is on its way; and the longest time
     unsupported beside mocap's.
@@ -42,8 +45,10 @@ def table(
                     found.setdefault((by, row.pop("what"), beside, length), []).append(row)
         if progress is not None:
             progress(number + 1, len(clips))
-    return [{"by": by, "what": what, "beside": beside, "frames": length, "gaps": len(rows), **_quantiles(rows)}
-            for (by, what, beside, length), rows in sorted(found.items())]  # fmt: skip
+    return [
+        {"by": by, "what": what, "beside": beside, "frames": length, "gaps": len(rows), **_quantiles(rows)}
+        for (by, what, beside, length), rows in sorted(found.items())
+    ]
 
 
 def _measured(clip: Motion, length: int, beside: int, infiller: Inbetweener, densities: Sequence[Any]) -> Row | None:
@@ -58,8 +63,10 @@ def _measured(clip: Motion, length: int, beside: int, infiller: Inbetweener, den
     done: Infilled = fill(part, lost, infiller, another=partial(choose_proposals, densities=densities))
     off = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = [CANONICAL.index(name) for name in TOES]
-    slid, mocap = (worst_frame.longest_unsupported(each.joint_positions()[:, toes], each.root_position, PRIOR_FPS)
-                   for each in (done.motion, part))  # fmt: skip
+    slid, mocap = (
+        worst_frame.longest_unsupported(each.joint_positions()[:, toes], each.root_position, PRIOR_FPS)
+        for each in (done.motion, part)
+    )
     what = "going" if going_between(part, beside - 1, beside + length) else "in place"
     return {"by": done.sources[0].by, "what": what, "error": 100 * float(off.mean()), "slid": slid, "mocap": mocap}
 

@@ -64,15 +64,29 @@ def generation(
         clips, cost = _drawn(prior, variant, settings)
         for kind, some in _by_kind(clips, settings).items():
             rows.append({"motion": kind, "variant": variant.name, "clips": len(some), **_means(some)})
-        rows.append({"motion": "both", "variant": variant.name, "clips": len(clips), "ms_per_frame": cost,
-                     **_realism(clips, mocap, settings), **_diversity(prior, variant, settings),
-                     **_spreads(clips, spread)})  # fmt: skip
+        rows.append(
+            {
+                "motion": "both",
+                "variant": variant.name,
+                "clips": len(clips),
+                "ms_per_frame": cost,
+                **_realism(clips, mocap, settings),
+                **_diversity(prior, variant, settings),
+                **_spreads(clips, spread),
+            }
+        )
     return rows
 
 
 def _variants(refiner: Refiner | None) -> list[_Variant]:
-    refined = [] if refiner is None else [_Variant("density, refiner", refiner, None),
-                                          _Variant("density, refiner, footing", refiner, FinishSettings())]  # fmt: skip
+    refined = (
+        []
+        if refiner is None
+        else [
+            _Variant("density, refiner", refiner, None),
+            _Variant("density, refiner, footing", refiner, FinishSettings()),
+        ]
+    )
     return [_Variant("density", None, None), _Variant("density, footing", None, FinishSettings()), *refined]
 
 
@@ -103,8 +117,9 @@ def _diversity(prior: Any, variant: _Variant, settings: GenerationSettings) -> R
     found = []
     for start in range(0, len(prior.starts.speed), max(1, len(prior.starts.speed) // 4)):
         wishes = replace(GenerateSettings(finishing=variant.finishing), start=start)
-        samples = [_clip(prior, variant, wishes, settings.sibling_seconds, settings.seed + k)
-                   for k in range(settings.siblings)]  # fmt: skip
+        samples = [
+            _clip(prior, variant, wishes, settings.sibling_seconds, settings.seed + k) for k in range(settings.siblings)
+        ]
         found.append(sample_diversity(samples).root_aligned_cm)
     return {"diversity_cm": sum(found) / len(found)}
 
@@ -112,14 +127,20 @@ def _diversity(prior: Any, variant: _Variant, settings: GenerationSettings) -> R
 def _realism(clips: Sequence[Motion], mocap: Sequence[Motion], settings: GenerationSettings) -> Row:
     generator = torch.Generator().manual_seed(settings.seed)
     found = realism(clips, mocap, generator=generator, settings=settings.realism)
-    return {"told_apart": found.accuracy, "told_apart_floor": found.floor_accuracy, "frechet": found.frechet,
-            "frechet_floor": found.floor_frechet}  # fmt: skip
+    return {
+        "told_apart": found.accuracy,
+        "told_apart_floor": found.floor_accuracy,
+        "frechet": found.frechet,
+        "frechet_floor": found.floor_frechet,
+    }
 
 
 def _by_kind(clips: Sequence[Motion], settings: GenerationSettings) -> dict[str, list[Motion]]:
     runs = [measure(clip)["speed_m_s"] > settings.running for clip in clips]
-    return {kind: [clip for clip, ran in zip(clips, runs, strict=True) if ran == (kind == "run")]
-            for kind in ("walk", "run")}  # fmt: skip
+    return {
+        kind: [clip for clip, ran in zip(clips, runs, strict=True) if ran == (kind == "run")]
+        for kind in ("walk", "run")
+    }
 
 
 def _means(clips: Sequence[Motion]) -> Row:

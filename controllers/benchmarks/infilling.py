@@ -50,20 +50,27 @@ class Task:
 
 
 TASKS: tuple[Task, ...] = (
-    Task("nothing missing", WINDOW), Task("gap of 0.5 s", WINDOW, 15), Task("gap of 1 s", WINDOW, 30),
-    Task("gap of 2 s", WINDOW, 60), Task("noise of 3 cm", WINDOW, noise=0.03),
-    Task("noise of 5 cm", WINDOW, noise=0.05), Task("30 % of joints dropped", WINDOW, dropout=0.3),
+    Task("nothing missing", WINDOW),
+    Task("gap of 0.5 s", WINDOW, 15),
+    Task("gap of 1 s", WINDOW, 30),
+    Task("gap of 2 s", WINDOW, 60),
+    Task("noise of 3 cm", WINDOW, noise=0.03),
+    Task("noise of 5 cm", WINDOW, noise=0.05),
+    Task("30 % of joints dropped", WINDOW, dropout=0.3),
     Task("50 % of joints dropped", WINDOW, dropout=0.5),
     *(Task(f"gap of {gap} frames, {_CONTEXT} around it", gap + 2 * _CONTEXT, gap) for gap in (3, 10, 40, 125)),
     *(Task(f"gap of 40 frames, {context} around it", 40 + 2 * context, 40) for context in (1, 3, 5, 13, 25)),
-)  # fmt: skip
+)
 """The paper's, at 30 frames a second in place of its 60; its noise is said in no unit, ours is."""
 
 
 def table(
-    clips: Sequence[Motion], networks: Mapping[str, Inbetweener], *, ours: str,
+    clips: Sequence[Motion],
+    networks: Mapping[str, Inbetweener],
+    *,
+    ours: str,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Row]:  # fmt: skip
+) -> list[Row]:
     """Every task for every method, over all clips that are long enough, if there are any; `ours` is the network that
     MAP finishes.
 
@@ -90,13 +97,26 @@ def by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> lis
         for task in TASKS[1:4]:
             shown = [middle(on_canonical_bones(clip), WINDOW) for clip in clips if clip.seconds * PRIOR_FPS > WINDOW]
             masks = [Mask(ALL, (WINDOW - task.gap) // 2, (WINDOW + task.gap) // 2)]
-            pairs = [[float(_filled(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
-                      for method in _COMPARED] for clip in shown]  # fmt: skip
+            pairs = [
+                [
+                    float(_filled(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
+                    for method in _COMPARED
+                ]
+                for clip in shown
+            ]
             if pairs:
                 errors = 100 * torch.tensor(pairs)
                 slerp, ours = errors.mean(dim=0).tolist()
-                rows.append({"task": task.name, "clips": len(pairs), "method": f"MAP on {kind}", "error_cm": ours,
-                             "slerp_cm": slerp, "ratio": float((errors[:, 1] / errors[:, 0]).mean())})  # fmt: skip
+                rows.append(
+                    {
+                        "task": task.name,
+                        "clips": len(pairs),
+                        "method": f"MAP on {kind}",
+                        "error_cm": ours,
+                        "slerp_cm": slerp,
+                        "ratio": float((errors[:, 1] / errors[:, 0]).mean()),
+                    }
+                )
     return rows
 
 
@@ -109,8 +129,10 @@ def _of_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, Inbetwe
     if task.gap:
         masks = [Mask(ALL, (task.frames - task.gap) // 2, (task.frames + task.gap) // 2)]
         methods: tuple[tuple[str, Method], ...] = (
-            ("on rigid bones", "infiller"), ("and MAP", "map"), ("interpolation", "linear"),
-        )  # fmt: skip
+            ("on rigid bones", "infiller"),
+            ("and MAP", "map"),
+            ("interpolation", "linear"),
+        )
         for name, method in methods:
             settings = InfillSettings(method=method)
             done = [_filled(clip, masks, networks[ours], settings) for clip in clips]
@@ -137,8 +159,14 @@ def _raw(clip: Motion, task: Task, network: Inbetweener, generator: torch.Genera
     facing = heading(clip.local_quat_xyzw[:, 0]).float()
     stands = contacts.planted(truth[:, list(_TOES)], PRIOR_FPS).float()
     guess = slerped(seen[None], clip.local_quat_xyzw.float()[None], known[None])
-    image = PositionImage.of_world(guess, led(facing[None], known[None]), stands[None], known=known[None],
-                                   present=torch.ones(1, len(truth), dtype=torch.bool), toes=_TOES)  # fmt: skip
+    image = PositionImage.of_world(
+        guess,
+        led(facing[None], known[None]),
+        stands[None],
+        known=known[None],
+        present=torch.ones(1, len(truth), dtype=torch.bool),
+        toes=_TOES,
+    )
     places = image.to_world(network.propose(image).places)[0]
     return _result(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))
 
@@ -168,8 +196,11 @@ def _known(task: Task, generator: torch.Generator) -> Bool[Tensor, "frames joint
 
 def _summary(results: Sequence[_Result]) -> Row:
     errors, bones = (torch.cat([getattr(result, name) for result in results]) for name in ("errors", "bones"))
-    return {"error_cm": 100 * float(errors.mean()), "std_cm": 100 * float(errors.std()),
-            "bones_mm": 1000 * float(bones.mean())}  # fmt: skip
+    return {
+        "error_cm": 100 * float(errors.mean()),
+        "std_cm": 100 * float(errors.std()),
+        "bones_mm": 1000 * float(bones.mean()),
+    }
 
 
 def on_canonical_bones(motion: Motion) -> Motion:

@@ -90,6 +90,15 @@ def timing(clips: Sequence[Motion]) -> list[Row]:
                 ratio = (seconds / pairs.seconds)[which]
                 low, middle, high = torch.quantile(ratio, ratio.new_tensor([0.25, 0.5, 0.75])).tolist()
                 off = float(ratio.log().abs().median().exp())
-                rows.append({"pairs": name, "count": len(ratio), "method": method, "median": middle,
-                             "lower_quartile": low, "upper_quartile": high, "half_off_by": off})  # fmt: skip
+                rows.append(
+                    {
+                        "pairs": name,
+                        "count": len(ratio),
+                        "method": method,
+                        "median": middle,
+                        "lower_quartile": low,
+                        "upper_quartile": high,
+                        "half_off_by": off,
+                    }
+                )
     return rows

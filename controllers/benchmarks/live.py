@@ -59,9 +59,13 @@ class _Log:
 
 
 def live(
-    load: Callable[[], Any], *, characters: int, minutes: float, seed: int = 0,
+    load: Callable[[], Any],
+    *,
+    characters: int,
+    minutes: float,
+    seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
-) -> Row:  # fmt: skip
+) -> Row:
     """So many characters for so long, together in one row; `load` as in RemoteRequest."""
     draws = torch.Generator().manual_seed(seed)
     remotes = [Remote(RemoteRequest(load, Command(1.2, 0.0), seed + k)) for k in range(characters)]
@@ -106,11 +110,16 @@ def _row(logs: list[_Log], minutes: float) -> Row:
     cost = np.concatenate([log.cost for log in logs])
     memory = [log.memory for log in logs if len(log.memory) > 1]
     return {
-        "characters": len(logs), "minutes": minutes, "frames": sum(log.frames for log in logs),
-        "late_frames": sum(log.late for log in logs), "not_finite": sum(log.broken for log in logs),
-        "frame_ms_p50": float(np.percentile(cost, 50)), "frame_ms_p99": float(np.percentile(cost, 99)),
+        "characters": len(logs),
+        "minutes": minutes,
+        "frames": sum(log.frames for log in logs),
+        "late_frames": sum(log.late for log in logs),
+        "not_finite": sum(log.broken for log in logs),
+        "frame_ms_p50": float(np.percentile(cost, 50)),
+        "frame_ms_p99": float(np.percentile(cost, 99)),
         "evaluations_a_step": float(np.mean(np.concatenate([log.evaluations for log in logs]))),
-        "commands": sum(log.commands for log in logs), "not_obeyed": sum(log.missed for log in logs),
+        "commands": sum(log.commands for log in logs),
+        "not_obeyed": sum(log.missed for log in logs),
         "memory_mb_first": max((m[1] for m in memory), default=math.nan),
         "memory_mb_last": max((m[-1] for m in memory), default=math.nan),
-    }  # fmt: skip
+    }

@@ -39,8 +39,17 @@ def lost_joints(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) ->
                 found.append([_away(motion, clip, joints) for motion in tried])
             if found:
                 usual, own, ours = (100 * torch.tensor(found)).mean(dim=0).tolist()
-                rows.append({"task": f"{name} lost", "clips": len(found), "method": f"MAP on {kind}", "error_cm": ours,
-                             "mean_pose_cm": usual, "own_mean_pose_cm": own, "ratio": ours / usual})  # fmt: skip
+                rows.append(
+                    {
+                        "task": f"{name} lost",
+                        "clips": len(found),
+                        "method": f"MAP on {kind}",
+                        "error_cm": ours,
+                        "mean_pose_cm": usual,
+                        "own_mean_pose_cm": own,
+                        "ratio": ours / usual,
+                    }
+                )
     return rows
 
 
@@ -48,8 +57,12 @@ def mean_rotations(motions: Sequence[Motion]) -> Float[Tensor, "joints 4"]:
     """Of every joint over all frames, in the joint above, every motion counting alike: the eigenvector of the largest
     eigenvalue of the summed outer products (Markley et al. 2007).
     """
-    outer = torch.stack([torch.einsum("tji,tjk->jik", quats, quats) / len(quats)
-                         for quats in (motion.local_quat_xyzw for motion in motions)]).sum(dim=0)  # fmt: skip
+    outer = torch.stack(
+        [
+            torch.einsum("tji,tjk->jik", quats, quats) / len(quats)
+            for quats in (motion.local_quat_xyzw for motion in motions)
+        ]
+    ).sum(dim=0)
     return torch.linalg.eigh(outer)[1][..., -1]
 
 

@@ -63,9 +63,15 @@ def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) 
         everything.append(features)
         pace = ground_speed(features)
         seconds = pace[: len(pace) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
-        rows.append({"run": str(run), **state_summary(features), "slowest_second_m_s": float(seconds.min()),
-                     "fastest_second_m_s": float(seconds.max()),
-                     "largest_feature_sigma": float(_in_sigmas(prior, features).abs().max())})  # fmt: skip
+        rows.append(
+            {
+                "run": str(run),
+                **state_summary(features),
+                "slowest_second_m_s": float(seconds.min()),
+                "fastest_second_m_s": float(seconds.max()),
+                "largest_feature_sigma": float(_in_sigmas(prior, features).abs().max()),
+            }
+        )
     data = prior.card.quality["data"]
     return [*rows, {"run": "all", **state_summary(torch.cat(everything))}, {"run": "training data", **data}]
 
@@ -116,9 +122,15 @@ def _ablated(prior: Any, curve: Curve, wishes: FollowSettings, label: str, setti
     solution = _followed(prior, curve, settings.seconds, settings.seed, wishes)
     spent = time.process_time() - began
     found = measure(solution.motion, curve)
-    return {"method": label, "energy_nats": _wish_energy(solution), "path_error_mean_cm": found["path_error_mean_cm"],
-            "path_error_max_cm": found["path_error_max_cm"], "contact_speed_cm_s": found["contact_speed_cm_s"],
-            "jitter_m_s3": found["jitter_m_s3"], "ms_per_frame": 1000 * spent / solution.motion.num_frames}  # fmt: skip
+    return {
+        "method": label,
+        "energy_nats": _wish_energy(solution),
+        "path_error_mean_cm": found["path_error_mean_cm"],
+        "path_error_max_cm": found["path_error_max_cm"],
+        "contact_speed_cm_s": found["contact_speed_cm_s"],
+        "jitter_m_s3": found["jitter_m_s3"],
+        "ms_per_frame": 1000 * spent / solution.motion.num_frames,
+    }
 
 
 def _wish_energy(solution: Solution) -> float:
@@ -128,8 +140,13 @@ def _wish_energy(solution: Solution) -> float:
 
 def _evaluation(prior: Any, reference: Any, count: int, settings: BenchSettings) -> Row:
     fast, slow = (_timed_evaluation(p, count, settings) for p in (prior, reference))
-    return {"what": f"energy and gradient, 34 frames, {count} candidates", "fast_ms": fast, "reference_ms": slow,
-            "times_faster": slow / fast, "fast_ms_per_candidate": fast / count}  # fmt: skip
+    return {
+        "what": f"energy and gradient, 34 frames, {count} candidates",
+        "fast_ms": fast,
+        "reference_ms": slow,
+        "times_faster": slow / fast,
+        "fast_ms_per_candidate": fast / count,
+    }
 
 
 def _timed_evaluation(prior: Any, count: int, settings: BenchSettings) -> float:
@@ -150,8 +167,11 @@ def _solve(prior: Any, seconds: float, settings: BenchSettings) -> Row:
     solution = _followed(prior, curves.circle(radius=4.0), seconds, settings.seed, FollowSettings())
     frames = solution.motion.num_frames
     windows = solution.windows
-    return {"what": f"follow a circle for {seconds:g} s", "ms_per_frame": 1000 * (time.process_time() - began) / frames,
-            "evaluations_per_window": sum(w.evaluations for w in windows) / len(windows)}  # fmt: skip
+    return {
+        "what": f"follow a circle for {seconds:g} s",
+        "ms_per_frame": 1000 * (time.process_time() - began) / frames,
+        "evaluations_per_window": sum(w.evaluations for w in windows) / len(windows),
+    }
 
 
 def _followed(prior: Any, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:

@@ -52,10 +52,16 @@ def steering(prior: Any, settings: SteeringSettings | None = None) -> list[Row]:
     for (before, after), row in zip(pairwise(track.commands), rows[1:], strict=False):
         kinds.setdefault(_kind(before, after), []).append(row)
     cost, feet = timing(records), measure(motion)
-    whole = {"frame_ms_p50": cost["frame_ms_p50"], "frame_ms_p99": cost["frame_ms_p99"],
-             "contact_speed_cm_s": feet["contact_speed_cm_s"], "jitter_m_s3": feet["jitter_m_s3"]}  # fmt: skip
-    return [*({"change": kind, **_summary(some)} for kind, some in sorted(kinds.items())),
-            {"change": "all", **_summary(rows[1:]), **whole}]  # fmt: skip
+    whole = {
+        "frame_ms_p50": cost["frame_ms_p50"],
+        "frame_ms_p99": cost["frame_ms_p99"],
+        "contact_speed_cm_s": feet["contact_speed_cm_s"],
+        "jitter_m_s3": feet["jitter_m_s3"],
+    }
+    return [
+        *({"change": kind, **_summary(some)} for kind, some in sorted(kinds.items())),
+        {"change": "all", **_summary(rows[1:]), **whole},
+    ]
 
 
 def pursued(prior: Any, seed: int = 0) -> list[Row]:
@@ -69,8 +75,15 @@ def pursued(prior: Any, seed: int = 0) -> list[Row]:
         recorder.show(first, 0.0)
         drive(state, pursuit, [recorder, pursuit], frames=round(seconds * PRIOR_FPS))
         found = measure(recorder.motion(), curve)
-        rows.append({"change": f"live along {name}", **{key: found[key] for key in
-                     ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")}})  # fmt: skip
+        rows.append(
+            {
+                "change": f"live along {name}",
+                **{
+                    key: found[key]
+                    for key in ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")
+                },
+            }
+        )
     return rows
 
 
@@ -99,7 +112,9 @@ def _summary(rows: list[Row]) -> Row:
     reached = [row["reached_s"] for row in rows if row["reached_s"] is not None]
     off = [abs(row["steady_heading_error_deg"]) for row in rows if row["steady_heading_error_deg"] is not None]
     return {
-        "commands": len(rows), "reached": len(reached),
-        "seconds_mean": statistics.mean(reached) if reached else None, "seconds_max": max(reached, default=None),
+        "commands": len(rows),
+        "reached": len(reached),
+        "seconds_mean": statistics.mean(reached) if reached else None,
+        "seconds_max": max(reached, default=None),
         "direction_off_deg_median": statistics.median(off) if off else None,
-    }  # fmt: skip
+    }

@@ -31,9 +31,12 @@ Row = dict[str, Any]
 
 
 def table(
-    kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener, densities: Sequence[Any], *,
+    kinds: Mapping[str, Sequence[Motion]],
+    infiller: Inbetweener,
+    densities: Sequence[Any],
+    *,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Row]:  # fmt: skip
+) -> list[Row]:
     """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens as they are by default, of a
     rolled variation and of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
     """
@@ -52,14 +55,20 @@ def table(
                 began = time.perf_counter()
                 made = way(clip, keys, infiller).motion
                 told[method].append(_of_keys(made, clip, keys.frames, time.perf_counter() - began))
-        rows += [{"kind": kind, "what": "keys", "by": method, "clips": len(each), **_mean(each)}
-                 for method, each in told.items() if each]  # fmt: skip
+        rows += [
+            {"kind": kind, "what": "keys", "by": method, "clips": len(each), **_mean(each)}
+            for method, each in told.items()
+            if each
+        ]
         shown = [clip.slice(0, 4 * PRIOR_FPS) for clip in clips if clip.num_frames >= 4 * PRIOR_FPS]
         for count in _ENDS:
             for by, extending in (("infiller", ()), ("density", densities)):
                 each = [_of_end(clip, count, infiller, extending) for clip in shown]
-                rows += [{"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each),
-                          **_mean(each)}] if each else []  # fmt: skip
+                rows += (
+                    [{"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each), **_mean(each)}]
+                    if each
+                    else []
+                )
         if progress is not None:
             progress(number + 1, len(kinds))
     return rows
@@ -73,17 +82,25 @@ def _of_keys(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) ->
     away = (places - truth).norm(dim=-1)
     ends, toes = ([made.skeleton.index(name) for name in names] for names in (("leftHand", "rightHand", *TOES), TOES))
     worst_ours, worst_mocap = (_worst(each.joint_positions(), ends, toes) for each in (made, clip))
-    return {"key_mm": 1000 * float(away[list(keys)].max()), "error_cm": 100 * float(away.mean()),
-            "jerk_at_keys": at_keys / float(usual.quantile(0.95)), **_feet(made, clip), **worst_ours,
-            **{f"mocap_{name}": value for name, value in worst_mocap.items()},
-            "ms_frame": 1000 * seconds / made.num_frames}  # fmt: skip
+    return {
+        "key_mm": 1000 * float(away[list(keys)].max()),
+        "error_cm": 100 * float(away.mean()),
+        "jerk_at_keys": at_keys / float(usual.quantile(0.95)),
+        **_feet(made, clip),
+        **worst_ours,
+        **{f"mocap_{name}": value for name, value in worst_mocap.items()},
+        "ms_frame": 1000 * seconds / made.num_frames,
+    }
 
 
 def _worst(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
     """Largest step (cm in a thirtieth of a second) and acceleration of hands and toes; longest time on no foot."""
     peaks = worst_frame.peaks(places[:, ends], places[:, 0], PRIOR_FPS)
-    return {"step_cm": 100 * peaks.step, "acceleration_m_s2": peaks.acceleration,
-            "unsupported_s": worst_frame.longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS)}  # fmt: skip
+    return {
+        "step_cm": 100 * peaks.step,
+        "acceleration_m_s2": peaks.acceleration,
+        "unsupported_s": worst_frame.longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS),
+    }
 
 
 def _of_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence[Any]) -> Row:
@@ -98,9 +115,13 @@ def _of_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence
 
 def _feet(made: Motion, clip: Motion) -> Row:
     ours, theirs = metrics.measure(made), metrics.measure(clip)
-    return {"skate_cm_s": ours["skate_cm_s"], "mocap_skate": theirs["skate_cm_s"],
-            "planted_cm_s": ours["contact_speed_cm_s"], "mocap_planted": theirs["contact_speed_cm_s"],
-            "jitter": ours["jitter_m_s3"] / theirs["jitter_m_s3"]}  # fmt: skip
+    return {
+        "skate_cm_s": ours["skate_cm_s"],
+        "mocap_skate": theirs["skate_cm_s"],
+        "planted_cm_s": ours["contact_speed_cm_s"],
+        "mocap_planted": theirs["contact_speed_cm_s"],
+        "jitter": ours["jitter_m_s3"] / theirs["jitter_m_s3"],
+    }
 
 
 def _mean(rows: Sequence[Row]) -> Row:

@@ -44,8 +44,10 @@ class Stature:
         """The person's bones at the prior's size: only their proportions are the person's own."""
         if self.scale == 1.0:
             return self.skeleton
-        ends = {name: (x / self.scale, y / self.scale, z / self.scale)
-                for name, (x, y, z) in self.skeleton.end_offsets.items()}  # fmt: skip
+        ends = {
+            name: (x / self.scale, y / self.scale, z / self.scale)
+            for name, (x, y, z) in self.skeleton.end_offsets.items()
+        }
         return Skeleton(CANONICAL.names, CANONICAL.parents, self.skeleton.offsets / self.scale, ends)
 
     def curve(self, curve: Curve) -> Curve:
@@ -72,9 +74,12 @@ class Stature:
     def footing(self, footing: Footing) -> Footing:
         """A footing term, whose rest height is the person's own, for the prior's size."""
         return replace(
-            footing, sigma_speed=footing.sigma_speed / self.scale, sigma_height=footing.sigma_height / self.scale,
-            sigma_below=footing.sigma_below / self.scale, rest_height=self.toe_rest_height / self.scale,
-        )  # fmt: skip
+            footing,
+            sigma_speed=footing.sigma_speed / self.scale,
+            sigma_height=footing.sigma_height / self.scale,
+            sigma_below=footing.sigma_below / self.scale,
+            rest_height=self.toe_rest_height / self.scale,
+        )
 
     def motion(self, motion: Motion) -> Motion:
         """A motion of the prior's size on the person's bones."""
@@ -86,8 +91,10 @@ class Stature:
         """Residuals with a length in them in the person's metres."""
         if self.scale == 1.0:
             return ledger
-        scaled = [replace(entry, residual=entry.residual * self.scale) if entry.unit.startswith(("m", "cm")) else entry
-                  for entry in ledger.entries]  # fmt: skip
+        scaled = [
+            replace(entry, residual=entry.residual * self.scale) if entry.unit.startswith(("m", "cm")) else entry
+            for entry in ledger.entries
+        ]
         return Ledger(tuple(scaled))
 
 

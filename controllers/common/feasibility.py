@@ -76,8 +76,10 @@ def between_keys(
         rates = turns * ~(lost.joints[start] | lost.joints[stop]) / seconds
         worst = int(rates.argmax())
         if float(rates[worst]) > _WHIP:
-            notes.append(f"{motion.skeleton.names[worst]} needs {float(rates[worst]):.0f} rad/s between frames {start} "
-                         f"and {stop}, which nobody turns")  # fmt: skip
+            notes.append(
+                f"{motion.skeleton.names[worst]} needs {float(rates[worst]):.0f} rad/s between frames {start} "
+                f"and {stop}, which nobody turns"
+            )
     return (*notes, *([] if targets is None else _limbs(motion, hips, rigmap, lost, targets)))
 
 
@@ -98,8 +100,10 @@ def _limbs(motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, lost
                 notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, which nobody reaches")
             elif jolt > _JOLT:
                 where = f"between frames {start} and {stop}"
-                notes.append(f"{name} goes {100 * far:.0f} cm in {seconds:.2f} s {where}, which takes {jolt:.0f} m/s^2;"
-                             f" mocap's hardly ever reach {_JOLT:.0f}")  # fmt: skip
+                notes.append(
+                    f"{name} goes {100 * far:.0f} cm in {seconds:.2f} s {where}, which takes {jolt:.0f} m/s^2;"
+                    f" mocap's hardly ever reach {_JOLT:.0f}"
+                )
     return notes
 
 
@@ -120,5 +124,7 @@ def _corners(request: Follow, arcs: Tensor, abilities: Abilities) -> list[str]:
     if float(turned[worst]) <= abilities.turn_rate:
         return []
     degrees, able = (torch.rad2deg(torch.tensor(v)).item() for v in (float(turned[worst]), abilities.turn_rate))
-    return [f"the curve turns {degrees:.0f} degrees within a second at {float(arcs[worst]):.1f} m, "
-            f"where the prior's data turn at most {able:.0f}"]  # fmt: skip
+    return [
+        f"the curve turns {degrees:.0f} degrees within a second at {float(arcs[worst]):.1f} m, "
+        f"where the prior's data turn at most {able:.0f}"
+    ]

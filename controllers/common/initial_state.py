@@ -38,9 +38,15 @@ class Start:
 
 
 def choose_start(
-    prior: Any, curve: Curve, arcs: Float[Tensor, " frames"], terms_of: Callable[[int, int], Sequence[Term]], *,
-    skeleton: Skeleton, fps: float, generator: torch.Generator,
-) -> Start:  # fmt: skip
+    prior: Any,
+    curve: Curve,
+    arcs: Float[Tensor, " frames"],
+    terms_of: Callable[[int, int], Sequence[Term]],
+    *,
+    skeleton: Skeleton,
+    fps: float,
+    generator: torch.Generator,
+) -> Start:
     """Of the prior's starts near the wanted speed, one of those that fit the wishes best with nobody steering.
 
     Each candidate stands on the curve's first point and is turned so that the first half second of its plain rollout

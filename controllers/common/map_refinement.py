@@ -89,9 +89,14 @@ class Stood:
 
 
 def stand(
-    proposal: Motion, contacts: Float[Tensor, "frames 2"], capture: Capture, settings: StandingSettings, *,
-    densities: Sequence[Any] = (), targets: Targets | None = None,
-) -> Stood:  # fmt: skip
+    proposal: Motion,
+    contacts: Float[Tensor, "frames 2"],
+    capture: Capture,
+    settings: StandingSettings,
+    *,
+    densities: Sequence[Any] = (),
+    targets: Targets | None = None,
+) -> Stood:
     """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was. `targets` are
     places that joints are wanted at.
 
@@ -109,8 +114,15 @@ def stand(
     while first < frames:
         stop = min(frames, first + settings.frames)
         count = stop - first if stop == frames else settings.frames - settings.ahead
-        poses = Poses(guide.slice(first, stop), sigma[first:stop], done.place, done.before, done.contacts,
-                      proposal.skeleton, smooth=settings.smooth)  # fmt: skip
+        poses = Poses(
+            guide.slice(first, stop),
+            sigma[first:stop],
+            done.place,
+            done.before,
+            done.contacts,
+            proposal.skeleton,
+            smooth=settings.smooth,
+        )
         terms: list[Term] = [Noise(1.0), footing]
         if judges:
             poses, done, choice = _judged(poses, done, judges)

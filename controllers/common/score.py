@@ -45,7 +45,15 @@ def energy_of(
     terms.append(Support(rest_height=height))
     terms.append(settings.seam or Seam(sigma=50.0, frames=len(features)))
     contacts = features[:, LAYOUT.slices["contacts"]] > 0.5
-    trial = Trial(shown, place, torch.zeros_like(shown), nats, contacts[None, _PAST:],
-                  canonical.joint_positions()[:_PAST].float(), canonical.skeleton, PRIOR_FPS,
-                  contacts[_PAST - 1])  # fmt: skip
+    trial = Trial(
+        shown,
+        place,
+        torch.zeros_like(shown),
+        nats,
+        contacts[None, _PAST:],
+        canonical.joint_positions()[:_PAST].float(),
+        canonical.skeleton,
+        PRIOR_FPS,
+        contacts[_PAST - 1],
+    )
     return Objective(lambda unknowns: trial, terms).ledger_of(trial)

@@ -52,9 +52,13 @@ class CausalDenoiser:
     """Takes the frames of one capture as they come, gives back clean ones."""
 
     def __init__(
-        self, denoiser: Denoiser, *, settings: DenoiseSettings | None = None, causal: CausalSettings | None = None,
+        self,
+        denoiser: Denoiser,
+        *,
+        settings: DenoiseSettings | None = None,
+        causal: CausalSettings | None = None,
         rig: Rig | None = None,
-    ):  # fmt: skip
+    ):
         """`rig` wins over what would be recognised."""
         self._denoiser, self._settings, self._rig = denoiser, settings or DenoiseSettings(), rig
         self._told = False  # whether the rig was told from the capture's beginning, which later passes do not see
@@ -128,10 +132,15 @@ class CausalDenoiser:
 
 
 def denoise_causal(
-    motion: Motion, denoiser: Denoiser, *, masks: Sequence[Mask] = (), settings: DenoiseSettings | None = None,
-    delay: float = CausalSettings.delay, rig: Rig | None = None,
+    motion: Motion,
+    denoiser: Denoiser,
+    *,
+    masks: Sequence[Mask] = (),
+    settings: DenoiseSettings | None = None,
+    delay: float = CausalSettings.delay,
+    rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Denoised:  # fmt: skip
+) -> Denoised:
     """A whole motion through a CausalDenoiser, a frame at a time."""
     began = time.perf_counter()
     stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay), rig=rig)

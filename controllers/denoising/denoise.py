@@ -34,9 +34,15 @@ _PIECE, _SHARED = 60.0, 2.0  # seconds of a long capture that are cleaned at onc
 
 
 def denoise(
-    motion: Motion, denoiser: Denoiser, *, masks: Sequence[Mask] = (), settings: DenoiseSettings | None = None,
-    densities: Sequence[Any] = (), rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
-) -> Denoised:  # fmt: skip
+    motion: Motion,
+    denoiser: Denoiser,
+    *,
+    masks: Sequence[Mask] = (),
+    settings: DenoiseSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Denoised:
     """Denoise a motion on any rig that `mapctl.retarget.rigs` can tell, or on a given one; RequestError for others and
     for masks that do not fit.
 
@@ -85,16 +91,21 @@ def _beginning(motion: Motion) -> Motion:
 
 
 def _cleaned(
-    motion: Motion, denoiser: Denoiser, masks: Sequence[Mask], settings: DenoiseSettings, densities: Sequence[Any],
+    motion: Motion,
+    denoiser: Denoiser,
+    masks: Sequence[Mask],
+    settings: DenoiseSettings,
+    densities: Sequence[Any],
     rig: Rig,
-) -> Denoised:  # fmt: skip
+) -> Denoised:
     began = time.perf_counter()
     examined = examine(motion, masks)
     if motion.num_frames < SHORTEST:
         nothing = torch.zeros(motion.num_frames, 2, dtype=torch.bool)
         believed = torch.zeros(motion.num_frames, CANONICAL.num_joints)
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
-        return Denoised(motion, motion, examined.noise, examined.noise_root, (), nothing, believed, Ledger(),
-                        notes=(note,))  # fmt: skip
+        return Denoised(
+            motion, motion, examined.noise, examined.noise_root, (), nothing, believed, Ledger(), notes=(note,)
+        )
     done = Piece(examined, denoiser, settings, rig).run(densities)
     return replace(done, seconds=time.perf_counter() - began)

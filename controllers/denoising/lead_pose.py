@@ -55,8 +55,9 @@ def led_by(motion: Motion, done: Denoised, rigmap: RigMap, found: Passage, masks
     notes = ["frame 0 is a T-pose, or the rest pose: it stays, but for noise of joints at rest"]
     if found.stop > 1:
         notes.append(f"frames 1 to {found.stop - 1} mix it into the motion, as exporters' filters do, and stay mixed")
-    return replace(done, motion=pose.join(clean), capture=motion, faults=faults, stretches=stretches,
-                   notes=(*notes, *done.notes))  # fmt: skip
+    return replace(
+        done, motion=pose.join(clean), capture=motion, faults=faults, stretches=stretches, notes=(*notes, *done.notes)
+    )
 
 
 def _clear_tpose(canonical: Motion) -> bool:
@@ -72,8 +73,12 @@ def _like_tpose(canonical: Motion) -> bool:
     """
     first = Poses.of(canonical.slice(0, 1), range(CANONICAL.num_joints))
     up, left = first.up()[0], first.left()[0]
-    aims = (("leftUpperArm", "leftHand", left), ("rightUpperArm", "rightHand", -left),
-            ("leftUpperLeg", "leftFoot", -up), ("rightUpperLeg", "rightFoot", -up))  # fmt: skip
+    aims = (
+        ("leftUpperArm", "leftHand", left),
+        ("rightUpperArm", "rightHand", -left),
+        ("leftUpperLeg", "leftFoot", -up),
+        ("rightUpperLeg", "rightFoot", -up),
+    )
     ways = [(first.place(stop)[0] - first.place(start)[0], aim) for start, stop, aim in aims]
     return all(float(way @ aim) > math.cos(_LIKE) * float(way.norm()) for way, aim in ways)
 
@@ -118,8 +123,9 @@ def _at_rest(motion: Motion, done: Denoised, rigmap: RigMap) -> Motion:
 def _rests(motion: Motion, rigmap: RigMap) -> list[Float[Tensor, "1 joints 4"]]:
     """Local rotations that a T-pose may be meant to have: none, as in CMU's takes, and those of the rig's T-pose."""
     none = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    tpose = Motion(rigmap.skeleton, motion.fps, torch.zeros(1, 3, dtype=torch.float64),
-                   none.expand(1, CANONICAL.num_joints, 4))  # fmt: skip
+    tpose = Motion(
+        rigmap.skeleton, motion.fps, torch.zeros(1, 3, dtype=torch.float64), none.expand(1, CANONICAL.num_joints, 4)
+    )
     return [none.expand(1, motion.num_joints, 4), from_canonical(tpose, rigmap).local_quat_xyzw]
 
 

@@ -64,8 +64,9 @@ def passage(motion: Motion, rigmap: RigMap) -> Passage:
     if count == 0:
         return none
     part, place = slice(0, count), _place(motion, traveller(motion))
-    by_mixing, by_motion = (_misses(model, seen[part])
-                            for model in (mixed(pose, ahead[part], share[part]), ahead[part]))  # fmt: skip
+    by_mixing, by_motion = (
+        _misses(model, seen[part]) for model in (mixed(pose, ahead[part], share[part]), ahead[part])
+    )
     limbs, body = torch.ones(motion.num_joints, dtype=torch.bool), carriers(motion, rigmap)
     limbs[body] = False
     if by_mixing[limbs].sum() > by_motion[limbs].sum():
@@ -89,9 +90,11 @@ def _mixed_joints(
 
 
 def _place_mixed(
-    pose: Float[Tensor, "1 3"], ahead: Float[Tensor, "frames 3"], seen: Float[Tensor, "frames 3"],
+    pose: Float[Tensor, "1 3"],
+    ahead: Float[Tensor, "frames 3"],
+    seen: Float[Tensor, "frames 3"],
     share: Float[Tensor, " frames"],
-) -> bool:  # fmt: skip
+) -> bool:
     away = (seen - torch.lerp(pose, ahead, share[:, None])).square().sum()
     return bool(_CLEARLY * away < (seen - ahead).square().sum())
 

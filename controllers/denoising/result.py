@@ -59,11 +59,15 @@ class Denoised:
         part = slice(round(start * ratio), round(stop * ratio))
         faults = _shifted(_between(self.faults, start, stop), -start)
         return replace(
-            self, motion=self.motion.slice(start, stop), capture=self.capture.slice(start, stop),
-            faults=tuple(faults), contacts=self.contacts[part], believed=self.believed[part],
+            self,
+            motion=self.motion.slice(start, stop),
+            capture=self.capture.slice(start, stop),
+            faults=tuple(faults),
+            contacts=self.contacts[part],
+            believed=self.believed[part],
             stretches=tuple(_shifted(_between(self.stretches, start, stop), -start)),
             ledger=_part(self.ledger, part),
-        )  # fmt: skip
+        )
 
     def summary(self) -> dict[str, Any]:
         """For a report, in plain numbers."""
@@ -71,17 +75,21 @@ class Denoised:
         moved, turned = self.correction()
         return {
             "rig": None if self.rig is None else self.rig.name,
-            "frames": self.motion.num_frames, "fps": float(self.motion.fps),
+            "frames": self.motion.num_frames,
+            "fps": float(self.motion.fps),
             "noise_deg": dict(zip(names, torch.rad2deg(self.noise).tolist(), strict=True)),
             "noise_root_cm": 100 * self.noise_root,
             "faults": [vars(fault) for fault in self.faults],
             "correction_cm": dict(zip(names, moved.tolist(), strict=True)),
             "correction_deg": dict(zip(names, turned.tolist(), strict=True)),
-            "contacts": self.contact_frames(), "fallback": self.fallback(),
+            "contacts": self.contact_frames(),
+            "fallback": self.fallback(),
             "densities": [vars(stretch) for stretch in self.stretches],
-            "ledger": self.ledger.summary(), "seconds": self.seconds,
-            "frame_ms": 1000 * self.seconds / self.motion.num_frames, "notes": list(self.notes),
-        }  # fmt: skip
+            "ledger": self.ledger.summary(),
+            "seconds": self.seconds,
+            "frame_ms": 1000 * self.seconds / self.motion.num_frames,
+            "notes": list(self.notes),
+        }
 
     def correction(self) -> tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]]:
         """By joint of the rig the mean distance that it was moved by (cm), and the mean angle in its parent (deg)."""
@@ -105,8 +113,10 @@ class Denoised:
     def fallback(self) -> list[dict[str, Any]]:
         """Joints, and frames of the capture, in which the network was out of its depth."""
         scale = float(self.motion.fps) / PRIOR_FPS
-        return [{"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": self._last(stop, scale)}
-                for joint, start, stop in runs(self.believed < _DOUBTED)]  # fmt: skip
+        return [
+            {"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": self._last(stop, scale)}
+            for joint, start, stop in runs(self.believed < _DOUBTED)
+        ]
 
 
 def joined(pieces: Sequence[tuple[Denoised, int]]) -> Denoised:
@@ -132,16 +142,19 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
     later = _between(_shifted(piece.stretches, start), skip, motion.num_frames)
     share = piece.motion.num_frames / motion.num_frames
     return replace(
-        whole, motion=motion, capture=whole.capture.join(piece.capture.slice(shared, piece.capture.num_frames)),
+        whole,
+        motion=motion,
+        capture=whole.capture.join(piece.capture.slice(shared, piece.capture.num_frames)),
         noise=(1 - share) * whole.noise + share * piece.noise,
-        noise_root=(1 - share) * whole.noise_root + share * piece.noise_root, faults=faults,
+        noise_root=(1 - share) * whole.noise_root + share * piece.noise_root,
+        faults=faults,
         contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
         believed=torch.cat([whole.believed[:kept], piece.believed[skipped:]]),
         ledger=whole.ledger.slice(kept).join(_part(piece.ledger, slice(skipped, None))),
         seconds=whole.seconds + piece.seconds,
         notes=tuple(dict.fromkeys(whole.notes + piece.notes)),
         stretches=(*_between(whole.stretches, 0, skip), *later),
-    )  # fmt: skip
+    )
 
 
 def _shifted(parts: Sequence[Part], frames: int) -> list[Part]:
@@ -183,8 +196,10 @@ def faded(before: Motion, after: Motion, shared: int) -> Motion:
     weight = torch.linspace(0, 1, shared, dtype=torch.float64)
     tail, head = before.slice(first, before.num_frames), after.slice(0, shared)
     place = torch.lerp(tail.root_position, head.root_position, weight[:, None])
-    moving = {joint: torch.lerp(values, head.moving_offsets[joint], weight[:, None])
-              for joint, values in tail.moving_offsets.items()}  # fmt: skip
+    moving = {
+        joint: torch.lerp(values, head.moving_offsets[joint], weight[:, None])
+        for joint, values in tail.moving_offsets.items()
+    }
     turns = weight[:, None].expand(shared, before.num_joints)
     quats = rotations.slerp(tail.local_quat_xyzw, head.local_quat_xyzw, turns)
     mixed = replace(tail, root_position=place, local_quat_xyzw=quats, moving_offsets=moving)

@@ -83,16 +83,30 @@ class Piece:
         within = self.bands.within
         stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
         examined, found = self.examined, self._faults(motion, proposal.slice(0, within), stood)
-        return Denoised(motion, examined.motion, examined.noise, examined.noise_root, found, stood.contacts,
-                        1 - share[:within], stood.ledger, stretches=self._at_own_rate(stood.stretches))  # fmt: skip
+        return Denoised(
+            motion,
+            examined.motion,
+            examined.noise,
+            examined.noise_root,
+            found,
+            stood.contacts,
+            1 - share[:within],
+            stood.ledger,
+            stretches=self._at_own_rate(stood.stretches),
+        )
 
     def _at_own_rate(self, stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
         """In frames of the capture; the last ends with it."""
         frames, shown = self.examined.motion.num_frames, self.shown.num_frames
         ratio = float(self.examined.motion.fps) / float(self.shown.fps)
-        moved = [replace(part, start=min(frames, round(part.start * ratio)),
-                         stop=frames if part.stop == shown else min(frames, round(part.stop * ratio)))
-                 for part in stretches]  # fmt: skip
+        moved = [
+            replace(
+                part,
+                start=min(frames, round(part.start * ratio)),
+                stop=frames if part.stop == shown else min(frames, round(part.stop * ratio)),
+            )
+            for part in stretches
+        ]
         return tuple(part for part in moved if part.start < part.stop)
 
     def _faults(self, motion: Motion, proposal: Motion, stood: Stood) -> tuple[artefacts.Fault, ...]:
@@ -113,8 +127,9 @@ class Piece:
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
         ratio = float(motion.fps) / float(self.shown.fps)
         height = rest_height(proposal, stood.contacts)
-        steps = artefacts.feet(known, proposal.joint_positions()[:, toes], stood.contacts, rest_height=height,
-                            fps=float(self.shown.fps))  # fmt: skip
+        steps = artefacts.feet(
+            known, proposal.joint_positions()[:, toes], stood.contacts, rest_height=height, fps=float(self.shown.fps)
+        )
         return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
 
     def _spikes_on_rig(self) -> Bool[Tensor, "frames joints"]:
@@ -148,8 +163,13 @@ class Piece:
         root = self.seen_root[:, None]
         sigma = self.bands.noise_at_prior_rate(self.sigma)
         sigma_root = self.bands.noise_at_prior_rate(torch.tensor(self.sigma_root))
-        return Capture.of_motion(self.shown, seen=self._resampled(seen), seen_root=self._resampled(root)[:, 0],
-                                 sigma=sigma, sigma_root=float(sigma_root))  # fmt: skip
+        return Capture.of_motion(
+            self.shown,
+            seen=self._resampled(seen),
+            seen_root=self._resampled(root)[:, 0],
+            sigma=sigma,
+            sigma_root=float(sigma_root),
+        )
 
     def _resampled(self, seen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
         """Seen at the prior's rate is what was seen in half of the frames about there."""

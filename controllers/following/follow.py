@@ -53,16 +53,25 @@ class FollowSettings:
         """The same sigmas for somebody of this size, in metres of the prior's size."""
         if person.scale == 1.0:
             return self
-        sigmas = {name: getattr(self, name) / person.scale for name in
-                  ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")}  # fmt: skip
+        sigmas = {
+            name: getattr(self, name) / person.scale
+            for name in ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")
+        }
         return replace(self, footing=person.footing(self.footing), **sigmas)
 
 
 def follow(
-    prior: Any, curve: Curve, *, seconds: float | None = None, speed: float | SpeedProfile = 1.2,
-    generator: torch.Generator | None = None, settings: FollowSettings | None = None, skeleton: Skeleton = CANONICAL,
-    progress: Callable[[int, int], None] | None = None, deadline_seconds: float | None = None,
-) -> Solution:  # fmt: skip
+    prior: Any,
+    curve: Curve,
+    *,
+    seconds: float | None = None,
+    speed: float | SpeedProfile = 1.2,
+    generator: torch.Generator | None = None,
+    settings: FollowSettings | None = None,
+    skeleton: Skeleton = CANONICAL,
+    progress: Callable[[int, int], None] | None = None,
+    deadline_seconds: float | None = None,
+) -> Solution:
     """A character walks the curve from its first point, facing along it.
 
     `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the
@@ -85,8 +94,9 @@ def follow(
     terms_of = follow_terms(seen, seen_arcs, settings.seen_by(person))
     start = choose_start(prior, seen, seen_arcs, terms_of, skeleton=person.small, fps=PRIOR_FPS, generator=generator)
     solver = WindowSolver(prior, settings.window, person.small, method=settings.method)
-    done, outcome = solver.solve(start.committed, terms_of, frames, generator=generator, progress=progress,
-                                 deadline=deadline)  # fmt: skip
+    done, outcome = solver.solve(
+        start.committed, terms_of, frames, generator=generator, progress=progress, deadline=deadline
+    )
     known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], person.abilities(prior.abilities)))
     motion = person.motion(decode(done.features, start.before_first, skeleton=person.small))
     done = replace(done, ledger=person.ledger(done.ledger))

@@ -48,9 +48,15 @@ class FinishSettings:
 
 
 def finish(
-    prior: Any, pieces: Iterable[Float[Tensor, "_ size"]], *, frames: int, state: Any, generator: torch.Generator,
-    settings: FinishSettings | None = None, skeleton: Skeleton = CANONICAL,
-) -> Iterator[Float[Tensor, "_ size"]]:  # fmt: skip
+    prior: Any,
+    pieces: Iterable[Float[Tensor, "_ size"]],
+    *,
+    frames: int,
+    state: Any,
+    generator: torch.Generator,
+    settings: FinishSettings | None = None,
+    skeleton: Skeleton = CANONICAL,
+) -> Iterator[Float[Tensor, "_ size"]]:
     """Finished features of the first `frames` of consecutive pieces, their contact labels steadied.
 
     `state` is the density's before the first frame (batch of one). Windows look ahead, so the pieces must hold
@@ -75,12 +81,18 @@ def finish(
 
 
 def _window(
-    prior: Any, done: Committed, window: Float[Tensor, "frames size"], count: int, settings: FinishSettings,
-    skeleton: Skeleton, generator: torch.Generator,
-) -> Committed:  # fmt: skip
+    prior: Any,
+    done: Committed,
+    window: Float[Tensor, "frames size"],
+    count: int,
+    settings: FinishSettings,
+    skeleton: Skeleton,
+    generator: torch.Generator,
+) -> Committed:
     """`done` and `count` more frames; a window without a finite solution is left as it was."""
-    closeness = Closeness(window, sigma_pose=settings.sigma_pose, sigma_way=settings.sigma_way,
-                          sigma_turn=settings.sigma_turn)  # fmt: skip
+    closeness = Closeness(
+        window, sigma_pose=settings.sigma_pose, sigma_way=settings.sigma_way, sigma_turn=settings.sigma_turn
+    )
     terms: tuple[Term, ...] = Noise(settings.sigma_noise), closeness, settings.footing
     method = GuidedMethod(window, share=settings.share)
     solver = WindowSolver(prior, settings.window, skeleton, method=method)
@@ -92,8 +104,14 @@ def _forgetting(done: Committed) -> Committed:
     """Without all that no later window looks at, and moved to the origin, where single precision is finest."""
     here = done.place.position_xz
     joints = done.joints_world - torch.stack([here[0], here.new_zeros(()), here[1]])
-    return replace(done, features=done.features[-STEADY:], ledger=Ledger(), windows=(), joints_world=joints,
-                   place=Place(torch.zeros_like(here), done.place.heading))  # fmt: skip
+    return replace(
+        done,
+        features=done.features[-STEADY:],
+        ledger=Ledger(),
+        windows=(),
+        joints_world=joints,
+        place=Place(torch.zeros_like(here), done.place.heading),
+    )
 
 
 def _with_steady_contacts(

@@ -49,9 +49,15 @@ class GenerateSettings:
 
 
 def stream(
-    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None, refiner: Refiner | None = None, skeleton: Skeleton = CANONICAL,
-) -> Iterator[Motion]:  # fmt: skip
+    prior: Any,
+    *,
+    seconds: float,
+    generator: torch.Generator,
+    settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None,
+    refiner: Refiner | None = None,
+    skeleton: Skeleton = CANONICAL,
+) -> Iterator[Motion]:
     """Consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its length.
 
     Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the memory.
@@ -64,20 +70,38 @@ def stream(
 
 
 def stream_features(
-    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None, refiner: Refiner | None = None,
-) -> Iterator[Float[Tensor, "_ size"]]:  # fmt: skip
+    prior: Any,
+    *,
+    seconds: float,
+    generator: torch.Generator,
+    settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None,
+    refiner: Refiner | None = None,
+) -> Iterator[Float[Tensor, "_ size"]]:
     """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
     return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner, Stature())[0]
 
 
 def generate(
-    prior: Any, *, seconds: float, generator: torch.Generator, settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None, refiner: Refiner | None = None, skeleton: Skeleton = CANONICAL,
-) -> Motion:  # fmt: skip
+    prior: Any,
+    *,
+    seconds: float,
+    generator: torch.Generator,
+    settings: GenerateSettings | None = None,
+    start_clip: Motion | None = None,
+    refiner: Refiner | None = None,
+    skeleton: Skeleton = CANONICAL,
+) -> Motion:
     """The whole motion at once; see `stream`."""
-    pieces = stream(prior, seconds=seconds, generator=generator, settings=settings, start_clip=start_clip,
-                    refiner=refiner, skeleton=skeleton)  # fmt: skip
+    pieces = stream(
+        prior,
+        seconds=seconds,
+        generator=generator,
+        settings=settings,
+        start_clip=start_clip,
+        refiner=refiner,
+        skeleton=skeleton,
+    )
     motion = next(pieces)
     for piece in pieces:
         motion = motion.join(piece)
@@ -125,9 +149,14 @@ def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[in
 
 
 def _begun(
-    prior: Any, seconds: float, generator: torch.Generator, settings: GenerateSettings, clip: Motion | None,
-    refiner: Refiner | None, person: Stature,
-) -> tuple[Iterator[Float[Tensor, "_ size"]], Place]:  # fmt: skip
+    prior: Any,
+    seconds: float,
+    generator: torch.Generator,
+    settings: GenerateSettings,
+    clip: Motion | None,
+    refiner: Refiner | None,
+    person: Stature,
+) -> tuple[Iterator[Float[Tensor, "_ size"]], Place]:
     """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
@@ -137,8 +166,15 @@ def _begun(
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
     if settings.finishing is not None:
-        pieces = finish(prior, pieces, frames=frames, state=state, generator=generator,
-                        settings=settings.finishing.seen_by(person), skeleton=person.small)  # fmt: skip
+        pieces = finish(
+            prior,
+            pieces,
+            frames=frames,
+            state=state,
+            generator=generator,
+            settings=settings.finishing.seen_by(person),
+            skeleton=person.small,
+        )
     return _in_chunks(pieces, frames), place
 
 

@@ -47,9 +47,15 @@ class Borrowed:
 
 
 def blend(
-    motion: Motion, source: Motion, borrowed: Borrowed, infiller: Inbetweener | None, *,
-    settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
-) -> Infilled:  # fmt: skip
+    motion: Motion,
+    source: Motion,
+    borrowed: Borrowed,
+    infiller: Inbetweener | None,
+    *,
+    settings: InfillSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+) -> Infilled:
     """The motion with its limbs where the source's are, seen from shoulder or hip, in size, and bent as those are; all
     else stays to the bit. In the margins before and after, the limbs go there and come back.
 
@@ -80,8 +86,11 @@ def blend(
     lost[free] = True
     lost[there] = False
     done = fill(lent, Lost(lost & moved, nothing), infiller, settings=settings, densities=densities, rig=rig)
-    notes = (*carried.notes, *_haste(own, posed, borrowed, limbs, free, there),
-             f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new")  # fmt: skip
+    notes = (
+        *carried.notes,
+        *_haste(own, posed, borrowed, limbs, free, there),
+        f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new",
+    )
     return replace(done, lost=Lost((lost | new) & moved, nothing), notes=(*done.notes, *notes))
 
 
@@ -114,8 +123,7 @@ def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: 
     goals[:, limb.end] = goals[:, limb.upper] + way
     free = torch.zeros(goals.shape[:2], dtype=torch.bool)
     free[:, [limb.upper, limb.lower]] = True
-    solved = inverse.solve(goals, quats, own.skeleton, free=free, limbs=(limb,),
-                                      root_position=part.root_position)  # fmt: skip
+    solved = inverse.solve(goals, quats, own.skeleton, free=free, limbs=(limb,), root_position=part.root_position)
     whole = posed.local_quat_xyzw.clone()
     whole[there] = torch.where(free[..., None] | _is(limb.end), solved, whole[there])
     whole[there, limb.end] = quats[:, limb.end]
@@ -151,9 +159,11 @@ def _haste(
                 JERKLESS * float(way[limb.end].norm()) * (fps / max(1, count)) ** 2,
             )
             if needed > _HASTY:
-                notes.append(f"{name} goes {100 * far:.0f} cm in {count / fps:.2f} s beside frame {frame}, which takes "
-                             f"{needed:.0f} m/s^2; {_HASTY:.0f} is the most that is common: a margin of "
-                             f"{math.sqrt(JERKLESS * far / _HASTY):.2f} s would do")  # fmt: skip
+                notes.append(
+                    f"{name} goes {100 * far:.0f} cm in {count / fps:.2f} s beside frame {frame}, which takes "
+                    f"{needed:.0f} m/s^2; {_HASTY:.0f} is the most that is common: a margin of "
+                    f"{math.sqrt(JERKLESS * far / _HASTY):.2f} s would do"
+                )
     return tuple(notes)
 
 

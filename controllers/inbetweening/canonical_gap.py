@@ -46,14 +46,17 @@ class CanonicalGap:
         quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[best], whole.local_quat_xyzw)
         root = torch.where(snapped[:, None], canonical.root_position[best], whole.root_position)
         shown = replace(whole, root_position=root, local_quat_xyzw=rotations.sign_continuous(quats))
-        columns = [torch.zeros(canonical.num_frames, dtype=torch.bool) if joint is None else lost.joints[:, joint]
-                   for joint in joint_of]  # fmt: skip
+        columns = [
+            torch.zeros(canonical.num_frames, dtype=torch.bool) if joint is None else lost.joints[:, joint]
+            for joint in joint_of
+        ]
         turns = torch.stack(columns, dim=1)
         for joint, own in enumerate(joint_of):  # an End Site turns with its parent
             if own is None:
                 turns[:, joint] = turns[:, CANONICAL.parents[joint]]
-        return CanonicalGap(shown, turns[low] | turns[high], lost.root[low] | lost.root[high],
-                             at / float(canonical.fps))  # fmt: skip
+        return CanonicalGap(
+            shown, turns[low] | turns[high], lost.root[low] | lost.root[high], at / float(canonical.fps)
+        )
 
     def places_known(self) -> Bool[Tensor, "frames joints"]:
         """A place is known if all that carries it is."""
@@ -77,8 +80,9 @@ def _to_the_end(canonical: Motion) -> Motion:
     if over <= Fraction(1, 2):
         return canonical.resample(PRIOR_FPS)
     frame = torch.arange(canonical.num_frames + math.ceil(canonical.fps / PRIOR_FPS)).clamp(max=last)
-    held = replace(canonical, root_position=canonical.root_position[frame],
-                   local_quat_xyzw=canonical.local_quat_xyzw[frame])  # fmt: skip
+    held = replace(
+        canonical, root_position=canonical.root_position[frame], local_quat_xyzw=canonical.local_quat_xyzw[frame]
+    )
     return held.resample(PRIOR_FPS).slice(0, moments + 1)
 
 

@@ -36,10 +36,15 @@ class ChainSettings:
 
 
 def chain(
-    clips: Sequence[Motion], infiller: Inbetweener | None, *, generator: torch.Generator,
-    settings: ChainSettings | None = None, filling: InfillSettings | None = None, densities: Sequence[Any] = (),
+    clips: Sequence[Motion],
+    infiller: Inbetweener | None,
+    *,
+    generator: torch.Generator,
+    settings: ChainSettings | None = None,
+    filling: InfillSettings | None = None,
+    densities: Sequence[Any] = (),
     extending: Sequence[Any] = (),
-) -> Infilled:  # fmt: skip
+) -> Infilled:
     """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
 
     Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's. In gaps
@@ -62,8 +67,9 @@ def chain(
         masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
         piece = _led_on(whole, piece, gap)
         held = torch.full((gap,), whole.num_frames - 1)
-        whole = whole.join(replace(whole, root_position=whole.root_position[held],
-                                   local_quat_xyzw=whole.local_quat_xyzw[held])).join(piece)  # fmt: skip
+        whole = whole.join(
+            replace(whole, root_position=whole.root_position[held], local_quat_xyzw=whole.local_quat_xyzw[held])
+        ).join(piece)
     assert whole is not None, "there are clips"
     done = infill(body.on_rig(whole), infiller, masks, settings=filling, densities=densities, extending=extending)
     return replace(done, notes=(*done.notes, *notes))

@@ -83,8 +83,10 @@ class Sureness:
         """In words."""
         if self.clips < _FEW:
             return f"joints about {self.half_cm:.0f} cm from mocap's in the only {self.clips} unseen clips of the kind"
-        return (f"joints within {self.half_cm:.0f} cm of mocap's in half of {self.clips} unseen clips and within"
-                f" {self.nine_in_ten_cm:.0f} cm in nine of ten")  # fmt: skip
+        return (
+            f"joints within {self.half_cm:.0f} cm of mocap's in half of {self.clips} unseen clips and within"
+            f" {self.nine_in_ten_cm:.0f} cm in nine of ten"
+        )
 
 
 def sureness_of(by: str, frames: int, *, going: bool, beside: bool) -> Sureness:

@@ -68,8 +68,9 @@ def _is_morph(gap: CanonicalGap, made: Motion, source: GapSource) -> bool:
     if source.stop - source.start < _MORPH_FRAMES or source.by == "standing still":
         return False
     part = slice(max(0, source.start - 1), source.stop + 1)
-    way, straight = (_way(each.joint_positions()[part], heading(each.local_quat_xyzw[part, 0]))
-                     for each in (made, gap.motion))  # fmt: skip
+    way, straight = (
+        _way(each.joint_positions()[part], heading(each.local_quat_xyzw[part, 0])) for each in (made, gap.motion)
+    )
     going = going_between(gap.motion, max(0, source.start - 1), min(source.stop, len(gap.root) - 1))
     pace, least = (each * PRIOR_FPS / (source.stop - source.start) for each in (way, straight))
     quiet = least < _QUIET and _quiet_beside(gap, source)

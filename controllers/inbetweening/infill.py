@@ -26,10 +26,16 @@ __all__ = ["InfillSettings", "Infilled", "Method", "infill"]
 
 
 def infill(
-    motion: Motion, infiller: Inbetweener | None, masks: Sequence[Mask], *,
-    settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
-    course: Curve | None = None, extending: Sequence[Any] = (),
-) -> Infilled:  # fmt: skip
+    motion: Motion,
+    infiller: Inbetweener | None,
+    masks: Sequence[Mask],
+    *,
+    settings: InfillSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+    course: Curve | None = None,
+    extending: Sequence[Any] = (),
+) -> Infilled:
     """Fill what the masks say is missing. RequestError for masks that do not fit, or a method without its network.
 
     What stands in a gap does not matter. A gap at the motion's beginning or end is extended into: at the end by one of
@@ -53,7 +59,6 @@ def infill(
         end = extended(gap, chosen.motion, chosen.odds, densities=extending)
         return replace(end, sources=(*chosen.sources, *end.sources))
 
-    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course,
-                another=another)  # fmt: skip
+    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course, another=another)
     last = done.sources[-1].by if done.sources and lost.root[-1] else first
     return replace(done, notes=(*end_notes(lost, first, last), *done.notes))

@@ -140,8 +140,12 @@ def _in_time(poses: dict[int, Motion], frames: int) -> Motion:
     joined = reduce(Motion.join, (poses[frame] for frame in sorted(poses)))
     held = torch.searchsorted(at, torch.arange(frames), right=True) - 1
     moving = {joint: values[held] for joint, values in joined.moving_offsets.items()}
-    motion = replace(joined, root_position=joined.root_position[held], moving_offsets=moving,
-                     local_quat_xyzw=rotations.sign_continuous(joined.local_quat_xyzw)[held])  # fmt: skip
+    motion = replace(
+        joined,
+        root_position=joined.root_position[held],
+        moving_offsets=moving,
+        local_quat_xyzw=rotations.sign_continuous(joined.local_quat_xyzw)[held],
+    )
     free = torch.ones(frames, dtype=torch.bool)
     free[at] = False
     return straight(motion, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free))

@@ -27,16 +27,49 @@ GOING = 0.3
 FARTHEST = 4.0
 """Metres beyond which people go on as fast as they do over so many: mocap's pairs end about there."""
 _CUES = ("step", "stride", "lift", "hips", "toes", "knees", "arms", "lean")
-FEATURES = ("one", "way", "apart", "worst", "turned", "way2", "way_apart", "aside", "ahead", *_CUES,
-            *(f"way_{name}" for name in _CUES))  # fmt: skip
+FEATURES = (
+    "one",
+    "way",
+    "apart",
+    "worst",
+    "turned",
+    "way2",
+    "way_apart",
+    "aside",
+    "ahead",
+    *_CUES,
+    *(f"way_{name}" for name in _CUES),
+)
 """Of a pair of poses, as `pair_features` gives them."""
 _SOFT = 0.03  # metres below which it is all one how far two poses are apart
 _JOINT = {name: index for index, name in enumerate(CANONICAL.names)}
 WEIGHTS: tuple[float, ...] = (
-    0.7268, 0.5584, -0.1348, 0.01211, 0.132, 0.05434, 0.09474, 0.145, -0.1124,
-    0.672, -2.509, -2.11, -5.756, -1.427, 5.594, 0.9593, -0.1232,
-    -0.4131, 1.52, 1.446, 1.752, -3.662, -1.475, -0.2542, -1.575,
-)  # fmt: skip
+    0.7268,
+    0.5584,
+    -0.1348,
+    0.01211,
+    0.132,
+    0.05434,
+    0.09474,
+    0.145,
+    -0.1124,
+    0.672,
+    -2.509,
+    -2.11,
+    -5.756,
+    -1.427,
+    5.594,
+    0.9593,
+    -0.1232,
+    -0.4131,
+    1.52,
+    1.446,
+    1.752,
+    -3.662,
+    -1.475,
+    -0.2542,
+    -1.575,
+)
 """Of the features, for the logarithm of seconds: `controllers.benchmarks.keyframe_timing.fitted` on 5,000 pairs of
 poses 0.25 to 4 s apart, of clips drawn from those that the bundled infiller was trained on."""
 _LEAST, _MOST = 0.25, 4.0  # seconds within which pairs lay
@@ -75,16 +108,29 @@ class Interval:
         low, high = self.usual
         verdict = "short" if self.given < low else "long" if self.given > high else "usual"
         if self.metres < GOING:
-            return (f"{verdict}: about in place ({self.metres:.2f} m), joints {self.apart_cm:.0f} cm apart; mocap "
-                    f"mostly takes {low} to {high} frames")  # fmt: skip
-        return (f"{verdict}: {self.metres:.2f} m at {self.given_speed:.2f} m/s, where poses like these go at "
-                f"{self.suggested_speed:.2f} m/s; mocap mostly takes {low} to {high} frames")  # fmt: skip
+            return (
+                f"{verdict}: about in place ({self.metres:.2f} m), joints {self.apart_cm:.0f} cm apart; mocap "
+                f"mostly takes {low} to {high} frames"
+            )
+        return (
+            f"{verdict}: {self.metres:.2f} m at {self.given_speed:.2f} m/s, where poses like these go at "
+            f"{self.suggested_speed:.2f} m/s; mocap mostly takes {low} to {high} frames"
+        )
 
     def summary(self) -> dict[str, Any]:
         """For a report."""
-        return {"from": self.start, "to": self.stop, "given": self.given, "suggested": self.suggested,
-                "usual": list(self.usual), "metres": self.metres, "given_m_s": self.given_speed,
-                "suggested_m_s": self.suggested_speed, "apart_cm": self.apart_cm, "reason": self.reason}  # fmt: skip
+        return {
+            "from": self.start,
+            "to": self.stop,
+            "given": self.given,
+            "suggested": self.suggested,
+            "usual": list(self.usual),
+            "metres": self.metres,
+            "given_m_s": self.given_speed,
+            "suggested_m_s": self.suggested_speed,
+            "apart_cm": self.apart_cm,
+            "reason": self.reason,
+        }
 
 
 def suggest(motion: Motion, keys: Keys, rig: Rig | None = None) -> list[Interval]:
@@ -104,11 +150,18 @@ def suggest(motion: Motion, keys: Keys, rig: Rig | None = None) -> list[Interval
         seconds = float(seconds_of(features[number : number + 1], metres[None]))
         usual = _USUAL["going" if float(metres) >= GOING else "staying"]
         suggested = max(1, round(seconds * fps))
-        intervals.append(Interval(
-            start, stop, suggested, (max(1, round(usual[0] * seconds * fps)), round(usual[1] * seconds * fps)),
-            float(metres) * scale, float(metres) * scale * fps / (stop - start),
-            float(metres) * scale * fps / suggested, 100 * scale * (math.exp(float(features[number, 2])) - _SOFT),
-        ))  # fmt: skip
+        intervals.append(
+            Interval(
+                start,
+                stop,
+                suggested,
+                (max(1, round(usual[0] * seconds * fps)), round(usual[1] * seconds * fps)),
+                float(metres) * scale,
+                float(metres) * scale * fps / (stop - start),
+                float(metres) * scale * fps / suggested,
+                100 * scale * (math.exp(float(features[number, 2])) - _SOFT),
+            )
+        )
     return intervals
 
 
@@ -148,12 +201,24 @@ def _cues(
     lowest = torch.minimum(left[:, 1], right[:, 1])
     ahead = (left - right).abs()
     legs, arms = (
-        torch.stack([(own[:, _JOINT[side + upper]] - own[:, _JOINT[side + end]]).norm(dim=-1)
-                     for side in ("left", "right")]).mean(dim=0)
+        torch.stack(
+            [(own[:, _JOINT[side + upper]] - own[:, _JOINT[side + end]]).norm(dim=-1) for side in ("left", "right")]
+        ).mean(dim=0)
         for upper, end in (("UpperLeg", "Foot"), ("UpperArm", "Hand"))
-    )  # fmt: skip
-    return torch.stack([(left - right).norm(dim=-1), ahead[:, 2], ahead[:, 1], -lowest, places[:, 0, 1] + lowest,
-                        legs, arms, own[:, _JOINT["head"], 2]], dim=-1)  # fmt: skip
+    )
+    return torch.stack(
+        [
+            (left - right).norm(dim=-1),
+            ahead[:, 2],
+            ahead[:, 1],
+            -lowest,
+            places[:, 0, 1] + lowest,
+            legs,
+            arms,
+            own[:, _JOINT["head"], 2],
+        ],
+        dim=-1,
+    )
 
 
 def travelled(body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]) -> Float[Tensor, " pairs"]:

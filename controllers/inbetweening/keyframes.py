@@ -71,8 +71,9 @@ class Keys:
         if limbs and root_only:
             raise RequestError("keys of limbs and keys of the root only are two kinds; choose one")
         ends = (min(frames), max(frames)) if frames else ()
-        return Keys(tuple(Key(frame) if frame in ends else Key(frame, limbs=limbs, root_only=root_only)
-                          for frame in frames))  # fmt: skip
+        return Keys(
+            tuple(Key(frame) if frame in ends else Key(frame, limbs=limbs, root_only=root_only) for frame in frames)
+        )
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -95,8 +96,9 @@ class Keys:
             raise RequestError(f"in-betweening needs at least two keys, got {len(wanted)}")
         for key in (wanted[0], wanted[-1]):
             if key.what != "pose":
-                raise RequestError(f"the first and the last key are whole poses; that at frame {key.frame} tells the "
-                                   f"{key.what} only")  # fmt: skip
+                raise RequestError(
+                    f"the first and the last key are whole poses; that at frame {key.frame} tells the {key.what} only"
+                )
         return wanted
 
 
@@ -145,8 +147,10 @@ def missed_by(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[
             rows.append(row | {"missed_cm": 100 * float(off[targets.wanted[key.frame]].max())})
             continue
         joints = [hips or 0] if key.what == "root" else list(range(source.num_joints))
-        rows.append(row | {"missed_cm": float(away[key.frame, joints].max()),
-                           "missed_deg": float(turned[key.frame, joints].max())})  # fmt: skip
+        rows.append(
+            row
+            | {"missed_cm": float(away[key.frame, joints].max()), "missed_deg": float(turned[key.frame, joints].max())}
+        )
     return rows
 
 

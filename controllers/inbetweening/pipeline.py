@@ -73,23 +73,40 @@ class Infilled:
     def summary(self) -> dict[str, Any]:
         """For a report, in plain numbers."""
         filled = int(self.lost.frames.sum())
-        gaps = [{"start": start, "stop": stop, "joints": int(self.lost.joints[start:stop].any(dim=0).sum()),
-                 "root": bool(self.lost.root[start:stop].any())}
-                for _, start, stop in runs(self.lost.frames[:, None])]  # fmt: skip
+        gaps = [
+            {
+                "start": start,
+                "stop": stop,
+                "joints": int(self.lost.joints[start:stop].any(dim=0).sum()),
+                "root": bool(self.lost.root[start:stop].any()),
+            }
+            for _, start, stop in runs(self.lost.frames[:, None])
+        ]
         return {
-            "frames": self.motion.num_frames, "fps": float(self.motion.fps), "gaps": gaps,
-            "ledger": self.ledger.summary(), "seconds": self.seconds,
+            "frames": self.motion.num_frames,
+            "fps": float(self.motion.fps),
+            "gaps": gaps,
+            "ledger": self.ledger.summary(),
+            "seconds": self.seconds,
             "frame_ms": 1000 * self.seconds / max(1, filled),
-            "contacts": [[bool(bit) for bit in row] for row in self.contacts.tolist()], "notes": list(self.notes),
+            "contacts": [[bool(bit) for bit in row] for row in self.contacts.tolist()],
+            "notes": list(self.notes),
             "gap_notes": list(self.gap_notes),
-        }  # fmt: skip
+        }
 
 
 def fill(
-    motion: Motion, lost: Lost, infiller: Inbetweener | None, *, settings: InfillSettings | None = None,
-    densities: Sequence[Any] = (), rig: Rig | None = None, targets: Targets | None = None,
-    course: Curve | None = None, another: Another | None = None,
-) -> Infilled:  # fmt: skip
+    motion: Motion,
+    lost: Lost,
+    infiller: Inbetweener | None,
+    *,
+    settings: InfillSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+    targets: Targets | None = None,
+    course: Curve | None = None,
+    another: Another | None = None,
+) -> Infilled:
     """What is lost of a motion, filled in; RequestError for a method without its network.
 
     `targets` are places that the rig's hands and feet are wanted at in frames in which they are lost; along `course`
@@ -138,17 +155,23 @@ def _at_rate_of(canonical: Motion, proposal: Motion, seconds: Float[Tensor, " sh
     frames, fps = canonical.num_frames, float(canonical.fps)
     quats = rotations.sign_continuous(proposal.local_quat_xyzw)
     quats = torch.nn.functional.normalize(upsampled(quats, seconds, fps=fps, frames=frames), dim=-1)
-    return replace(canonical, root_position=upsampled(proposal.root_position, seconds, fps=fps, frames=frames),
-                   local_quat_xyzw=quats)  # fmt: skip
+    return replace(
+        canonical,
+        root_position=upsampled(proposal.root_position, seconds, fps=fps, frames=frames),
+        local_quat_xyzw=quats,
+    )
 
 
 def _closed(filled: Motion, lost: Lost, original: Motion) -> Motion:
     """On the rig, with seams that run on; what is known is the original's."""
     fps = float(original.fps)
     moving = {joint: closed_places(values, lost.root, fps=fps) for joint, values in filled.moving_offsets.items()}
-    closed = replace(filled, moving_offsets=moving,
-                     root_position=closed_places(filled.root_position, lost.root, fps=fps),
-                     local_quat_xyzw=closed_rotations(filled.local_quat_xyzw, lost.joints, fps=fps))  # fmt: skip
+    closed = replace(
+        filled,
+        moving_offsets=moving,
+        root_position=closed_places(filled.root_position, lost.root, fps=fps),
+        local_quat_xyzw=closed_rotations(filled.local_quat_xyzw, lost.joints, fps=fps),
+    )
     return put_back(closed, original, lost)
 
 

@@ -22,19 +22,28 @@ from mapctl.terms import Clearance, Footing, Seam
 
 _BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 FINISHING = StandingSettings(
-    ease=8.0, unseen_deg=2.0, unseen_cm=2.0, seam=Seam(sigma=150.0, frames=96), clearance=Clearance(),
+    ease=8.0,
+    unseen_deg=2.0,
+    unseen_cm=2.0,
+    seam=Seam(sigma=150.0, frames=96),
+    clearance=Clearance(),
     footing=Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05),
-    budget=Budget(evaluations=40), lbfgs=LbfgsSettings(max_iterations=40),
-)  # fmt: skip
+    budget=Budget(evaluations=40),
+    lbfgs=LbfgsSettings(max_iterations=40),
+)
 """Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
 network's, since styles differ in them, but for those of toes that skate; jerk costs something; and it may take twice
 the evaluations."""
 
 
 def stood(
-    proposal: Motion, bits: Tensor, gap: CanonicalGap, settings: StandingSettings, densities: Sequence[Any],
+    proposal: Motion,
+    bits: Tensor,
+    gap: CanonicalGap,
+    settings: StandingSettings,
+    densities: Sequence[Any],
     targets: Targets | None,
-) -> tuple[Motion, Ledger]:  # fmt: skip
+) -> tuple[Motion, Ledger]:
     """The proposal with its feet put down, gap by gap; and the ledger of these."""
     quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
     for first, last in _surroundings(gap.turns.any(dim=1) | gap.root):
@@ -42,9 +51,12 @@ def stood(
             continue
         part = slice(first, last)
         capture = Capture.of_motion(
-            proposal.slice(first, last), seen=~gap.turns[part], seen_root=~gap.root[part],
-            sigma=torch.zeros(CANONICAL.num_joints), sigma_root=0.0,
-        )  # fmt: skip
+            proposal.slice(first, last),
+            seen=~gap.turns[part],
+            seen_root=~gap.root[part],
+            sigma=torch.zeros(CANONICAL.num_joints),
+            sigma_root=0.0,
+        )
         wanted = None if targets is None else Targets(targets.places[part], targets.wanted[part])
         standing = stand(
             proposal.slice(first, last), bits[part], capture, settings, densities=densities, targets=wanted

@@ -22,10 +22,16 @@ from mapctl.retarget.rigs import Rig
 
 
 def tween(
-    motion: Motion, keys: Keys, infiller: Inbetweener | None, *,
-    settings: InfillSettings | None = None, densities: Sequence[Any] = (), rig: Rig | None = None,
-    rollable: Sequence[Any] = (), another: Another | None = None,
-) -> Infilled:  # fmt: skip
+    motion: Motion,
+    keys: Keys,
+    infiller: Inbetweener | None,
+    *,
+    settings: InfillSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+    rollable: Sequence[Any] = (),
+    another: Another | None = None,
+) -> Infilled:
     """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
 
     Where keys are so far apart that the infiller does not know enough, one of the densities `rollable` proposes if a
@@ -39,8 +45,16 @@ def tween(
     hasty = feasibility.between_keys(shown, canonical, rigmap, lost, targets)
     if another is None and (settings is None or settings.method == "map"):
         another = partial(choose_proposals, densities=rollable)
-    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=settled(rigmap), targets=targets,
-                another=another)  # fmt: skip
+    done = fill(
+        motion,
+        lost,
+        infiller,
+        settings=settings,
+        densities=densities,
+        rig=settled(rigmap),
+        targets=targets,
+        another=another,
+    )
     by = "nearest key" if infiller is None else "infiller"
     return replace(done, notes=(*hasty, *end_notes(lost, by, by), *done.notes))
 

@@ -57,10 +57,19 @@ class Variations:
 
 
 def variations(
-    motion: Motion, keys: Keys, infiller: Inbetweener, count: int, *, rollable: Sequence[Any],
-    generator: torch.Generator, settings: InfillSettings | None = None, rolling: RolloutSettings | None = None,
-    densities: Sequence[Any] = (), rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
-) -> Variations:  # fmt: skip
+    motion: Motion,
+    keys: Keys,
+    infiller: Inbetweener,
+    count: int,
+    *,
+    rollable: Sequence[Any],
+    generator: torch.Generator,
+    settings: InfillSettings | None = None,
+    rolling: RolloutSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Variations:
     """So many motions through the same keys. The first answers are the same however many are asked for.
 
     The first is that of `tween`; in the others densities that are `rollable` are drawn from and steered from key to
@@ -80,10 +89,19 @@ def variations(
 
 
 def best_of(
-    motion: Motion, keys: Keys, infiller: Inbetweener, count: int, *, rollable: Sequence[Any],
-    generator: torch.Generator, settings: InfillSettings | None = None, rolling: RolloutSettings | None = None,
-    densities: Sequence[Any] = (), rig: Rig | None = None, progress: Callable[[int, int], None] | None = None,
-) -> Infilled:  # fmt: skip
+    motion: Motion,
+    keys: Keys,
+    infiller: Inbetweener,
+    count: int,
+    *,
+    rollable: Sequence[Any],
+    generator: torch.Generator,
+    settings: InfillSettings | None = None,
+    rolling: RolloutSettings | None = None,
+    densities: Sequence[Any] = (),
+    rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Infilled:
     """The one with the least energy of so many finished answers: from the infiller's proposal, from slerp's, and from
     rollouts; its notes tell all energies. RequestError for fewer than two, and as `tween`.
     """
@@ -94,11 +112,14 @@ def best_of(
     found = [_first(motion, make), make(another=_straight)]
     density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
     found += _rollouts(make, count - 2, density, generator, rolling, progress)
-    nats = [Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)).energy
-            for one in found]  # fmt: skip
+    nats = [
+        Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)).energy for one in found
+    ]
     names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
-    best, told = min(range(count), key=nats.__getitem__), ", ".join(f"{name} {one:.1f}" for name, one in
-                                                                    zip(names, nats, strict=True))  # fmt: skip
+    best, told = (
+        min(range(count), key=nats.__getitem__),
+        ", ".join(f"{name} {one:.1f}" for name, one in zip(names, nats, strict=True)),
+    )
     note = f"the best of {count} is from the {names[best]}; nats a frame: {told}"
     seconds = sum(one.seconds for one in found)
     return replace(found[best], seconds=seconds, notes=(*found[best].notes, note))
@@ -112,9 +133,13 @@ def _first(motion: Motion, make: Callable[..., Infilled]) -> Infilled:
 
 
 def _rollouts(
-    make: Callable[..., Infilled], count: int, density: Any, generator: torch.Generator, rolling: RolloutSettings,
+    make: Callable[..., Infilled],
+    count: int,
+    density: Any,
+    generator: torch.Generator,
+    rolling: RolloutSettings,
     progress: Callable[[int, int], None] | None,
-) -> list[Infilled]:  # fmt: skip
+) -> list[Infilled]:
     """Answers of a density, each of a seed of its own."""
     found = []
     for number, seed in enumerate(_seeds(count, generator)):

@@ -178,9 +178,13 @@ class Recorder:
 
 
 def steps(
-    state: SteerState, source: Source, displays: Sequence[Display], *, clock: Clock,
+    state: SteerState,
+    source: Source,
+    displays: Sequence[Display],
+    *,
+    clock: Clock,
     settings: LoopSettings | None = None,
-) -> Iterator[tuple[SteerState, StepRecord]]:  # fmt: skip
+) -> Iterator[tuple[SteerState, StepRecord]]:
     """Steer without end, a step at a time; the first pose counts as delivered.
 
     Frame k is due at second k / PRIOR_FPS. The clock starts a step before that.
@@ -200,14 +204,22 @@ def steps(
             clock.hold(held)  # before they are shown: they are due now
         for display in displays:
             display.show(new, due)
-        yield state, StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, new.note,
-                                held)  # fmt: skip
+        yield (
+            state,
+            StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, new.note, held),
+        )
 
 
 def drive(
-    state: SteerState, source: Source, displays: Sequence[Display], *, frames: int, clock: Clock | None = None,
-    settings: LoopSettings | None = None, stop: Callable[[], bool] = lambda: False,
-) -> tuple[SteerState, list[StepRecord]]:  # fmt: skip
+    state: SteerState,
+    source: Source,
+    displays: Sequence[Display],
+    *,
+    frames: int,
+    clock: Clock | None = None,
+    settings: LoopSettings | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[SteerState, list[StepRecord]]:
     """Steer until `frames` have been delivered, or `stop()` says so, or Ctrl-C."""
     records: list[StepRecord] = []
     stream = steps(state, source, displays, clock=clock or StreamClock(), settings=settings)

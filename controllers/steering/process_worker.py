@@ -162,7 +162,16 @@ def _steer(connection: Connection, request: RemoteRequest) -> None:
 def _plain(frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]) -> Delivered:
     energies = {entry.name: float(entry.energy.mean()) for entry in frames.ledger.entries}
     return Delivered(
-        at, seconds, frames.motion.root_position.numpy(), frames.motion.local_quat_xyzw.numpy(),
-        frames.contacts.numpy(), frames.forecast.numpy(), frames.wishes[-1].velocity, energies, spare,
-        frames.seconds, frames.evaluations, notes,
-    )  # fmt: skip
+        at,
+        seconds,
+        frames.motion.root_position.numpy(),
+        frames.motion.local_quat_xyzw.numpy(),
+        frames.contacts.numpy(),
+        frames.forecast.numpy(),
+        frames.wishes[-1].velocity,
+        energies,
+        spare,
+        frames.seconds,
+        frames.evaluations,
+        notes,
+    )

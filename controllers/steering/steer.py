@@ -126,9 +126,14 @@ class SteerFrames:
 
 
 def begin(
-    prior: Any, command: Command, *, generator: torch.Generator, at: tuple[float, float] = (0.0, 0.0),
-    settings: SteerSettings | None = None, skeleton: Skeleton = CANONICAL,
-) -> tuple[SteerState, SteerFrames]:  # fmt: skip
+    prior: Any,
+    command: Command,
+    *,
+    generator: torch.Generator,
+    at: tuple[float, float] = (0.0, 0.0),
+    settings: SteerSettings | None = None,
+    skeleton: Skeleton = CANONICAL,
+) -> tuple[SteerState, SteerFrames]:
     """A character at x and z (metres) that faces along the command, and its first pose.
 
     It is one of the prior's starts near the wanted speed and of the labels it is told, drawn by the generator: the
@@ -164,9 +169,7 @@ def accept(prior: Any, command: Command) -> tuple[Command, list[str]]:
     return command.within(prior.abilities.fastest_asked)
 
 
-def step(
-    state: SteerState, command: Command, *, seconds: float | None = None
-) -> tuple[SteerState, SteerFrames]:  # fmt: skip
+def step(state: SteerState, command: Command, *, seconds: float | None = None) -> tuple[SteerState, SteerFrames]:
     """The next frames under a command. With `seconds`, the best found by then but for the least that the settings ask
     for, and a note that says so.
 
@@ -184,8 +187,9 @@ def step(
     done, outcome = _solve(told, terms, seconds, free=stuck)
     if outcome is not Outcome.DONE:
         unsearched = replace(settings, least_evaluations=0)
-        afresh = replace(told, settings=unsearched,
-                         committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None))  # fmt: skip
+        afresh = replace(
+            told, settings=unsearched, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None)
+        )
         done, _ = _solve(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
     motion = person.motion(decode(new, state.committed.place, skeleton=person.small))
@@ -195,8 +199,16 @@ def step(
     forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
     forecast = forecast if person.scale == 1.0 else forecast * person.scale
     delivered = tuple(_in_their_metres(wish, person) for wish in own)
-    frames = SteerFrames(motion, LAYOUT.pick(new, "contacts"), delivered, forecast, person.ledger(done.ledger),
-                         record.evaluations, time.perf_counter() - began, note)  # fmt: skip
+    frames = SteerFrames(
+        motion,
+        LAYOUT.pick(new, "contacts"),
+        delivered,
+        forecast,
+        person.ledger(done.ledger),
+        record.evaluations,
+        time.perf_counter() - began,
+        note,
+    )
     owed = torch.cat([state.owed, torch.tensor([wish.velocity for wish in own])])[-_OWED:]
     kept = replace(done, features=new, ledger=Ledger(), windows=())
     following = replace(state, committed=kept, wish=own[-1], owed=owed, frames=state.frames + len(new))
@@ -256,9 +268,14 @@ class _StepFirst:
     loose: Sequence[Term]
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        self,
+        context: Context,
+        terms: Sequence[Term],
+        tail: Tensor,
+        generator: torch.Generator,
+        *,
         seconds: float = math.inf,
-    ) -> SolvedWindow:  # fmt: skip
+    ) -> SolvedWindow:
         first = self.bold(context, self.loose, tail, generator, seconds=seconds / 2)
         second = self.half(context, terms, first.carry, generator, seconds=seconds / 2)
         return replace(second, evaluations=first.evaluations + second.evaluations)
@@ -292,9 +309,12 @@ def _from_here(state: SteerState) -> SteerState:
 def _terms(state: SteerState, wishes: Sequence[Wish], step_length: float | None) -> Sequence[Term]:
     settings = state.settings
     travel = Travel(
-        torch.tensor([wish.velocity for wish in wishes]), state.owed,
-        facing=torch.tensor([wish.facing for wish in wishes]), sigma_speed=settings.sigma_speed,
-        sigma_direction=settings.sigma_direction, sigma_facing=settings.sigma_facing,
-    )  # fmt: skip
+        torch.tensor([wish.velocity for wish in wishes]),
+        state.owed,
+        facing=torch.tensor([wish.facing for wish in wishes]),
+        sigma_speed=settings.sigma_speed,
+        sigma_direction=settings.sigma_direction,
+        sigma_facing=settings.sigma_facing,
+    )
     terms = settings.noise, travel, settings.footing
     return (*terms, Steps(step_length, sigma=settings.sigma_step)) if step_length else terms

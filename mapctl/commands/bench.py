@@ -79,8 +79,13 @@ class Bench:
         compute_on_one()
         from mapctl import report
 
-        others = {"denoise": self._denoise, "infill": self._infill, "tween": self._tween, "timing": self._timing,
-                  "gaps": self._gaps}  # fmt: skip
+        others = {
+            "denoise": self._denoise,
+            "infill": self._infill,
+            "tween": self._tween,
+            "timing": self._timing,
+            "gaps": self._gaps,
+        }
         rows = others.get(self.what, self._of_a_prior)()
         if self.json:
             print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")

@@ -51,10 +51,14 @@ class Chain:
 
         settings = ChainSettings(piece=self.piece, gap=self._gap())
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
-        done = chain([options.read_motion(path, None) for path in self.clips], infiller, settings=settings,
-                     filling=InfillSettings(method=self.method),
-                     extending=priors.load_choice("auto") if self.method == "map" else (),
-                     generator=torch.Generator().manual_seed(self.seed))  # fmt: skip
+        done = chain(
+            [options.read_motion(path, None) for path in self.clips],
+            infiller,
+            settings=settings,
+            filling=InfillSettings(method=self.method),
+            extending=priors.load_choice("auto") if self.method == "map" else (),
+            generator=torch.Generator().manual_seed(self.seed),
+        )
         formats.save(done.motion, self.out)
         if self.video is not None:
             from mapctl.retarget import to_canonical
@@ -65,8 +69,10 @@ class Chain:
                 film([(to_canonical(done.motion)[0], None)], self.video, progress=progress)
         if not self.quiet:
             filled = int(done.lost.frames.sum())
-            print(f"{self.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(self.clips)}"
-                  f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame")  # fmt: skip
+            print(
+                f"{self.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(self.clips)}"
+                f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame"
+            )
             for note in (*done.notes, *done.gap_notes):
                 print(note)
         return 0

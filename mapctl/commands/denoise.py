@@ -145,8 +145,10 @@ class Denoise:
     def _tell(self, done: "Denoised") -> None:
         summary = done.summary()
         moved = sum(summary["correction_cm"].values()) / len(summary["correction_cm"])
-        print(f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
-              f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame")  # fmt: skip
+        print(
+            f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
+            f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame"
+        )
         for line in fault_lines(done):
             print(line)
         for note in (*done.notes, *density_lines(done)):
@@ -189,6 +191,8 @@ def density_lines(done: "Denoised") -> list[str]:
     if doubted:
         places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MOST_NAMED])
         rest = len(doubted) - _MOST_NAMED
-        lines.append(f"prior out of its depth, so that it counts for less than half: frames {places}"
-                     + (f" and {rest} more windows" if rest > 0 else ""))  # fmt: skip
+        lines.append(
+            f"prior out of its depth, so that it counts for less than half: frames {places}"
+            + (f" and {rest} more windows" if rest > 0 else "")
+        )
     return lines

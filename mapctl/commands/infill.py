@@ -107,13 +107,16 @@ class Infill:
         extending = () if self.method != "map" else priors.load_choice(self.prior or "auto")
         settings = InfillSettings(method=self.method)
         course = None if self.curve is None else options.read_curve(self.curve, None)
-        return infill(motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course,
-                      extending=extending)  # fmt: skip
+        return infill(
+            motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course, extending=extending
+        )
 
     def _tell(self, done: "Infilled") -> None:
         summary = done.summary()
         gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in summary["gaps"])
-        print(f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
-              f" {summary['frame_ms']:.1f} ms a filled frame")  # fmt: skip
+        print(
+            f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
+            f" {summary['frame_ms']:.1f} ms a filled frame"
+        )
         for note in (*done.notes, *done.gap_notes):
             print(note)

@@ -38,10 +38,7 @@ class Info:
         elif self.name is not None:
             print(report.as_json(card(self.name)), end="")
         elif self.json:
-            print(
-                report.as_json({"priors": priors_here(), "installation": installation(), "notice": NOTICE}),
-                end="",
-            )
+            print(report.as_json({"priors": priors_here(), "installation": installation(), "notice": NOTICE}), end="")
         else:
             self._tables()
         return 0

@@ -71,8 +71,13 @@ class Measure:
         if self.reference is not None:
             other, more = _comparable(self.reference)
             reference, notes = metrics.measure(other), notes + more
-        return {"clip": str(self.clip), "measures": ours, "reference": reference, "mocap": _mocap(self.prior),
-                "notes": notes}  # fmt: skip
+        return {
+            "clip": str(self.clip),
+            "measures": ours,
+            "reference": reference,
+            "mocap": _mocap(self.prior),
+            "notes": notes,
+        }
 
     def _curve(self) -> "Curve | None":
         if self.speed is not None and not 0 < self.speed < float("inf"):

@@ -56,9 +56,8 @@ class RunScene:
         return INTERRUPTED if interrupted else 0
 
     def _walk(
-        self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity",
-        person: character.Wearer,
-    ) -> tuple[list[Walk], bool]:  # fmt: skip
+        self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity", person: character.Wearer
+    ) -> tuple[list[Walk], bool]:
         """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
         walks: list[Walk] = []
         for actor, request in zip(scene.actors, requests, strict=True):
@@ -98,14 +97,18 @@ class RunScene:
         from scenes.film import film
         from scenes.stage import Shot
 
-        shots = [Shot(done.solution.motion, done.request.curve, actor.colour, actor.start_seconds)
-                 for actor, done in zip(scene.actors, walks, strict=True)]  # fmt: skip
+        shots = [
+            Shot(done.solution.motion, done.request.curve, actor.colour, actor.start_seconds)
+            for actor, done in zip(scene.actors, walks, strict=True)
+        ]
         with bar("filming", quiet=self.quiet) as progress:
             film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, progress=progress)
 
     def _report(self, scene: "SceneDescription", walks: Sequence[Walk]) -> dict[str, Any]:
         """By actor, the report of each walk that has begun."""
         request = options.as_request("run", self) | {"title": scene.title}
-        actors = {actor.name: done.report(options.as_request("follow", actor))
-                  for actor, done in zip(scene.actors, walks, strict=False)}  # fmt: skip
+        actors = {
+            actor.name: done.report(options.as_request("follow", actor))
+            for actor, done in zip(scene.actors, walks, strict=False)
+        }
         return {"request": request, "actors": actors}

@@ -126,22 +126,32 @@ class Steer:
         return recorder, records, frames
 
     def _report(
-        self, motion: "Motion", recorder: "Recorder", records: Sequence["StepRecord"], track: "CommandTrack",
-        lowered: Sequence[str], prior: Any,
-    ) -> dict[str, Any]:  # fmt: skip
+        self,
+        motion: "Motion",
+        recorder: "Recorder",
+        records: Sequence["StepRecord"],
+        track: "CommandTrack",
+        lowered: Sequence[str],
+        prior: Any,
+    ) -> dict[str, Any]:
         from controllers.steering.loop import timing
         from mapctl import metrics, report
         from mapctl.metrics.travel import by_command
 
         cost = timing(records, [time for time in track.times[1:] if time < motion.seconds])
         return {
-            "request": options.as_request("steer", self), "seed": self.seed, "versions": report.versions(),
-            "prior": {"name": prior.name, "licence": prior.card.licence}, "motion": report.outline(motion),
+            "request": options.as_request("steer", self),
+            "seed": self.seed,
+            "versions": report.versions(),
+            "prior": {"name": prior.name, "licence": prior.card.licence},
+            "motion": report.outline(motion),
             "status": {"text": "; ".join(lowered) or "done", "ok": not lowered, "notes": list(lowered)},
-            "commands": by_command(motion, track), "ledger": recorder.ledger.summary(),
-            "measures": metrics.measure(motion), "mocap": report.mocap_values(prior.card.quality),
+            "commands": by_command(motion, track),
+            "ledger": recorder.ledger.summary(),
+            "measures": metrics.measure(motion),
+            "mocap": report.mocap_values(prior.card.quality),
             "timing": cost | {"peak_memory_mb": report.peak_memory_mb()},
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True)
@@ -166,8 +176,11 @@ def _summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
         turned = "" if off is None else f", {off:+.1f} degrees off"
         turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
         turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
-        way = f"to {row['heading_deg']:.0f} degrees" if row["turn_deg_s"] is None else (
-            f"turning {row['turn_deg_s']:.0f} degrees/s")  # fmt: skip
+        way = (
+            f"to {row['heading_deg']:.0f} degrees"
+            if row["turn_deg_s"] is None
+            else (f"turning {row['turn_deg_s']:.0f} degrees/s")
+        )
         asked = f"{row['speed_mps']:.2f} m/s {way}"
         lines.append(f"{row['time_s']:6.1f} s  {asked}: {reached}{steady}{turned}")
     cost, latency = report["timing"], report["timing"]["command_latency_s"]

@@ -120,8 +120,15 @@ class Tween:
         """Of the options; files that are given are read, and so not written."""
         if self.joints is not None and self.root_only:
             raise RequestError("--joints and --root-only are two kinds of keys; choose one")
-        idle = [name for name, value in (("--keyframes", self.keyframes), ("--joints", self.joints),
-                                          ("--root-only", self.root_only or None)) if value is not None]  # fmt: skip
+        idle = [
+            name
+            for name, value in (
+                ("--keyframes", self.keyframes),
+                ("--joints", self.joints),
+                ("--root-only", self.root_only or None),
+            )
+            if value is not None
+        ]
         if self._of_file and idle:
             raise RequestError(f"{idle[0]} is for motion files; {self.source} says itself what its keys are")
         if not self._of_file and self.keyframes is None:
@@ -169,8 +176,9 @@ class Tween:
         if self.best_of > 1 and infiller is not None:
             return tween_variations.best(self, asked, infiller, settings)
         rollable = () if method != "map" else priors.load_choice(self.prior or "auto")
-        return tween(asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig,
-                     rollable=rollable)  # fmt: skip
+        return tween(
+            asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig, rollable=rollable
+        )
 
     def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:
         from controllers.inbetweening.tween import key_errors

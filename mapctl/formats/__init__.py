@@ -23,21 +23,26 @@ def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
     usd.save(motion, path)
 
 
-READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {
-    ".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load,
-}  # fmt: skip
+READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load}
 _LOSSY_READERS: dict[str, Callable[[str | PathLike[str]], tuple[Motion, Missing]]] = {
-    ".bvh": bvh.load_lossy, ".npz": npz.load_lossy, ".amc": acclaim.load_lossy,
-}  # fmt: skip
+    ".bvh": bvh.load_lossy,
+    ".npz": npz.load_lossy,
+    ".amc": acclaim.load_lossy,
+}
 WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
-    ".bvh": bvh.save, ".npz": npz.save, ".glb": _save_glb,
-    ".usda": _save_usd, ".usdc": _save_usd, ".usd": _save_usd,
-}  # fmt: skip
+    ".bvh": bvh.save,
+    ".npz": npz.save,
+    ".glb": _save_glb,
+    ".usda": _save_usd,
+    ".usdc": _save_usd,
+    ".usd": _save_usd,
+}
 _USD = (".usda", ".usdc", ".usd")
 _WHY_NOT = {
     ".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
-    ".glb": "can be written but not read", **dict.fromkeys(_USD, "can be written but not read"),
-}  # fmt: skip
+    ".glb": "can be written but not read",
+    **dict.fromkeys(_USD, "can be written but not read"),
+}
 
 
 def load(

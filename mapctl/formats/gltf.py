@@ -33,10 +33,16 @@ class _Buffer:
         self.blob += table.tobytes()
         self.blob += bytes(-len(self.blob) % 4)
         self.document.bufferViews.append(view)
-        self.document.accessors.append(pygltflib.Accessor(
-            bufferView=len(self.document.bufferViews) - 1, componentType=_COMPONENT[table.dtype.name], count=len(table),
-            type=_KINDS[table.shape[1]], min=table.min(0).tolist(), max=table.max(0).tolist(),
-        ))  # fmt: skip
+        self.document.accessors.append(
+            pygltflib.Accessor(
+                bufferView=len(self.document.bufferViews) - 1,
+                componentType=_COMPONENT[table.dtype.name],
+                count=len(table),
+                type=_KINDS[table.shape[1]],
+                min=table.min(0).tolist(),
+                max=table.max(0).tolist(),
+            )
+        )
         return len(self.document.accessors) - 1
 
 
@@ -57,14 +63,23 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     document.meshes = [_mesh(body, buffer)]
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
-    document.skins = [pygltflib.Skin(joints=list(range(joints)), skeleton=0,
-                                inverseBindMatrices=buffer.add(inverse.reshape(joints, 16)))]  # fmt: skip
+    document.skins = [
+        pygltflib.Skin(
+            joints=list(range(joints)), skeleton=0, inverseBindMatrices=buffer.add(inverse.reshape(joints, 16))
+        )
+    ]
     document.nodes.append(pygltflib.Node(name="mannequin", mesh=0, skin=0))
     document.scenes = [pygltflib.Scene(nodes=[0, len(document.nodes) - 1])]
     document.scene = 0
     document.animations = [_animation(motion, buffer)]
-    document.materials = [pygltflib.Material(name="mannequin", pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
-        baseColorFactor=[1.0, 1.0, 1.0, 1.0], metallicFactor=0.0, roughnessFactor=0.8))]  # fmt: skip
+    document.materials = [
+        pygltflib.Material(
+            name="mannequin",
+            pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
+                baseColorFactor=[1.0, 1.0, 1.0, 1.0], metallicFactor=0.0, roughnessFactor=0.8
+            ),
+        )
+    ]
     document.buffers = [pygltflib.Buffer(byteLength=len(buffer.blob))]
     document.set_binary_blob(bytes(buffer.blob))
     return b"".join(document.save_to_bytes())
@@ -79,8 +94,10 @@ def _nodes(motion: Motion) -> list[pygltflib.Node]:
     below = [skeleton.children(joint) for joint in range(motion.num_joints)]
     for number, name in enumerate(skeleton.end_offsets):
         below[skeleton.index(name)].append(motion.num_joints + number)
-    joints = [pygltflib.Node(name=name, children=children, translation=offset.tolist())
-              for name, children, offset in zip(skeleton.names, below, offsets, strict=True)]  # fmt: skip
+    joints = [
+        pygltflib.Node(name=name, children=children, translation=offset.tolist())
+        for name, children, offset in zip(skeleton.names, below, offsets, strict=True)
+    ]
     ends = [pygltflib.Node(name=f"{name}_end", translation=list(at)) for name, at in skeleton.end_offsets.items()]
     return [*joints, *ends]
 

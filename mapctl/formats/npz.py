@@ -38,18 +38,36 @@ FORMAT = "mapctl-motion-1"
 
 # Key: kind of number (numpy's letters) and shape, by the letters of the module's docstring.
 _KEYS = {
-    "format": ("U", ""), "names": ("U", "J"), "parents": ("i", "J"), "offsets": ("f", "J3"),
-    "end_names": ("U", "E"), "end_offsets": ("f", "E3"), "fps": ("i", "2"),
-    "root_position_world": ("f", "T3"), "local_quat_xyzw": ("f", "TJ4"),
-    "moving_joints": ("i", "M"), "moving_offsets": ("f", "MT3"),
-}  # fmt: skip
+    "format": ("U", ""),
+    "names": ("U", "J"),
+    "parents": ("i", "J"),
+    "offsets": ("f", "J3"),
+    "end_names": ("U", "E"),
+    "end_offsets": ("f", "E3"),
+    "fps": ("i", "2"),
+    "root_position_world": ("f", "T3"),
+    "local_quat_xyzw": ("f", "TJ4"),
+    "moving_joints": ("i", "M"),
+    "moving_offsets": ("f", "MT3"),
+}
 
 _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
 """Keys that change from frame to frame, and may hold NaN where what is lost is asked for."""
 _UNSOUND = (
-    zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, lzma.LZMAError, ValueError, EOFError, OSError,
-    MemoryError, NotImplementedError, RuntimeError, SyntaxError, TypeError, OverflowError,
-)  # fmt: skip
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    ValueError,
+    EOFError,
+    OSError,
+    MemoryError,
+    NotImplementedError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    OverflowError,
+)
 """What zipfile and numpy raise on archives that are cut, encrypted, forged or hold pickled objects."""
 
 
@@ -194,8 +212,11 @@ def _missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> Missin
         never = ~held.any(axis=-1)
         held[never] = (0.0, 0.0, 0.0, 1.0)
         tracks = [missing.bridged(track, np.zeros(3)) for track in arrays["moving_offsets"]]
-        arrays |= {"local_quat_xyzw": held, "moving_offsets": np.array(tracks).reshape(moving.shape),
-                   "root_position_world": missing.bridged(arrays["root_position_world"], np.zeros(3))}  # fmt: skip
+        arrays |= {
+            "local_quat_xyzw": held,
+            "moving_offsets": np.array(tracks).reshape(moving.shape),
+            "root_position_world": missing.bridged(arrays["root_position_world"], np.zeros(3)),
+        }
     return Missing(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(places))
 
 

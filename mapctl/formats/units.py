@@ -15,9 +15,13 @@ _TOES, _FEET, _HIPS = ("toe",), ("foot", "ankle"), ("hips", "pelvis")
 
 
 def metres_per_unit(
-    names: Sequence[str], parents: Sequence[int], offsets: np.ndarray, *,
-    end_offsets: Mapping[int, Sequence[float]], moving: Collection[int] = (),
-) -> float:  # fmt: skip
+    names: Sequence[str],
+    parents: Sequence[int],
+    offsets: np.ndarray,
+    *,
+    end_offsets: Mapping[int, Sequence[float]],
+    moving: Collection[int] = (),
+) -> float:
     """How many metres one unit of `offsets` (joints, 3) is, for a skeleton of about human size.
 
     Bones are measured from hips to toes; where no leg is named, from the root to the farthest leaf.
@@ -40,9 +44,12 @@ def metres_per_unit(
 
 
 def leg_length(
-    names: Sequence[str], parents: Sequence[int], lengths: np.ndarray, ends: Mapping[int, float],
+    names: Sequence[str],
+    parents: Sequence[int],
+    lengths: np.ndarray,
+    ends: Mapping[int, float],
     moving: Collection[int] = (),
-) -> float:  # fmt: skip
+) -> float:
     """Hips to toes along the bones, or to the foot's End Site if there are no toes; 0 if no foot is named."""
     plain = [_plain(name) for name in names]
     joint = _first(_TOES, plain) or _first(_FEET, plain)

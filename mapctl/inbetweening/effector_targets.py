@@ -17,11 +17,9 @@ from mapctl.skeleton import CANONICAL
 _KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 LIMBS = {
     side + end: Limb(CANONICAL.index(side + upper), CANONICAL.index(side + lower), CANONICAL.index(side + end), bends)
-    for upper, lower, end, bends in (
-        ("UpperArm", "LowerArm", "Hand", _ELBOW), ("UpperLeg", "LowerLeg", "Foot", _KNEE),
-    )
+    for upper, lower, end, bends in (("UpperArm", "LowerArm", "Hand", _ELBOW), ("UpperLeg", "LowerLeg", "Foot", _KNEE))
     for side in ("left", "right")
-}  # fmt: skip
+}
 """Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
 _REACH = 0.15  # seconds over which a limb goes to its place and back, at least
 _CALM = 15.0  # m/s^2 at which it goes farther
@@ -53,8 +51,11 @@ class Targets:
 
 def check_limbs(targets: Targets) -> None:
     """RequestError unless only ends of limbs, which can be brought to a place, are wanted somewhere."""
-    other = [name for name, some in zip(CANONICAL.names, targets.wanted.any(dim=0).tolist(), strict=True)
-             if some and name not in LIMBS]  # fmt: skip
+    other = [
+        name
+        for name, some in zip(CANONICAL.names, targets.wanted.any(dim=0).tolist(), strict=True)
+        if some and name not in LIMBS
+    ]
     if other:
         raise RequestError(f"places are for {', '.join(LIMBS)}; {other[0]} has none")
 

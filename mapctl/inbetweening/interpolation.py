@@ -12,9 +12,10 @@ from mapctl.skeleton import CANONICAL
 
 
 def slerped(
-    places_world: Float[Tensor, "batch frames joints 3"], local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
+    places_world: Float[Tensor, "batch frames joints 3"],
+    local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
     known: Bool[Tensor, "batch frames joints"],
-) -> Float[Tensor, "batch frames joints 3"]:  # fmt: skip
+) -> Float[Tensor, "batch frames joints 3"]:
     """World places, metres, on canonical bones; known ones as they are. What is not known may hold anything finite.
 
     A rotation is known while the joint and all that it carries next are.

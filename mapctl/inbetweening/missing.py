@@ -69,18 +69,26 @@ def straight(motion: Motion, lost: Lost) -> Motion:
     rest = quats.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quats)
     between = torch.where(known.any(dim=1)[None, :, None], between, rest)
     moving = {joint: _held(values, lost.root) for joint, values in motion.moving_offsets.items()}
-    return replace(motion, local_quat_xyzw=torch.where(lost.joints[..., None], between, quats),
-                   root_position=_held(motion.root_position, lost.root), moving_offsets=moving)  # fmt: skip
+    return replace(
+        motion,
+        local_quat_xyzw=torch.where(lost.joints[..., None], between, quats),
+        root_position=_held(motion.root_position, lost.root),
+        moving_offsets=moving,
+    )
 
 
 def put_back(motion: Motion, original: Motion, lost: Lost) -> Motion:
     """The original with what it lacks from `motion`, of the same rig and length; all else to the bit."""
-    moving = {joint: torch.where(lost.root[:, None], motion.moving_offsets[joint], values)
-              for joint, values in original.moving_offsets.items()}  # fmt: skip
-    return replace(original, moving_offsets=moving,
-                   root_position=torch.where(lost.root[:, None], motion.root_position, original.root_position),
-                   local_quat_xyzw=torch.where(lost.joints[..., None], motion.local_quat_xyzw,
-                                               original.local_quat_xyzw))  # fmt: skip
+    moving = {
+        joint: torch.where(lost.root[:, None], motion.moving_offsets[joint], values)
+        for joint, values in original.moving_offsets.items()
+    }
+    return replace(
+        original,
+        moving_offsets=moving,
+        root_position=torch.where(lost.root[:, None], motion.root_position, original.root_position),
+        local_quat_xyzw=torch.where(lost.joints[..., None], motion.local_quat_xyzw, original.local_quat_xyzw),
+    )
 
 
 def _held(values: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:

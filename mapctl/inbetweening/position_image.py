@@ -37,10 +37,14 @@ class PositionImage:
 
     @staticmethod
     def of_world(
-        places_world: Float[Tensor, "batch frames joints 3"], heading: Float[Tensor, "batch frames"],
-        contacts: Float[Tensor, "batch frames 2"], *, known: Bool[Tensor, "batch frames joints"],
-        present: Bool[Tensor, "batch frames"], toes: tuple[int, int],
-    ) -> "PositionImage":  # fmt: skip
+        places_world: Float[Tensor, "batch frames joints 3"],
+        heading: Float[Tensor, "batch frames"],
+        contacts: Float[Tensor, "batch frames 2"],
+        *,
+        known: Bool[Tensor, "batch frames joints"],
+        present: Bool[Tensor, "batch frames"],
+        toes: tuple[int, int],
+    ) -> "PositionImage":
         """From world positions (metres) and the hips' heading (radians), guesses where they are not known; the
         reference is their root. Contacts of toes that are not known may be anything finite.
         """
@@ -63,8 +67,14 @@ class PositionImage:
     def mirrored(self) -> "PositionImage":
         """Left and right exchanged."""
         flip = self.ground.new_tensor([-1.0, 1.0])
-        return PositionImage(mirrored_places(self.places), self.contacts.flip(-1), self.known[..., _PARTNERS],
-                             self.present, self.ground * flip, -self.heading)  # fmt: skip
+        return PositionImage(
+            mirrored_places(self.places),
+            self.contacts.flip(-1),
+            self.known[..., _PARTNERS],
+            self.present,
+            self.ground * flip,
+            -self.heading,
+        )
 
     @property
     def ever_known(self) -> Bool[Tensor, "batch joints"]:

@@ -87,12 +87,15 @@ class KeyRequest:
                 raise RequestError(f"key[{number}]: key[{other}] is at frame {frame} already")
         for number in (frames.index(min(frames)), frames.index(max(frames))):
             if self.key[number].joints or self.key[number].reach or self.key[number].root_only:
-                raise RequestError(f"key[{number}]: the first and the last key in time are whole poses, without "
-                                   "joints, reach or root_only")  # fmt: skip
+                raise RequestError(
+                    f"key[{number}]: the first and the last key in time are whole poses, without "
+                    "joints, reach or root_only"
+                )
         if min(frames) > 0:
             first = frames.index(min(frames))
-            raise RequestError(f"key[{first}]: the motion begins with its first key, so that is at frame 0; got "
-                               f"{frames[first]}")  # fmt: skip
+            raise RequestError(
+                f"key[{first}]: the motion begins with its first key, so that is at frame 0; got {frames[first]}"
+            )
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -116,8 +119,9 @@ def read_keys(path: str | PathLike[str]) -> KeyRequest:
     def found(name: str | None) -> str | None:
         return None if name is None else str(folder / name)
 
-    return replace(request, body=found(request.body),
-                   key=tuple(replace(key, pose=found(key.pose)) for key in request.key))  # fmt: skip
+    return replace(
+        request, body=found(request.body), key=tuple(replace(key, pose=found(key.pose)) for key in request.key)
+    )
 
 
 def _fault(key: PlacedKey, body: str | None) -> str | None:

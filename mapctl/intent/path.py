@@ -98,8 +98,10 @@ class Follow:
             return self, None
         share = max(slowest_share, self.curve.length / wanted)
         slower = SpeedProfile(self.profile.arcs, tuple(v * share for v in self.profile.speeds))
-        note = (f"the wanted speed would go {wanted:.1f} m in {self.seconds:.1f} s but the curve is "
-                f"{self.curve.length:.1f} m long, so the speed was lowered to {100 * share:.0f} % of it")  # fmt: skip
+        note = (
+            f"the wanted speed would go {wanted:.1f} m in {self.seconds:.1f} s but the curve is "
+            f"{self.curve.length:.1f} m long, so the speed was lowered to {100 * share:.0f} % of it"
+        )
         return Follow(self.curve, slower, self.seconds), note
 
     def arcs(self, frames: int, fps: float) -> Float[Tensor, " frames"]:

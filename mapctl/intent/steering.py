@@ -52,8 +52,10 @@ class Command:
             said.append(f"the speed of {self.speed:g} m/s{when} was lowered to {speed:.2f} m/s, the prior's fastest")
         if step is not None and (held := min(longest, max(shortest, step))) != step:
             way = "raised" if held > step else "lowered"
-            said.append(f"the step length of {step:g} m{when} was {way} to {held:g} m; "
-                        f"steps can be {shortest:g} to {longest:g} m long")  # fmt: skip
+            said.append(
+                f"the step length of {step:g} m{when} was {way} to {held:g} m; "
+                f"steps can be {shortest:g} to {longest:g} m long"
+            )
             step = held
         turned = {name: _wrapped(getattr(self, name)) for name in ("heading", "facing")}
         return replace(self, speed=speed, step_length=step, **turned), said
@@ -85,8 +87,10 @@ class CommandTrack:
 
     def clamped(self, fastest: float) -> tuple["CommandTrack", list[str]]:
         """The track with every command within what can be held, and a sentence for each number that was changed."""
-        found = [command.within(fastest, when=f" at {time:g} s")
-                 for time, command in zip(self.times, self.commands, strict=True)]  # fmt: skip
+        found = [
+            command.within(fastest, when=f" at {time:g} s")
+            for time, command in zip(self.times, self.commands, strict=True)
+        ]
         return CommandTrack(self.times, tuple(command for command, _ in found)), [
             one for _, said in found for one in said
         ]

@@ -57,9 +57,14 @@ class _Line:
     def command(self) -> Command:
         told = tuple(self.words[name] for name in _LABELS if self.words.get(name))
         speed = self.within("speed_mps", 0, _MOST_SPEED)
-        return Command(speed, math.radians(self.value("heading_deg")), self.angle("facing_deg"),
-                       self.angle("turn_deg_s"),
-                       self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None, told)  # fmt: skip
+        return Command(
+            speed,
+            math.radians(self.value("heading_deg")),
+            self.angle("facing_deg"),
+            self.angle("turn_deg_s"),
+            self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None,
+            told,
+        )
 
     def angle(self, name: str) -> float | None:
         """Radians; None where the line leaves it open."""
@@ -67,8 +72,9 @@ class _Line:
 
     def within(self, name: str, low: float, high: float) -> float:
         if not low <= (value := self.value(name)) <= high:
-            raise FileFormatError(self.path, f"{name} must lie between {low:g} and {high:g}, got {value:g}",
-                                  self.number)  # fmt: skip
+            raise FileFormatError(
+                self.path, f"{name} must lie between {low:g} and {high:g}, got {value:g}", self.number
+            )
         return value
 
     def value(self, name: str) -> float:

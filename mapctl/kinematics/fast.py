@@ -33,8 +33,9 @@ class Columns(NamedTuple):
 def _columns() -> Columns:
     first = {block: places.start for block, places in LAYOUT.slices.items()}
     step, tilt = first["root_displacement_heading"], first["root_tilt"]
-    return Columns(step, step + 1, first["heading_change"], first["root_height"], tilt, tilt + 1,
-                   first["joint_rotations"])  # fmt: skip
+    return Columns(
+        step, step + 1, first["heading_change"], first["root_height"], tilt, tilt + 1, first["joint_rotations"]
+    )
 
 
 _COLUMNS = _columns()
@@ -109,8 +110,9 @@ class _Body(torch.autograd.Function):
         places = features.new_empty(*features.shape[:2], len(parents), 3)
         world = np.empty((*places.shape, 3), np.float32)
         known = _array(features)
-        _kernels().body_forward(known, _COLUMNS, _array(ground), _array(heading), parents, offsets,
-                                places.numpy(), world)  # fmt: skip
+        _kernels().body_forward(
+            known, _COLUMNS, _array(ground), _array(heading), parents, offsets, places.numpy(), world
+        )
         ctx.known = known, parents, offsets, world
         return places
 

@@ -100,8 +100,13 @@ def body_forward(features, columns, ground, headings, parents, offsets, places, 
                 for i in range(3):
                     step = above[i, 0] * bone[0] + above[i, 1] * bone[1] + above[i, 2] * bone[2]
                     at[joint, i] = at[parents[joint], i] + step
-                turn_by(frames[joint], above, np.float64(now[vector]), np.float64(now[vector + 1]),
-                        np.float64(now[vector + 2]))  # fmt: skip
+                turn_by(
+                    frames[joint],
+                    above,
+                    np.float64(now[vector]),
+                    np.float64(now[vector + 1]),
+                    np.float64(now[vector + 2]),
+                )
 
 
 @inner
@@ -137,8 +142,14 @@ def body_backward(features, columns, parents, offsets, world, d_places, d_featur
                 out[v], out[v + 1], out[v + 2] = vector_gradient(
                     frames[joint], torque[joint], np.float64(now[v]), np.float64(now[v + 1]), np.float64(now[v + 2])
                 )
-                hand_up(frames[parents[joint]], offsets[joint], force[joint], torque[joint],
-                        force[parents[joint]], torque[parents[joint]])  # fmt: skip
+                hand_up(
+                    frames[parents[joint]],
+                    offsets[joint],
+                    force[joint],
+                    torque[joint],
+                    force[parents[joint]],
+                    torque[parents[joint]],
+                )
             out[columns.tilt_x], _, out[columns.tilt_z] = vector_gradient(
                 frames[0], torque[0], np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
             )

@@ -57,8 +57,10 @@ def solve(
     """
     frames, joints = places_world.shape[:2]
     if start_quat_xyzw.shape[:2] != (frames, joints) or joints != skeleton.num_joints:
-        raise RequestError(f"places {tuple(places_world.shape)} and rotations {tuple(start_quat_xyzw.shape)} must be "
-                           f"of the same frames and of {skeleton.num_joints} joints")  # fmt: skip
+        raise RequestError(
+            f"places {tuple(places_world.shape)} and rotations {tuple(start_quat_xyzw.shape)} must be "
+            f"of the same frames and of {skeleton.num_joints} joints"
+        )
     offsets = skeleton.offsets.to(places_world)
     start, bending = start_quat_xyzw.to(places_world), {limb.upper: limb for limb in limbs}
     at, world, local = [places_world[:, 0] if root_position is None else root_position], [], []
@@ -85,9 +87,13 @@ def solve(
 
 
 def _reached(
-    limb: Limb, turn: Float[Tensor, "frames 4"], bent: Float[Tensor, "frames 4"], at: Float[Tensor, "frames 3"],
-    places: Float[Tensor, "frames joints 3"], offsets: Float[Tensor, "joints 3"],
-) -> Float[Tensor, "frames 2 3"]:  # fmt: skip
+    limb: Limb,
+    turn: Float[Tensor, "frames 4"],
+    bent: Float[Tensor, "frames 4"],
+    at: Float[Tensor, "frames 3"],
+    places: Float[Tensor, "frames joints 3"],
+    offsets: Float[Tensor, "joints 3"],
+) -> Float[Tensor, "frames 2 3"]:
     """Where the elbow or the knee is if the end is at its place, as far as the bones reach; and where the end then is.
 
     A proposal that is the mean of several poses has short bones, and a forearm that is short points anywhere, also
@@ -105,8 +111,9 @@ def _reached(
     foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(len(turn), 3))
     towards = _shortest(foot, way)
     usual = rotations.rotate(rotations.multiply(towards, turn), offsets.new_tensor(limb.bends).expand(len(turn), 3))
-    proposed = torch.stack([places[:, limb.lower] - places[:, limb.upper],
-                            places[:, limb.end] - places[:, limb.lower]], dim=1)  # fmt: skip
+    proposed = torch.stack(
+        [places[:, limb.lower] - places[:, limb.upper], places[:, limb.end] - places[:, limb.lower]], dim=1
+    )
     whole = (proposed.norm(dim=-1) / torch.stack([long, short])).amin(dim=1, keepdim=True).clamp(max=1)
     trust = whole**_TRUST
     side = trust * (places[:, limb.lower] - at) + (1 - trust) * rotations.rotate(towards, knee) + _SIDE * usual
@@ -133,9 +140,13 @@ def _turned(
 
 
 def _in_plane(
-    turn: Float[Tensor, "frames 4"], start: Float[Tensor, "frames joints 4"], skeleton: Skeleton, child: int,
-    places: Float[Tensor, "frames joints 3"], at: Float[Tensor, "frames 3"],
-) -> Float[Tensor, "frames 4"]:  # fmt: skip
+    turn: Float[Tensor, "frames 4"],
+    start: Float[Tensor, "frames joints 4"],
+    skeleton: Skeleton,
+    child: int,
+    places: Float[Tensor, "frames joints 3"],
+    at: Float[Tensor, "frames 3"],
+) -> Float[Tensor, "frames 4"]:
     """`turn`, turned about its bone so that the child bends in the plane that its own child's place asks for."""
     below = skeleton.children(child)
     if len(below) != 1:

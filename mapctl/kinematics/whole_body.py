@@ -38,9 +38,13 @@ _UPPER, _ENDS = ([getattr(limb, end) for limb in LIMBS.values()] for end in ("up
 
 
 def reach_with_body(
-    body: Motion, targets: Targets, *, turning: Bool[Tensor, "frames joints"], moving: Bool[Tensor, " frames"],
+    body: Motion,
+    targets: Targets,
+    *,
+    turning: Bool[Tensor, "frames joints"],
+    moving: Bool[Tensor, " frames"],
     stray: Float[Tensor, " frames"],
-) -> tuple[Motion, Float[Tensor, "frames 3"]]:  # fmt: skip
+) -> tuple[Motion, Float[Tensor, "frames 3"]]:
     """A canonical motion whose poses, in the frames in which a hand or a foot is wanted somewhere, have it there.
 
     `turning` are joints that may turn and `moving` frames in which the hips may move; all else stays. By about `stray`
@@ -82,9 +86,11 @@ def _offset_sigmas(
 
 
 def _least_offsets(
-    part: Motion, goals: Float[Tensor, "poses limbs 3"], wanted: Bool[Tensor, "poses limbs"],
+    part: Motion,
+    goals: Float[Tensor, "poses limbs 3"],
+    wanted: Bool[Tensor, "poses limbs"],
     sigma: Float[Tensor, "poses offsets"],
-) -> Float[Tensor, "poses offsets"]:  # fmt: skip
+) -> Float[Tensor, "poses offsets"]:
     """The mode of  |x / sigma|^2 + |r(x)|^2,  r what limbs and balance ask for; Levenberg-Marquardt in its small dual
     form, pose by pose: steps that do not help are damped more.
     """
@@ -175,9 +181,12 @@ def _with_offsets(part: Motion, offsets: Tensor) -> tuple[Motion, Float[Tensor, 
 
 
 def bend_limbs(
-    posed: Motion, before: Motion, ends: Float[Tensor, "poses joints 3"], wanted: Bool[Tensor, "poses joints"],
+    posed: Motion,
+    before: Motion,
+    ends: Float[Tensor, "poses joints 3"],
+    wanted: Bool[Tensor, "poses joints"],
     turning: Bool[Tensor, "poses joints"],
-) -> Motion:  # fmt: skip
+) -> Motion:
     """Poses with feet, and with hands that are wanted, at the places `ends` (world, metres), as far as limbs reach.
 
     Feet lie as they lay `before`, and arms of which nothing is wanted hang as they hung; joints that are not `turning`
@@ -192,8 +201,9 @@ def bend_limbs(
         places[:, limb.end] = torch.where(told[:, None], ends[:, limb.end], places[:, limb.end])
         free = torch.zeros_like(turning)
         free[:, [limb.upper, limb.lower]] = (turning[:, [limb.upper, limb.lower]].all(dim=1) & told)[:, None]
-        quats = inverse.solve(places, posed.local_quat_xyzw, posed.skeleton, free=free, limbs=(limb,),
-                                         root_position=posed.root_position)  # fmt: skip
+        quats = inverse.solve(
+            places, posed.local_quat_xyzw, posed.skeleton, free=free, limbs=(limb,), root_position=posed.root_position
+        )
         posed = replace(posed, local_quat_xyzw=torch.where(free[..., None], quats, posed.local_quat_xyzw))
         if name.endswith("Foot"):
             posed = _keep_orientation(posed, limb.end, lay[:, limb.end], turning[:, limb.end])

@@ -124,13 +124,7 @@ class Anatomy:
         toe_axes = _axes(up=self._local(toe, _UP)[flat].mean(0), forward=self._local(toe, level)[flat].mean(0))
         heights = tuple(self._height(point, flat) for point in (ankle, ball))
         return Foot(
-            side,
-            ankle,
-            ball,
-            tip,
-            axes,
-            toe_axes,
-            (max(heights[0], heights[1] + 0.02 * self.scale), heights[1]),
+            side, ankle, ball, tip, axes, toe_axes, (max(heights[0], heights[1] + 0.02 * self.scale), heights[1])
         )
 
     def _flat(self, ankle: int, ball: int) -> Array:

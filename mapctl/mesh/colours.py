@@ -7,9 +7,17 @@ import numpy as np
 from mapctl.errors import RequestError
 
 ACTORS: Mapping[str, str] = {
-    "slate": "#5b6675", "crimson": "#c9304e", "green": "#2f9e62", "purple": "#7d55c7", "teal": "#1b98a0",
-    "brown": "#8d6346", "pink": "#d4609f", "olive": "#8a8f2e", "navy": "#2f4a7d", "black": "#33363b",
-}  # fmt: skip
+    "slate": "#5b6675",
+    "crimson": "#c9304e",
+    "green": "#2f9e62",
+    "purple": "#7d55c7",
+    "teal": "#1b98a0",
+    "brown": "#8d6346",
+    "pink": "#d4609f",
+    "olive": "#8a8f2e",
+    "navy": "#2f4a7d",
+    "black": "#33363b",
+}
 """Torso colours by name, in the order in which actors without one get them; all differ from the limbs'."""
 
 LEFT = "#2f7fe0"

@@ -13,13 +13,24 @@ from mapctl.motion import Motion
 
 # Radii at a bone's start and end in metres, for a leg of 80 cm; a bone belongs to the part it starts at.
 _RADII = {
-    Part.NECK: (0.050, 0.046), Part.SHOULDER: (0.052, 0.056), Part.UPPER_ARM: (0.047, 0.042),
-    Part.LOWER_ARM: (0.037, 0.026), Part.HAND: (0.033, 0.026), Part.FINGER: (0.009, 0.008),
-    Part.UPPER_LEG: (0.078, 0.057), Part.LOWER_LEG: (0.050, 0.034), Part.OTHER: (0.015, 0.012),
-}  # fmt: skip
+    Part.NECK: (0.050, 0.046),
+    Part.SHOULDER: (0.052, 0.056),
+    Part.UPPER_ARM: (0.047, 0.042),
+    Part.LOWER_ARM: (0.037, 0.026),
+    Part.HAND: (0.033, 0.026),
+    Part.FINGER: (0.009, 0.008),
+    Part.UPPER_LEG: (0.078, 0.057),
+    Part.LOWER_LEG: (0.050, 0.034),
+    Part.OTHER: (0.015, 0.012),
+}
 # Bones from the trunk to a limb, by the part they lead to.
-_LINKS = {Part.UPPER_LEG: (0.092, 0.081), Part.HIPS: (0.092, 0.084), Part.SHOULDER: (0.060, 0.056),
-          Part.UPPER_ARM: (0.060, 0.056), Part.OTHER: (0.015, 0.012)}  # fmt: skip
+_LINKS = {
+    Part.UPPER_LEG: (0.092, 0.081),
+    Part.HIPS: (0.092, 0.084),
+    Part.SHOULDER: (0.060, 0.056),
+    Part.UPPER_ARM: (0.060, 0.056),
+    Part.OTHER: (0.015, 0.012),
+}
 _TRUNK = ((0.0, 0.35, 0.75, 1.0), (0.100, 0.096, 0.110, 0.060))
 """Radius of the trunk at shares of the way from hips to neck, metres."""
 _OVERLAP = 0.93
@@ -227,12 +238,7 @@ def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
     centre, frames, half = (np.stack(values) for values in zip(*boxes, strict=True))
     many, leather = len(boxes), colours.mix(_limb(foot.side), np.zeros(3), 0.28)
     return RoundedBoxes(
-        centre,
-        frames,
-        half,
-        np.full((many, 2), _EDGE * scale),
-        np.ones((many, 3)),
-        np.tile(leather, (many, 1)),
+        centre, frames, half, np.full((many, 2), _EDGE * scale), np.ones((many, 3)), np.tile(leather, (many, 1))
     )
 
 

@@ -33,9 +33,7 @@ def turn_rate(angle: Float[Tensor, "frames"], fps: float) -> float:
 
 
 def pose_variation(
-    positions: Float[Tensor, "frames joints 3"],
-    hips: Float[Tensor, "frames 3"],
-    angle: Float[Tensor, "frames"],
+    positions: Float[Tensor, "frames joints 3"], hips: Float[Tensor, "frames 3"], angle: Float[Tensor, "frames"]
 ) -> float:
     """Spread of the poses, metres; a frozen pose has none however it travels and turns.
 

@@ -58,8 +58,12 @@ def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | No
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
         part = (way.seconds >= began) & (way.seconds <= until)
         turning = None if command.turning is None else math.degrees(command.turning)
-        row: dict[str, float | None] = {"time_s": began, "speed_mps": command.speed, "turn_deg_s": turning,
-                                        "heading_deg": math.degrees(command.heading)}  # fmt: skip
+        row: dict[str, float | None] = {
+            "time_s": began,
+            "speed_mps": command.speed,
+            "turn_deg_s": turning,
+            "heading_deg": math.degrees(command.heading),
+        }
         row["reached_s"] = _reached(way, part, began, command, float(motion.fps))
         steady = np.flatnonzero(part & (way.seconds >= began + _STEADY_AFTER))
         row |= _steady(way, ground, steady, command, float(motion.fps))

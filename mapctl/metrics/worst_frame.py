@@ -29,8 +29,9 @@ def peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"],
     """Of world positions in metres; 0 for what so few frames do not show."""
     seen = ends - hips[:, None]
     steps, bends = (torch.diff(seen, n=order, dim=0).norm(dim=-1) for order in (1, 2))
-    return Peaks(float(steps.max()) * fps / 30 if steps.numel() else 0.0,
-                 float(bends.max()) * fps**2 if bends.numel() else 0.0)  # fmt: skip
+    return Peaks(
+        float(steps.max()) * fps / 30 if steps.numel() else 0.0, float(bends.max()) * fps**2 if bends.numel() else 0.0
+    )
 
 
 def unsupported(

@@ -79,8 +79,10 @@ def checked(term: Term, what: str, values: Any, trial: Trial) -> Float[Tensor, "
         return values
     told = f"shape {list(got)}" if got is not None else f"a {type(values).__name__}"
     article = "an" if what == "energy" else "a"
-    raise RequestError(f"the term {term.name!r} gave {article} {what} of {told}; expected a tensor of shape"
-                       f" {list(wanted)}: candidates, frames")  # fmt: skip
+    raise RequestError(
+        f"the term {term.name!r} gave {article} {what} of {told}; expected a tensor of shape"
+        f" {list(wanted)}: candidates, frames"
+    )
 
 
 def _entry(term: Term, trial: Trial) -> LedgerEntry:
@@ -100,5 +102,7 @@ def _check_finite(term: Term, what: str, values: Tensor) -> None:
         return
     bad = int((~torch.isfinite(values)).nonzero()[0, -1])
     where = "" if what == "gradient" else f", first in frame {bad} of its window"
-    raise RequestError(f"the term {term.name!r} gave {'an' if what == 'energy' else 'a'} {what} that is not finite"
-                       f" for a motion that is{where}")  # fmt: skip
+    raise RequestError(
+        f"the term {term.name!r} gave {'an' if what == 'energy' else 'a'} {what} that is not finite"
+        f" for a motion that is{where}"
+    )

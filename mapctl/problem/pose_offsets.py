@@ -80,8 +80,9 @@ class Poses:
         if self.density is not None:
             density = self.density.log_prob(features, self.state)
         bits = self.guide.contacts.expand(len(white), -1, -1)
-        return Trial(features, self.place, white, density, bits, self.before, self.skeleton, PRIOR_FPS,
-                     self.contacts_before)  # fmt: skip
+        return Trial(
+            features, self.place, white, density, bits, self.before, self.skeleton, PRIOR_FPS, self.contacts_before
+        )
 
     def _features(self, packed: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames size"]:
         """Steps and turns from places and headings."""

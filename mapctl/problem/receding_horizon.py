@@ -85,9 +85,15 @@ class WindowSolver:
     """How one window is solved."""
 
     def solve(
-        self, committed: Committed, terms_of: TermsOf, frames: int, *, generator: torch.Generator,
-        progress: Callable[[int, int], None] | None = None, deadline: float | None = None,
-    ) -> tuple[Committed, Outcome]:  # fmt: skip
+        self,
+        committed: Committed,
+        terms_of: TermsOf,
+        frames: int,
+        *,
+        generator: torch.Generator,
+        progress: Callable[[int, int], None] | None = None,
+        deadline: float | None = None,
+    ) -> tuple[Committed, Outcome]:
         """Extend `committed` to `frames` frames; stops early, with all that is committed, at the deadline or Ctrl-C.
 
         `deadline` is a time.monotonic() value in seconds; the window it falls into is committed as far as it was
@@ -118,20 +124,27 @@ class WindowSolver:
         self, done: Committed, terms: Sequence[Term], count: int, generator: torch.Generator, seconds: float
     ) -> Committed:
         began = time.perf_counter()
-        context = Context(self.density, done.state, done.place, done.joints_world, self.settings.frames,
-                          self.skeleton, self.fps)  # fmt: skip
+        context = Context(
+            self.density, done.state, done.place, done.joints_world, self.settings.frames, self.skeleton, self.fps
+        )
         window = self.method(context, terms, done.tail, generator, seconds=seconds)
         features = window.trial.features[0, :count]
         ground, heading = root_places(features, done.place)
         joints = torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :]
         state = self.density.advance(done.state, features.unsqueeze(0))
-        record = WindowRecord(count, time.perf_counter() - began, window.evaluations, window.start_energy,
-                              window.energy, window.ended)  # fmt: skip
+        record = WindowRecord(
+            count, time.perf_counter() - began, window.evaluations, window.start_energy, window.energy, window.ended
+        )
         return Committed(
-            state=state, place=Place(ground[-1], heading[-1]), features=torch.cat([done.features, features]),
-            joints_world=joints, tail=window.carry[count:], ledger=done.ledger.join(window.ledger.slice(count)),
-            windows=(*done.windows, record), forecast=window.trial.joints_world[0, count:],
-        )  # fmt: skip
+            state=state,
+            place=Place(ground[-1], heading[-1]),
+            features=torch.cat([done.features, features]),
+            joints_world=joints,
+            tail=window.carry[count:],
+            ledger=done.ledger.join(window.ledger.slice(count)),
+            windows=(*done.windows, record),
+            forecast=window.trial.joints_world[0, count:],
+        )
 
 
 def _seconds_until(deadline: float | None) -> float:

@@ -80,12 +80,16 @@ class Ledger:
 
     def summary(self) -> dict[str, dict[str, float | str]]:
         """For a report: by term the total energy, and mean, 95th percentile and maximum of the residual."""
-        return {entry.name: {
-            "energy_nats": float(entry.energy.sum()), "residual_unit": entry.unit,
-            "residual_mean": float(entry.residual.mean()),
-            "residual_p95": float(torch.quantile(entry.residual.double(), 0.95)),
-            "residual_max": float(entry.residual.max()),
-        } for entry in self.entries}  # fmt: skip
+        return {
+            entry.name: {
+                "energy_nats": float(entry.energy.sum()),
+                "residual_unit": entry.unit,
+                "residual_mean": float(entry.residual.mean()),
+                "residual_p95": float(torch.quantile(entry.residual.double(), 0.95)),
+                "residual_max": float(entry.residual.max()),
+            }
+            for entry in self.entries
+        }
 
 
 def _joined(before: LedgerEntry | None, after: LedgerEntry | None, first: Ledger, second: Ledger) -> LedgerEntry:

@@ -89,8 +89,9 @@ class Swarm:
     ) -> Tensor:
         """See Proposal."""
         cost, start = _cost(context, terms, warm, self.space), torch.zeros(self.space.size())
-        found = swarm(cost, start=start, spread=self.space.spread, settings=self.settings, meter=meter,
-                      generator=generator)  # fmt: skip
+        found = swarm(
+            cost, start=start, spread=self.space.spread, settings=self.settings, meter=meter, generator=generator
+        )
         return warm + self.space.expand(found.x.to(warm.dtype)[None], context.frames).flatten(1)
 
 

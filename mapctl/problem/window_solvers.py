@@ -46,9 +46,14 @@ class Method(Protocol):
     """Solves one window."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Float[Tensor, "frames width"],
-        generator: torch.Generator, *, seconds: float = math.inf,
-    ) -> SolvedWindow:  # fmt: skip
+        self,
+        context: Context,
+        terms: Sequence[Term],
+        tail: Float[Tensor, "frames width"],
+        generator: torch.Generator,
+        *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:
         """`tail` is the end of the last window's `carry`, empty at the start; `seconds` are left."""
         ...
 
@@ -74,9 +79,14 @@ class LatentMethod:
     """Where the first round starts."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        self,
+        context: Context,
+        terms: Sequence[Term],
+        tail: Tensor,
+        generator: torch.Generator,
+        *,
         seconds: float = math.inf,
-    ) -> SolvedWindow:  # fmt: skip
+    ) -> SolvedWindow:
         """See Method; the carry is the noise."""
         meter = Meter(self.budget.within(seconds))
         unknowns = self.proposal(context, terms, _extended(tail, context.frames), meter, generator)
@@ -117,9 +127,14 @@ class GuidedMethod:
     """Of one window."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        self,
+        context: Context,
+        terms: Sequence[Term],
+        tail: Tensor,
+        generator: torch.Generator,
+        *,
         seconds: float = math.inf,
-    ) -> SolvedWindow:  # fmt: skip
+    ) -> SolvedWindow:
         """See Method; the carry is the noise, where the next window starts instead of the guide."""
         meter = Meter(self.budget.within(seconds))
         plan, noise = context.density.latents(self.guide.unsqueeze(0), context.state)
@@ -149,9 +164,14 @@ class StateMethod:
     """Of one window."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], tail: Tensor, generator: torch.Generator, *,
+        self,
+        context: Context,
+        terms: Sequence[Term],
+        tail: Tensor,
+        generator: torch.Generator,
+        *,
         seconds: float = math.inf,
-    ) -> SolvedWindow:  # fmt: skip
+    ) -> SolvedWindow:
         """See Method; the carry is the features."""
         meter = Meter(self.budget.within(seconds))
         features, plan = _continued(context, tail)
@@ -169,8 +189,15 @@ def _solved(
 ) -> SolvedWindow:
     with torch.no_grad():
         trial = objective.build(result.x)
-    return SolvedWindow(trial, carry, objective.ledger_of(trial), meter.evaluations, start_energy,
-                        float(result.energy[0]), result.status[0].value)  # fmt: skip
+    return SolvedWindow(
+        trial,
+        carry,
+        objective.ledger_of(trial),
+        meter.evaluations,
+        start_energy,
+        float(result.energy[0]),
+        result.status[0].value,
+    )
 
 
 def _extended(tail: Tensor, frames: int) -> Float[Tensor, "1 unknowns"]:

@@ -37,8 +37,11 @@ def noise(
 ) -> list[Fault]:
     """Joints whose angles shake (radians), and the place of the joint that travels (metres)."""
     degrees = torch.rad2deg(angles).tolist()
-    found = [Fault(name, 0, frames, "noise", amount, "deg")
-             for name, amount in zip(names, degrees, strict=True) if amount >= NOISE_DEG]  # fmt: skip
+    found = [
+        Fault(name, 0, frames, "noise", amount, "deg")
+        for name, amount in zip(names, degrees, strict=True)
+        if amount >= NOISE_DEG
+    ]
     if 100 * root >= NOISE_CM:
         found.append(Fault(names[travels], 0, frames, "noise", 100 * root, "cm"))
     return found
@@ -48,8 +51,10 @@ def leaping(
     names: Sequence[str], spikes: Bool[Tensor, "frames joints"], away: Float[Tensor, "frames joints"], unit: str
 ) -> list[Fault]:
     """Spikes, and how far each lies from what replaced it."""
-    return [Fault(names[joint], start, stop, "spike", float(away[start:stop, joint].max()), unit)
-            for joint, start, stop in runs(spikes)]  # fmt: skip
+    return [
+        Fault(names[joint], start, stop, "spike", float(away[start:stop, joint].max()), unit)
+        for joint, start, stop in runs(spikes)
+    ]
 
 
 def lost(names: Sequence[str], dropouts: Bool[Tensor, "frames joints"]) -> list[Fault]:
@@ -58,18 +63,28 @@ def lost(names: Sequence[str], dropouts: Bool[Tensor, "frames joints"]) -> list[
 
 
 def feet(
-    names: Sequence[str], toes: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], *,
-    rest_height: float, fps: float,
-) -> list[Fault]:  # fmt: skip
+    names: Sequence[str],
+    toes: Float[Tensor, "frames 2 3"],
+    planted: Bool[Tensor, "frames 2"],
+    *,
+    rest_height: float,
+    fps: float,
+) -> list[Fault]:
     """Planted toes that slide, and planted toes in the air; world positions, metres, at any rate."""
     steps = torch.diff(toes[..., ::2], dim=0, prepend=toes[:1, :, ::2]).norm(dim=-1)
     slides = planted & (steps * fps > _SLIDE)
     floats = planted & (toes[..., 1] > rest_height + _FLOAT)
-    found = [Fault(names[foot], start, stop, "slide", 100 * float(steps[start:stop, foot].sum()), "cm")
-             for foot, start, stop in runs(slides) if stop - start >= _SHORTEST]  # fmt: skip
+    found = [
+        Fault(names[foot], start, stop, "slide", 100 * float(steps[start:stop, foot].sum()), "cm")
+        for foot, start, stop in runs(slides)
+        if stop - start >= _SHORTEST
+    ]
     height = 100 * (toes[..., 1] - rest_height)
-    return found + [Fault(names[foot], start, stop, "float", float(height[start:stop, foot].max()), "cm")
-                    for foot, start, stop in runs(floats) if stop - start >= _SHORTEST]  # fmt: skip
+    return found + [
+        Fault(names[foot], start, stop, "float", float(height[start:stop, foot].max()), "cm")
+        for foot, start, stop in runs(floats)
+        if stop - start >= _SHORTEST
+    ]
 
 
 def runs(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, int, int]]:

@@ -125,8 +125,9 @@ def split(motion: Motion) -> Bands:
         side = (len(whole) - len(values)) // 2
         return torch.as_tensor(sosfiltfilt(sections, whole, axis=0, padlen=0)[side:-side].copy())
 
-    slow = Motion(motion.skeleton, motion.fps, low(motion.root_position),
-                  torch.nn.functional.normalize(low(quats), dim=-1))  # fmt: skip
+    slow = Motion(
+        motion.skeleton, motion.fps, low(motion.root_position), torch.nn.functional.normalize(low(quats), dim=-1)
+    )
     fast = rotations.multiply(rotations.inverse(slow.local_quat_xyzw), quats)
     return Bands(slow, rotations.to_rotation_vector(fast), motion.root_position - slow.root_position)
 

@@ -55,9 +55,14 @@ class Examined:
     def slice(self, start: int, stop: int) -> "Examined":
         """Frames start to stop; the noise stays that of the whole."""
         part = slice(start, stop)
-        return replace(self, motion=self.motion.slice(start, stop), spikes=self.spikes[part],
-                       dropouts=self.dropouts[part], spikes_root=self.spikes_root[part],
-                       dropouts_root=self.dropouts_root[part])  # fmt: skip
+        return replace(
+            self,
+            motion=self.motion.slice(start, stop),
+            spikes=self.spikes[part],
+            dropouts=self.dropouts[part],
+            spikes_root=self.spikes_root[part],
+            dropouts_root=self.dropouts_root[part],
+        )
 
     def repaired(self) -> Motion:
         """The recording with what is not to be believed filled in: straight between the frames around it."""
@@ -65,10 +70,16 @@ class Examined:
         quats = rotations.sign_continuous(_only(motion.local_quat_xyzw, seen))
         steps = filled(quats.transpose(0, 1), seen.T).transpose(0, 1)
         root = filled(motion.root_position[None], self.seen_root[None])[0]
-        moving = {joint: filled(values[None], self.seen_root[None])[0] if joint == self.travels else values
-                  for joint, values in motion.moving_offsets.items()}  # fmt: skip
-        return replace(motion, root_position=root, moving_offsets=moving,
-                       local_quat_xyzw=torch.nn.functional.normalize(steps, dim=-1))  # fmt: skip
+        moving = {
+            joint: filled(values[None], self.seen_root[None])[0] if joint == self.travels else values
+            for joint, values in motion.moving_offsets.items()
+        }
+        return replace(
+            motion,
+            root_position=root,
+            moving_offsets=moving,
+            local_quat_xyzw=torch.nn.functional.normalize(steps, dim=-1),
+        )
 
 
 def examine(motion: Motion, masks: Sequence[Mask] = ()) -> Examined:

@@ -20,9 +20,13 @@ _ROUNDS = 5  # of weighing anew what does not fit
 
 
 def shares(
-    pose: Float[Tensor, "1 joints 4"], ahead: Float[Tensor, "frames joints 4"], seen: Float[Tensor, "frames joints 4"],
-    *, noise: Float[Tensor, " joints"], counts: Bool[Tensor, "frames joints"],
-) -> Float[Tensor, " frames"]:  # fmt: skip
+    pose: Float[Tensor, "1 joints 4"],
+    ahead: Float[Tensor, "frames joints 4"],
+    seen: Float[Tensor, "frames joints 4"],
+    *,
+    noise: Float[Tensor, " joints"],
+    counts: Bool[Tensor, "frames joints"],
+) -> Float[Tensor, " frames"]:
     """How much of the way from the pose to the motion ahead each frame has gone, 0 to 1.
 
     By least squares over the joints, without those that go another way, and as evenly over time as noise makes it;
@@ -46,9 +50,14 @@ def mixed(pose: Tensor, ahead: Tensor, share: Float[Tensor, " frames"]) -> Float
 
 
 def bows(
-    along: Tensor, seen: Tensor, share: Float[Tensor, " frames"], *, noise: Float[Tensor, " joints"],
-    whole: Float[Tensor, "frames joints"], counts: Bool[Tensor, "frames joints"],
-) -> Float[Tensor, "frames joints 3"]:  # fmt: skip
+    along: Tensor,
+    seen: Tensor,
+    share: Float[Tensor, " frames"],
+    *,
+    noise: Float[Tensor, " joints"],
+    whole: Float[Tensor, "frames joints"],
+    counts: Bool[Tensor, "frames joints"],
+) -> Float[Tensor, "frames joints 3"]:
     """By how much the way from pose to motion leaves the short one, as Euler angles mixed one by one do: one bow a
     joint, highest half-way, and what else there is in most frames, as far as they stand out of the noise. `whole` is
     how long the short way is, radians.

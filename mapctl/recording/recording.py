@@ -42,15 +42,27 @@ class Capture:
         """
         joints = _continuous_vectors(motion.local_quat_xyzw[:, 1:])
         return Capture(
-            motion.root_position.float()[None], motion.local_quat_xyzw[:, 0].float()[None], joints.float()[None],
-            seen_root[None], seen[None], torch.tensor([sigma_root]), sigma.float()[None],
-        )  # fmt: skip
+            motion.root_position.float()[None],
+            motion.local_quat_xyzw[:, 0].float()[None],
+            joints.float()[None],
+            seen_root[None],
+            seen[None],
+            torch.tensor([sigma_root]),
+            sigma.float()[None],
+        )
 
     def slice(self, start: int, stop: int) -> "Capture":
         """Frames start to stop."""
         part = slice(start, stop)
-        return Capture(self.root[:, part], self.hips[:, part], self.joints[:, part], self.seen_root[:, part],
-                       self.seen[:, part], self.sigma_root, self.sigma)  # fmt: skip
+        return Capture(
+            self.root[:, part],
+            self.hips[:, part],
+            self.joints[:, part],
+            self.seen_root[:, part],
+            self.seen[:, part],
+            self.sigma_root,
+            self.sigma,
+        )
 
     @cached_property
     def heading(self) -> Float[Tensor, "batch frames"]:

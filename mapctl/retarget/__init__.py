@@ -83,9 +83,14 @@ def settled(rigmap: RigMap) -> Rig:
     pairs = list(zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
     axes = {c: rotations.to_matrix(quat).T.tolist() for c, joint, quat in pairs if joint is not None}
     return replace(
-        rigmap.rig, joints={c: names[joint] for c, joint, _ in pairs if joint is not None}, aliases={}, straighten=(),
-        tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()}, up=rigmap.up, rest="tpose",
-    )  # fmt: skip
+        rigmap.rig,
+        joints={c: names[joint] for c, joint, _ in pairs if joint is not None},
+        aliases={},
+        straighten=(),
+        tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()},
+        up=rigmap.up,
+        rest="tpose",
+    )
 
 
 def _with_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
@@ -112,8 +117,20 @@ def _by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap
 
 def _map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
     measured = bone_offsets.measure(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw)
-    return RigMap(found.rig, skeleton, found.joint_of, tpose.quat_xyzw, measured, tpose.upright_quat_xyzw,
-                  tpose.idle_quat_xyzw, found, tpose.up, tpose.facing, tpose.rest, tpose.found)  # fmt: skip
+    return RigMap(
+        found.rig,
+        skeleton,
+        found.joint_of,
+        tpose.quat_xyzw,
+        measured,
+        tpose.upright_quat_xyzw,
+        tpose.idle_quat_xyzw,
+        found,
+        tpose.up,
+        tpose.facing,
+        tpose.rest,
+        tpose.found,
+    )
 
 
 def _lies_as_canonical(skeleton: Skeleton) -> bool:
@@ -183,9 +200,13 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
             turn = rotations.multiply(rotations.inverse(above), wanted[joint])
         local.append(turn)
         world.append(turn if above is None else rotations.multiply(above, turn))
-    on_rig = Motion(skeleton, motion.fps, torch.zeros(frames, 3, dtype=torch.float64),
-                    rotations.sign_continuous(torch.stack(local, 1)),
-                    source=original.source if original is not None else None)  # fmt: skip
+    on_rig = Motion(
+        skeleton,
+        motion.fps,
+        torch.zeros(frames, 3, dtype=torch.float64),
+        rotations.sign_continuous(torch.stack(local, 1)),
+        source=original.source if original is not None else None,
+    )
     return _place_hips(on_rig, rigmap, hips, original if kept else None)
 
 

@@ -41,8 +41,11 @@ def measure(
         spots.append(known[c] if c in known else _put(c, joint_of, spots, known, ends))
     places = torch.stack(spots)
     offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
-    tips = {CANONICAL.names[c]: _triple(ends[j]) for c, j in enumerate(joint_of)
-            if j is not None and j in ends and not CANONICAL.children(c)}  # fmt: skip
+    tips = {
+        CANONICAL.names[c]: _triple(ends[j])
+        for c, j in enumerate(joint_of)
+        if j is not None and j in ends and not CANONICAL.children(c)
+    }
     return Skeleton(CANONICAL.names, CANONICAL.parents, offsets, tips)
 
 

@@ -126,9 +126,7 @@ def _ankle(toe_height: Float[Tensor, "2"], leveled: Skeleton) -> Float[Tensor, "
     return (toe_height - leveled.offsets[_TOES, 1]).mean()
 
 
-def _ankle_places(
-    own: Motion, moved: Motion, giver: Stance, body: Stance, scale: float
-) -> Float[Tensor, "frames 2 3"]:  # fmt: skip
+def _ankle_places(own: Motion, moved: Motion, giver: Stance, body: Stance, scale: float) -> Float[Tensor, "frames 2 3"]:
     """Where ankles are to be: with the toe joints as the giver's in scale, over their own rest heights, and moved over
     the ground to where the body's rotations bring them, by as much throughout a contact. High over the floor rotations
     alone count: a kick is a pose, and no place to be."""
@@ -248,8 +246,9 @@ def _reached(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
     free = torch.zeros(places.shape[:2], dtype=torch.bool)
     free[:, [*_HIPJOINTS, *_SHINS]] = True
     legs = [LIMBS[side + "Foot"] for side in SIDES]
-    local = inverse.solve(places, moved.local_quat_xyzw, moved.skeleton, free=free,
-                                     root_position=moved.root_position, limbs=legs)  # fmt: skip
+    local = inverse.solve(
+        places, moved.local_quat_xyzw, moved.skeleton, free=free, root_position=moved.root_position, limbs=legs
+    )
     turned = replace(moved, local_quat_xyzw=local).joint_rotations().clone()
     turned[:, [*_FEET, *_TOES]] = world[:, [*_FEET, *_TOES]]
     local = rotations.sign_continuous(kinematics.local_from_world(moved.skeleton.parents, turned))
@@ -269,5 +268,7 @@ def _missed(done: Motion, ankles: Float[Tensor, "frames 2 3"]) -> tuple[str, ...
     if float(off.max()) < _SEEN:
         return ()
     frames, worst = int((off > _SEEN).sum()), int(off.argmax())
-    return (f"the legs are too short for some of the way: feet are up to {100 * float(off.max()):.1f} cm off"
-            f" (frame {worst}), by more than {100 * _SEEN:g} cm in {frames} of {len(off)} frames",)  # fmt: skip
+    return (
+        f"the legs are too short for some of the way: feet are up to {100 * float(off.max()):.1f} cm off"
+        f" (frame {worst}), by more than {100 * _SEEN:g} cm in {frames} of {len(off)} frames",
+    )

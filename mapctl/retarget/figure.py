@@ -27,8 +27,10 @@ def stand(rig: Rig) -> Motion:
     """
     missing = [name for name in REQUIRED if name not in rig.joints]
     if missing:
-        raise RequestError(f"rig {rig.name} names no joint for {', '.join(missing)}: a skeleton cannot be made of it; "
-                           "name them, or a clip")  # fmt: skip
+        raise RequestError(
+            f"rig {rig.name} names no joint for {', '.join(missing)}: a skeleton cannot be made of it; "
+            "name them, or a clip"
+        )
     skeleton = _skeleton(rig)
     standing = retarget.from_canonical(_tpose(), retarget.map_rig(skeleton, rig))
     if rig.metres_per_unit is None:

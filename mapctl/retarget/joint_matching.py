@@ -19,13 +19,19 @@ from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
 ACCEPTED = 0.6
 """Score below which a rig is not believed to be understood."""
-REQUIRED = ("hips", "spine", *(side + part for side in ("left", "right") for part in
-            ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg", "Foot")))  # fmt: skip
+REQUIRED = (
+    "hips",
+    "spine",
+    *(side + part for side in ("left", "right") for part in ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg", "Foot")),
+)
 """Canonical joints that a rig must have; the others are put in between or at the end where it lacks them."""
 
 _BY_NAME, _BY_PLACE, _ABSENT, _SWAPPED = 1.0, 0.7, 0.4, 0.9
-_NO_BODY = re.compile(r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
-                      r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust", re.IGNORECASE)  # fmt: skip
+_NO_BODY = re.compile(
+    r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
+    r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -143,8 +149,10 @@ def _by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
             return {}
     found = {"hips": hips}
     inside = _below(skeleton, hips)
-    told = [r if j in inside and not _NO_BODY.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
-            for j, r in enumerate(roles(skeleton))]  # fmt: skip
+    told = [
+        r if j in inside and not _NO_BODY.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
+        for j, r in enumerate(roles(skeleton))
+    ]
     for side in (Side.LEFT, Side.RIGHT):
         found |= _limb_by_words(told, side)
     arms = [found[name] for name in ("leftUpperArm", "rightUpperArm") if name in found]
@@ -177,8 +185,16 @@ def _limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
         arm, elbow = arm[:1], arm[1:]
     if not arm and shoulder:
         shoulder, arm = shoulder[:-1], shoulder[-1:]  # a shoulder, an elbow and a wrist
-    parts = {"UpperLeg": upper, "LowerLeg": lower, "Foot": foot, "Toes": toes, "Shoulder": shoulder, "UpperArm": arm,
-             "LowerArm": elbow, "Hand": named(Part.HAND)}  # fmt: skip
+    parts = {
+        "UpperLeg": upper,
+        "LowerLeg": lower,
+        "Foot": foot,
+        "Toes": toes,
+        "Shoulder": shoulder,
+        "UpperArm": arm,
+        "LowerArm": elbow,
+        "Hand": named(Part.HAND),
+    }
     return {side.value + part: joints[0] for part, joints in parts.items() if joints}
 
 
@@ -234,5 +250,7 @@ def _check(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
         return
     what = f"no joint for {', '.join(missing)}" if missing else "too few joints are known by name"
     names, rigs = shorten(skeleton.names), ", ".join(rig.name for rig in known())
-    raise RequestError(f"cannot tell this rig: {what} (score {score:.2f}, {ACCEPTED} is needed); "
-                       f"its joints are {names}; known rigs: {rigs}; a TOML file can name its joints")  # fmt: skip
+    raise RequestError(
+        f"cannot tell this rig: {what} (score {score:.2f}, {ACCEPTED} is needed); "
+        f"its joints are {names}; known rigs: {rigs}; a TOML file can name its joints"
+    )

@@ -38,15 +38,17 @@ class Poses:
         """All rotations zero."""
         still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
         root = torch.zeros(1, 3, dtype=torch.float64)
-        return Poses(*kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, root, still), skeleton,
-                     tuple(joint_of))  # fmt: skip
+        return Poses(
+            *kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, root, still), skeleton, tuple(joint_of)
+        )
 
     @staticmethod
     def of(motion: Motion, joint_of: JointOf) -> "Poses":
         """Up to SAMPLES frames of a clip, the first among them."""
         picked = torch.linspace(0, motion.num_frames - 1, min(SAMPLES, motion.num_frames)).round().long()
-        return Poses(motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton,
-                     tuple(joint_of))  # fmt: skip
+        return Poses(
+            motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton, tuple(joint_of)
+        )
 
     def first(self) -> "Poses":
         """The first pose alone."""

@@ -72,8 +72,11 @@ def kind(poses: Poses, front: Float[Tensor, "3 3"]) -> str:
 
     `front` turns it to stand upright and face +Z.
     """
-    arms = [(_way(poses, side + part, front), sign) for side, sign in (("left", 1.0), ("right", -1.0))
-            for part in ("UpperArm", "LowerArm")]  # fmt: skip
+    arms = [
+        (_way(poses, side + part, front), sign)
+        for side, sign in (("left", 1.0), ("right", -1.0))
+        for part in ("UpperArm", "LowerArm")
+    ]
     legs = [_way(poses, side + part, front) for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")]
     if any(float(-leg[1]) < math.cos(_STRAIGHT) for leg in legs):
         return "neither"
@@ -165,8 +168,9 @@ def _laid(
             above = rotations.rotation_vector_to_matrix(aim * twists[name]) @ above
         turns.append(above)
     still = [_turn(turn) for turn in turns]
-    joints = [base.turns[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1])
-              for joint in base.joint_of]  # fmt: skip
+    joints = [
+        base.turns[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1]) for joint in base.joint_of
+    ]
     return torch.stack([rotations.multiply(turn, own) for turn, own in zip(still, joints, strict=True)])
 
 
@@ -221,8 +225,13 @@ def _untwisted(base: Poses, front: Tensor, clip: Poses, upright: Tensor | None) 
     put right, from the hips outward.
     """
     pitch, twists = _pitch(clip, upright), {}
-    for name in ("spine", "chest", "neck", "head", *(side + part for side in ("left", "right") for part in
-                 ("Shoulder", "UpperArm", "UpperLeg"))):  # fmt: skip
+    for name in (
+        "spine",
+        "chest",
+        "neck",
+        "head",
+        *(side + part for side in ("left", "right") for part in ("Shoulder", "UpperArm", "UpperLeg")),
+    ):
         quats = _laid(base, front, stands=False, pitch=pitch, twists=twists)
         if clip.has(name):
             hinged = name.endswith(("Arm", "Leg"))
@@ -274,8 +283,12 @@ def _canonical_turns(clip: Poses, name: str, quats: Tensor, upright: Tensor | No
 def _idle(base: Poses) -> Float[Tensor, "rigged 4"]:
     """Local rotations of the base pose."""
     parents, turns = base.skeleton.parents, base.turns[0]
-    return torch.stack([turns[j] if p < 0 else rotations.multiply(rotations.inverse(turns[p]), turns[j])
-                        for j, p in enumerate(parents)])  # fmt: skip
+    return torch.stack(
+        [
+            turns[j] if p < 0 else rotations.multiply(rotations.inverse(turns[p]), turns[j])
+            for j, p in enumerate(parents)
+        ]
+    )
 
 
 def _shortest(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

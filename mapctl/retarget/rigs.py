@@ -72,8 +72,12 @@ class Rig:
 @cache
 def known() -> tuple[Rig, ...]:
     """Every rig in this folder, the canonical one first."""
-    canonical = Rig("canonical", {name: name for name in CANONICAL.names}, rest="tpose",
-                    about="The canonical skeleton: VRM names, a T-pose with all rotations zero.")  # fmt: skip
+    canonical = Rig(
+        "canonical",
+        {name: name for name in CANONICAL.names},
+        rest="tpose",
+        about="The canonical skeleton: VRM names, a T-pose with all rotations zero.",
+    )
     paths = sorted(
         (p for p in files(__package__).joinpath("presets").iterdir() if p.name.endswith(".toml")), key=lambda p: p.name
     )
@@ -101,8 +105,9 @@ def read(name_or_path: str | PathLike[str]) -> Rig:
     from mapctl import formats, retarget
 
     found = retarget.to_canonical(formats.load(path))[1]
-    joints = {c: found.rig_skeleton.names[j] for c, j in zip(CANONICAL.names, found.joint_of, strict=True)
-              if j is not None}  # fmt: skip
+    joints = {
+        c: found.rig_skeleton.names[j] for c, j in zip(CANONICAL.names, found.joint_of, strict=True) if j is not None
+    }
     return replace(found.rig, joints=joints, aliases={})
 
 
@@ -126,11 +131,19 @@ def _rig(table: Mapping[str, Any]) -> Rig:
         raise RequestError("a rig's joints are a table of canonical names and the rig's own")
     names = {canonical: _names(canonical, own) for canonical, own in joints.items()}
     return Rig(
-        table["name"], {canonical: own[0] for canonical, own in names.items()}, table.get("tpose", {}),
-        tuple(table.get("straighten", ())), tuple(table.get("end_sites", ())), table.get("about", ""),
-        {canonical: own[1:] for canonical, own in names.items() if len(own) > 1}, tuple(table.get("also", ())),
-        table.get("up", "auto"), table.get("facing", "auto"), table.get("rest", "auto"), _unit(table.get("unit")),
-    )  # fmt: skip
+        table["name"],
+        {canonical: own[0] for canonical, own in names.items()},
+        table.get("tpose", {}),
+        tuple(table.get("straighten", ())),
+        tuple(table.get("end_sites", ())),
+        table.get("about", ""),
+        {canonical: own[1:] for canonical, own in names.items() if len(own) > 1},
+        tuple(table.get("also", ())),
+        table.get("up", "auto"),
+        table.get("facing", "auto"),
+        table.get("rest", "auto"),
+        _unit(table.get("unit")),
+    )
 
 
 def _names(canonical: str, own: Any) -> tuple[str, ...]:

@@ -89,9 +89,13 @@ class LbfgsResult:
 
 
 def minimise(
-    function: EnergyAndGradient, x: Float[Tensor, "batch n"], *, settings: LbfgsSettings = LbfgsSettings(),
-    meter: Meter | None = None, callback: Callable[[int, Float[Tensor, " batch"]], None] | None = None,
-) -> LbfgsResult:  # fmt: skip
+    function: EnergyAndGradient,
+    x: Float[Tensor, "batch n"],
+    *,
+    settings: LbfgsSettings = LbfgsSettings(),
+    meter: Meter | None = None,
+    callback: Callable[[int, Float[Tensor, " batch"]], None] | None = None,
+) -> LbfgsResult:
     """Minimise a batch of independent problems from `x`, evaluating the whole batch at once.
 
     The meter is asked before every evaluation; each counts the batch. A trial with an energy or gradient that
@@ -131,8 +135,10 @@ def _result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
         energy=x.new_tensor([p.best.energy for p in problems]),
         start_energy=x.new_tensor([p.start_energy for p in problems]),
         gradient_norm=x.new_tensor([p.best.gradient_norm for p in problems]),
-        evaluations=count[:, 0], iterations=count[:, 1], status=tuple(p.status for p in problems),
-    )  # fmt: skip
+        evaluations=count[:, 0],
+        iterations=count[:, 1],
+        status=tuple(p.status for p in problems),
+    )
 
 
 @dataclass(slots=True)

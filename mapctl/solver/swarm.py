@@ -69,10 +69,15 @@ class SwarmResult:
 
 
 def swarm(
-    cost: Cost, *, start: Float[Tensor, " n"], spread: Float[Tensor, " n"] | float,
-    settings: SwarmSettings = SwarmSettings(), bounds: Bounds | None = None, meter: Meter | None = None,
+    cost: Cost,
+    *,
+    start: Float[Tensor, " n"],
+    spread: Float[Tensor, " n"] | float,
+    settings: SwarmSettings = SwarmSettings(),
+    bounds: Bounds | None = None,
+    meter: Meter | None = None,
     generator: torch.Generator,
-) -> SwarmResult:  # fmt: skip
+) -> SwarmResult:
     """Search from `start`, which is the first particle; the others begin at draws around it, all at rest.
 
     `spread` is the standard deviation of the draws, in units of the unknowns. The swarm stops before an
@@ -98,9 +103,15 @@ def swarm(
 
 
 def best_of(
-    cost: Cost, *, start: Float[Tensor, " n"], spread: Float[Tensor, " n"] | float, count: int,
-    bounds: Bounds | None = None, meter: Meter | None = None, generator: torch.Generator,
-) -> SwarmResult:  # fmt: skip
+    cost: Cost,
+    *,
+    start: Float[Tensor, " n"],
+    spread: Float[Tensor, " n"] | float,
+    count: int,
+    bounds: Bounds | None = None,
+    meter: Meter | None = None,
+    generator: torch.Generator,
+) -> SwarmResult:
     """The best of `count` points, evaluated at once: the start and draws around it; fewer on a short budget.
 
     Arguments and errors as in `swarm`, which it is held against.

@@ -65,8 +65,10 @@ class Trial:
         vectors = torch.cat([tilt, LAYOUT.pick(self.features, "joint_rotations")], dim=-1).unflatten(-1, (-1, 3))
         turn = heading_matrix(self.heading)
         matrices = rotations.rotation_vector_to_matrix(vectors)
-        root = torch.stack([self.root_xz_world[..., 0], LAYOUT.pick(self.features, "root_height")[..., 0],
-                            self.root_xz_world[..., 1]], dim=-1)  # fmt: skip
+        root = torch.stack(
+            [self.root_xz_world[..., 0], LAYOUT.pick(self.features, "root_height")[..., 0], self.root_xz_world[..., 1]],
+            dim=-1,
+        )
         relative = kinematics.positions_from_matrices(self.skeleton, matrices)
         return root.unsqueeze(-2) + relative @ turn.transpose(-1, -2)
 

@@ -107,8 +107,9 @@ class _View:
         shown = filled(angles, capture.seen[..., 1:].transpose(1, 2).flatten(0, 1))
         joints = shown.unflatten(0, (batch, _OTHERS)).transpose(1, 2).flatten(2)
         self.angles = torch.cat([capture.tilt, joints], dim=-1)
-        self.angle_doubt = torch.cat([self.doubt[..., :1].expand(batch, frames, 2),
-                                      self.doubt[..., 1:].repeat_interleave(3, dim=-1)], dim=-1)  # fmt: skip
+        self.angle_doubt = torch.cat(
+            [self.doubt[..., :1].expand(batch, frames, 2), self.doubt[..., 1:].repeat_interleave(3, dim=-1)], dim=-1
+        )
         root = filled(capture.root, capture.seen_root)
         self.slow_heading = _smooth(capture.heading[..., None], _SLOW)[..., 0]
         self.slow_root = _smooth(root, _SLOW)
@@ -122,13 +123,22 @@ class _View:
         way = _turned(_rate(self.slow_root), -self.slow_heading)
         level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
         known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
-        return torch.cat([
-            self.angles / _ANGLE, _smooth(self.angles, _SMOOTH) / _ANGLE,
-            self.turn / _ANGLE, _smooth(self.turn, _SMOOTH) / _ANGLE, rate / _PACE,
-            self.off / _PLACE, _smooth(self.off, _SMOOTH) / _PLACE, way[..., ::2] / _PACE,
-            (self.slow_root[..., 1:2] - _HIPS) / _ANGLE,
-            known.to(self.angles), level[:, None].expand(-1, capture.frames, -1),
-        ], dim=-1)  # fmt: skip
+        return torch.cat(
+            [
+                self.angles / _ANGLE,
+                _smooth(self.angles, _SMOOTH) / _ANGLE,
+                self.turn / _ANGLE,
+                _smooth(self.turn, _SMOOTH) / _ANGLE,
+                rate / _PACE,
+                self.off / _PLACE,
+                _smooth(self.off, _SMOOTH) / _PLACE,
+                way[..., ::2] / _PACE,
+                (self.slow_root[..., 1:2] - _HIPS) / _ANGLE,
+                known.to(self.angles),
+                level[:, None].expand(-1, capture.frames, -1),
+            ],
+            dim=-1,
+        )
 
     def changed(self, change: Float[Tensor, "batch frames outputs"]) -> Cleaned:
         """What was seen, smoothed and changed as far as it is in doubt."""

@@ -81,8 +81,10 @@ class Picture(nn.Module):
         )
         self.down_two = nn.ModuleList() if vanilla else nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths)
         outs = tuple(reversed(ins))
-        self.up = nn.ModuleList(nn.ConvTranspose2d(b, b if not vanilla else a, 2, stride=2)
-                                for b, a in zip(reversed(widths), outs, strict=True))  # fmt: skip
+        self.up = nn.ModuleList(
+            nn.ConvTranspose2d(b, b if not vanilla else a, 2, stride=2)
+            for b, a in zip(reversed(widths), outs, strict=True)
+        )
         self.up_two = (
             nn.ModuleList()
             if vanilla

@@ -80,8 +80,12 @@ class LstmGmmDensity:
         fitting = known.held.sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
         weight = self.starts.weight[rows]
-        picked = Starts(self.starts.state.pick(rows), self.starts.speed[rows],
-                        tuple(self.starts.names[i] for i in rows.tolist()), weight / weight.sum())  # fmt: skip
+        picked = Starts(
+            self.starts.state.pick(rows),
+            self.starts.speed[rows],
+            tuple(self.starts.names[i] for i in rows.tolist()),
+            weight / weight.sum(),
+        )
         return replace(self, reference=self.reference.told(full), starts=picked)
 
     def told_as_start(self, start: int) -> "LstmGmmDensity":
@@ -157,8 +161,10 @@ def load(name: str) -> LstmGmmDensity:
     with checkpoints.opened(name, "lstm-gmm", called="density") as (tensors, card):
         starts = Starts(
             LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
-            tensors.pop("starts.speed"), tuple(card.data["starts"]), tensors.pop("starts.weight"),
-        )  # fmt: skip
+            tensors.pop("starts.speed"),
+            tuple(card.data["starts"]),
+            tensors.pop("starts.weight"),
+        )
         Abilities(**card.abilities)
         model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)

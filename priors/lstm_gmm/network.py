@@ -75,8 +75,11 @@ class LstmState:
 
     def repeat(self, count: int) -> "LstmState":
         """A batch of one, `count` times."""
-        return LstmState(self.previous.expand(count, -1), self.hidden.expand(-1, count, -1).contiguous(),
-                         self.cell.expand(-1, count, -1).contiguous())  # fmt: skip
+        return LstmState(
+            self.previous.expand(count, -1),
+            self.hidden.expand(-1, count, -1).contiguous(),
+            self.cell.expand(-1, count, -1).contiguous(),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +96,11 @@ class Mixture:
     """Log odds that the left and right toe are planted."""
 
     def log_prob(
-        self, target: Float[Tensor, "*batch size"], whitening: Float[Tensor, "components continuous continuous"] | None,
+        self,
+        target: Float[Tensor, "*batch size"],
+        whitening: Float[Tensor, "components continuous continuous"] | None,
         blur: Float[Tensor, "components continuous"] | None = None,
-    ) -> Float[Tensor, "*batch"]:  # fmt: skip
+    ) -> Float[Tensor, "*batch"]:
         """Eq. 8 without its sign, plus the contact bits; the target is normalised, its bits are 0 or 1.
 
         `whitening` holds each component's unit lower triangular factor, which leaves volumes as they are; `blur` is
@@ -120,9 +125,13 @@ class LstmGmm(nn.Module):
     blur: Tensor | None
 
     def __init__(
-        self, config: LstmGmmConfig, *, mean: Float[Tensor, " size"], std: Float[Tensor, " size"],
+        self,
+        config: LstmGmmConfig,
+        *,
+        mean: Float[Tensor, " size"],
+        std: Float[Tensor, " size"],
         layout: FeatureLayout = LAYOUT,
-    ):  # fmt: skip
+    ):
         super().__init__()
         self.config, self.layout = config, layout
         self.register_buffer("mean", mean.clone())
@@ -193,9 +202,12 @@ class LstmGmm(nn.Module):
         return LstmState(previous, zero, zero)
 
     def forward(
-        self, inputs: Float[Tensor, "batch frames size"], memory: tuple[Tensor, Tensor], *,
+        self,
+        inputs: Float[Tensor, "batch frames size"],
+        memory: tuple[Tensor, Tensor],
+        *,
         condition: Float[Tensor, "batch told"] | None = None,
-    ) -> tuple[Mixture, tuple[Tensor, Tensor]]:  # fmt: skip
+    ) -> tuple[Mixture, tuple[Tensor, Tensor]]:
         """Mixtures of the frames after each input; inputs normalised, `memory` is (h, C) of both layers.
 
         `condition` is what is known of each window: the level of its noise, in units of NOISE_UNIT, then 1 for each
@@ -220,9 +232,12 @@ class LstmGmm(nn.Module):
         return Mixture(torch.log_softmax(weight, dim=-1), mean + carried.unsqueeze(-2), log_sigma, contact)
 
     def log_prob(
-        self, features: Float[Tensor, "batch frames size"], state: LstmState, *,
+        self,
+        features: Float[Tensor, "batch frames size"],
+        state: LstmState,
+        *,
         inputs: Float[Tensor, "batch frames size"] | None = None,
-    ) -> Float[Tensor, "batch frames"]:  # fmt: skip
+    ) -> Float[Tensor, "batch frames"]:
         """Log density (nats, normalised units) of each frame given those before it (Eq. 5-8).
 
         `inputs` is what the network sees of the frames where that differs from them: the noisy inputs of Eq. 15.
@@ -319,9 +334,13 @@ class LstmGmm(nn.Module):
         return mixture, LstmState(state.previous, hidden, cell)
 
     def _compose(
-        self, mixture: Mixture, component: Int[Tensor, " batch"], noise: Float[Tensor, "batch continuous"],
-        contacts: Bool[Tensor, "batch 2"], mixing: Tensor | None,
-    ) -> tuple[Float[Tensor, "batch size"], Float[Tensor, " batch"]]:  # fmt: skip
+        self,
+        mixture: Mixture,
+        component: Int[Tensor, " batch"],
+        noise: Float[Tensor, "batch continuous"],
+        contacts: Bool[Tensor, "batch 2"],
+        mixing: Tensor | None,
+    ) -> tuple[Float[Tensor, "batch size"], Float[Tensor, " batch"]]:
         """One frame (physical units) of the chosen component and bits, and its log density."""
         row = torch.arange(len(component))
         mean, log_sigma = mixture.mean[row, component], mixture.log_sigma[row, component]

@@ -31,9 +31,8 @@ class BeginningSettings:
 
 
 def likely_state(
-    model: LstmGmm, known: LstmState, features: Float[Tensor, "frames size"],
-    settings: BeginningSettings | None = None,
-) -> LstmState:  # fmt: skip
+    model: LstmGmm, known: LstmState, features: Float[Tensor, "frames size"], settings: BeginningSettings | None = None
+) -> LstmState:
     """A state (batch of one) before `features` (physical units) that makes the first of them likely (Eq. 26).
 
     `known` are states that motion of the data left behind. The frame before the first is taken to be as the first.

@@ -30,8 +30,9 @@ def end_effectors(
     world = trial.joints_world[..., [CANONICAL.index(name) for name in joints], :]
     velocity = torch.diff(world, dim=1) * PRIOR_FPS
     ground = trial.root_xz_world[:, 1:, None]
-    place = torch.stack([world[:, 1:, :, 0] - ground[..., 0], world[:, 1:, :, 1],
-                         world[:, 1:, :, 2] - ground[..., 1]], dim=-1)  # fmt: skip
+    place = torch.stack(
+        [world[:, 1:, :, 0] - ground[..., 0], world[:, 1:, :, 1], world[:, 1:, :, 2] - ground[..., 1]], dim=-1
+    )
     seen = torch.cat([place, velocity], dim=2)
     heading = trial.heading[:, 1:, None].expand(seen.shape[:-1])
     turned = rotations.rotate_ground(seen[..., ::2], -heading)

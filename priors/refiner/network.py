@@ -19,8 +19,20 @@ from priors import checkpoints
 from priors.config import NetworkConfig
 from priors.refiner.end_effectors import channels, end_effectors
 
-END_EFFECTORS = ("hips", "head", "leftLowerArm", "leftHand", "rightLowerArm", "rightHand", "leftLowerLeg", "leftFoot",
-                 "leftToes", "rightLowerLeg", "rightFoot", "rightToes")  # fmt: skip
+END_EFFECTORS = (
+    "hips",
+    "head",
+    "leftLowerArm",
+    "leftHand",
+    "rightLowerArm",
+    "rightHand",
+    "leftLowerLeg",
+    "leftFoot",
+    "leftToes",
+    "rightLowerLeg",
+    "rightFoot",
+    "rightToes",
+)
 """Of the refiner and its critic: the paper's ends of the limbs, and knees, elbows and hips, which tremble too."""
 
 _BIT_LOGIT = 3.0  # log odds that a bit of the input is worth; the network may overrule it
@@ -62,8 +74,12 @@ class RefinerNetwork(nn.Module):
         super().__init__()
         self.config = config
         reach = channels(config.joints)
-        for name, values, width in (("mean", mean, LAYOUT.size), ("std", std, LAYOUT.size),
-                                    ("reach_mean", reach_mean, reach), ("reach_std", reach_std, reach)):  # fmt: skip
+        for name, values, width in (
+            ("mean", mean, LAYOUT.size),
+            ("std", std, LAYOUT.size),
+            ("reach_mean", reach_mean, reach),
+            ("reach_std", reach_std, reach),
+        ):
             self.register_buffer(name, values.expand(width).clone())
         seen = 2 * config.lookahead + 1
         self.first = nn.Conv1d(LAYOUT.size + reach, config.width, seen)

@@ -18,8 +18,9 @@ class Critic(nn.Module):
     reach_mean: Tensor
     reach_std: Tensor
 
-    def __init__(self, joints: Sequence[str], *, width: int, around: int, slow: float, reach_mean: Tensor,
-                 reach_std: Tensor):  # fmt: skip
+    def __init__(
+        self, joints: Sequence[str], *, width: int, around: int, slow: float, reach_mean: Tensor, reach_std: Tensor
+    ):
         """`width` units in the first layer and in each direction of the LSTM; the first layer sees `around` frames on
         either side of its own, and feet's ground speeds under `slow` (m/s) magnified, unless that is 0.
         """

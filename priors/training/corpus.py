@@ -53,8 +53,11 @@ class Corpus:
 
     def identity(self) -> dict[str, str]:
         """What tells this corpus from others: its size, and short hashes of names, lengths and features."""
-        hashed = {"clip names": repr(self.names).encode(), "clip lengths": repr(self.lengths).encode(),
-                  "features": self.features.contiguous().numpy().tobytes()}  # fmt: skip
+        hashed = {
+            "clip names": repr(self.names).encode(),
+            "clip lengths": repr(self.lengths).encode(),
+            "features": self.features.contiguous().numpy().tobytes(),
+        }
         size = {"clips": str(len(self.names)), "frames": str(len(self.features))}
         return size | {name: sha256(content).hexdigest()[:12] for name, content in hashed.items()}
 
@@ -65,8 +68,11 @@ class Corpus:
     def subset(self, picked: Iterable[int]) -> "Corpus":
         """The corpus of some clips."""
         picked, clips = list(picked), self.clips()
-        return Corpus(tuple(self.names[i] for i in picked), tuple(self.lengths[i] for i in picked),
-                      torch.cat([clips[i] for i in picked]))  # fmt: skip
+        return Corpus(
+            tuple(self.names[i] for i in picked),
+            tuple(self.lengths[i] for i in picked),
+            torch.cat([clips[i] for i in picked]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +118,11 @@ def _split_by_frames(corpus: Corpus) -> Split:
         )
     clips = corpus.clips()
     kept = [number for number, length in enumerate(lengths) if length > 1]
-    train = Corpus(tuple(corpus.names[i] for i in kept), tuple(lengths[i] for i in kept),
-                   torch.cat([clips[i][: lengths[i]] for i in kept]))  # fmt: skip
+    train = Corpus(
+        tuple(corpus.names[i] for i in kept),
+        tuple(lengths[i] for i in kept),
+        torch.cat([clips[i][: lengths[i]] for i in kept]),
+    )
     # Whoever looks for clips by their names shall not take the clip that was trained on for one that was not.
     end = Corpus((f"{corpus.names[at]}[{lengths[at]}:{longest}]",), (held,), clips[at][lengths[at] :])
     return Split(train, end, end)
@@ -231,8 +240,12 @@ def _read_cache(stored: Path) -> Corpus | None:
     try:
         with safe_open(stored, framework="pt") as file:
             index = json.loads(file.metadata()["index"])
-            corpus = Corpus(tuple(index["names"]), tuple(index["lengths"]), file.get_tensor("features"),
-                            tuple(Skipped(*row) for row in index["skipped"]))  # fmt: skip
+            corpus = Corpus(
+                tuple(index["names"]),
+                tuple(index["lengths"]),
+                file.get_tensor("features"),
+                tuple(Skipped(*row) for row in index["skipped"]),
+            )
     except (OSError, SafetensorError, ValueError, KeyError, TypeError):
         return None
     whole = len(corpus.names) == len(corpus.lengths) and sum(corpus.lengths) == len(corpus.features)
@@ -240,6 +253,11 @@ def _read_cache(stored: Path) -> Corpus | None:
 
 
 def _write_cache(corpus: Corpus, stored: Path) -> None:
-    index = json.dumps({"names": corpus.names, "lengths": corpus.lengths,
-                        "skipped": [(file.name, file.reason) for file in corpus.skipped]})  # fmt: skip
+    index = json.dumps(
+        {
+            "names": corpus.names,
+            "lengths": corpus.lengths,
+            "skipped": [(file.name, file.reason) for file in corpus.skipped],
+        }
+    )
     write_tensors(stored, {"features": corpus.features}, metadata={"index": index})

@@ -44,8 +44,9 @@ def gather(source: Source, *, progress: Progress, warn: Progress) -> tuple[Corpu
         if done % 200 == 0 or done == total:
             progress(f"read {done} of {total} clips")
 
-    corpus = read(source.data, match=source.match, cache=source.run / "cache", skip_first=source.skip_first,
-                  progress=news)  # fmt: skip
+    corpus = read(
+        source.data, match=source.match, cache=source.run / "cache", skip_first=source.skip_first, progress=news
+    )
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_listed(corpus.skipped, source.data)}")
     parts = split(corpus, source.seed)

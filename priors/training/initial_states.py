@@ -18,15 +18,20 @@ def choose(model: LstmGmm, corpus: Corpus, *, count: int, generator: torch.Gener
     clips = [i for i, length in enumerate(corpus.lengths) if length > _WARM_UP + _SECOND]
     features = corpus.clips()
     shuffled = [clips[i] for i in torch.randperm(len(clips), generator=generator).tolist()]
-    ends = [_WARM_UP + int(torch.randint(len(features[i]) - _WARM_UP - _SECOND // 2, (1,), generator=generator))
-            for i in shuffled]  # fmt: skip
+    ends = [
+        _WARM_UP + int(torch.randint(len(features[i]) - _WARM_UP - _SECOND // 2, (1,), generator=generator))
+        for i in shuffled
+    ]
     speeds = torch.stack(
         [ground_speed(features[i][end - _SECOND : end]).mean() for i, end in zip(shuffled, ends, strict=True)]
     )
     picked = _spread(speeds, count)
     states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]
-    state = LstmState(torch.cat([s.previous for s in states]), torch.cat([s.hidden for s in states], 1),
-                      torch.cat([s.cell for s in states], 1))  # fmt: skip
+    state = LstmState(
+        torch.cat([s.previous for s in states]),
+        torch.cat([s.hidden for s in states], 1),
+        torch.cat([s.cell for s in states], 1),
+    )
     names = tuple(corpus.names[shuffled[k]] for k in picked)
     return Starts(state, speeds[picked], names, _shares(corpus, speeds[picked]))
 
@@ -55,8 +60,12 @@ def _spread(speeds: Tensor, count: int) -> list[int]:
     free = torch.ones(len(speeds), dtype=torch.bool)
     picked = []
     # Half at even quantiles (common speeds), half at even steps of speed (rare ones too).
-    wanted = torch.cat([torch.quantile(speeds, torch.linspace(0.02, 0.98, count - count // 2)),
-                        torch.linspace(float(low), float(high), count // 2)])  # fmt: skip
+    wanted = torch.cat(
+        [
+            torch.quantile(speeds, torch.linspace(0.02, 0.98, count - count // 2)),
+            torch.linspace(float(low), float(high), count // 2),
+        ]
+    )
     for value in wanted[: int(free.sum())]:
         nearest = torch.where(free, (speeds - value).abs(), torch.inf).argmin()
         free[nearest] = False

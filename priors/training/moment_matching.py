@@ -58,9 +58,8 @@ class MatchingSettings:
 
 
 def mismatch(
-    model: LstmGmm, windows: Float[Tensor, "batch frames size"], settings: MatchingSettings,
-    generator: torch.Generator,
-) -> Tensor:  # fmt: skip
+    model: LstmGmm, windows: Float[Tensor, "batch frames size"], settings: MatchingSettings, generator: torch.Generator
+) -> Tensor:
     """How far free runs are from how the windows go on; differentiable in the network's weights.
 
     RequestError for windows too short to hold both.

@@ -43,11 +43,16 @@ class Judge:
         refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
         refined = refiner.refine(self.raw)
         means = _means(list(refined))
-        row = {f"{name}_ratio": means[name] / self.mocap[name]
-               for name in ("contact_speed_cm_s", "jitter_m_s3") if self.mocap[name] > 0}  # fmt: skip
+        row = {
+            f"{name}_ratio": means[name] / self.mocap[name]
+            for name in ("contact_speed_cm_s", "jitter_m_s3")
+            if self.mocap[name] > 0
+        }
         if min(len(refined), len(self.windows)) >= self.settings.fewest_clips:
-            made = [clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
-                    for clip in refined]  # fmt: skip
+            made = [
+                clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
+                for clip in refined
+            ]
             seeded = torch.Generator().manual_seed(0)
             row["told_apart"] = held_out_accuracy(
                 made, self.windows, generator=seeded, settings=self.settings.classifier

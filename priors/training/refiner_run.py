@@ -112,9 +112,14 @@ class _Run:
     """What `loop.go` does to a trainer, its guard and its checkpoints."""
 
     def __init__(
-        self, request: RefinerRequest, trainer: AdversarialTrainer, judge: Judge, data: dict[str, str],
-        skipped: dict[str, dict[str, str]], progress: Progress,
-    ):  # fmt: skip
+        self,
+        request: RefinerRequest,
+        trainer: AdversarialTrainer,
+        judge: Judge,
+        data: dict[str, str],
+        skipped: dict[str, dict[str, str]],
+        progress: Progress,
+    ):
         self.request, self.trainer, self.data, self.progress = request, trainer, data, progress
         self.judge_samples, self.skipped = judge, skipped
         self.curve: list[Row] = []
@@ -161,12 +166,20 @@ class _Run:
         """Write the best refiner in float16 with its card."""
         request, path = self.request, self.request.out / "model.safetensors"
         card = checkpoints.Card(
-            kind="refiner", config=request.config.as_card(), licence=request.licence,
-            data={"density": request.density, "density_config": prior.reference.config.as_card(),
-                  "samples": len(raw.lengths), **self.data, **self.skipped},
+            kind="refiner",
+            config=request.config.as_card(),
+            licence=request.licence,
+            data={
+                "density": request.density,
+                "density_config": prior.reference.config.as_card(),
+                "samples": len(raw.lengths),
+                **self.data,
+                **self.skipped,
+            },
             training={"settings": asdict(request.settings), "curve": self.curve, "command": command(request)},
-            quality=min(self.curve, key=score), **checkpoints.Card.of_layout(),
-        )  # fmt: skip
+            quality=min(self.curve, key=score),
+            **checkpoints.Card.of_layout(),
+        )
         checkpoints.save(self.best, card, path)
         return path
 
@@ -207,8 +220,12 @@ class _Run:
 
     def _index(self) -> dict:
         request = self.request
-        return {"settings": asdict(request.settings), "network": request.config.as_card(), "data": self.data,
-                "curve": self.curve}  # fmt: skip
+        return {
+            "settings": asdict(request.settings),
+            "network": request.config.as_card(),
+            "data": self.data,
+            "curve": self.curve,
+        }
 
     def _load(self) -> None:
         out = self.request.out

@@ -45,8 +45,11 @@ def _recipe(trainer: Trainer, data: Mapping[str, str]) -> dict[str, dict[str, An
 
 
 def _restore(trainer: Trainer, tensors: Mapping[str, torch.Tensor], *, step: int) -> None:
-    trainer.load_state({
-        "model": {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")},
-        "optimiser": run_files.optimiser_state(trainer.optimiser, "optimiser", tensors),
-        "generator": tensors["generator"], "step": int(step),
-    })  # fmt: skip
+    trainer.load_state(
+        {
+            "model": {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")},
+            "optimiser": run_files.optimiser_state(trainer.optimiser, "optimiser", tensors),
+            "generator": tensors["generator"],
+            "step": int(step),
+        }
+    )

@@ -77,12 +77,17 @@ def train(request: TrainRequest, progress: Progress = lambda line: None, *, warn
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-    source = Source(request.data, request.out, request.match, request.skip_first, request.strict_data,
-                    request.settings.seed)  # fmt: skip
+    source = Source(
+        request.data, request.out, request.match, request.skip_first, request.strict_data, request.settings.seed
+    )
     corpus, parts = gather(source, progress=progress, warn=warn)
     trainer = _trainer(request, parts.train, device)
-    data = corpus.identity() | {"match": request.match, "split seed": str(request.settings.seed),
-                                "labels": request.labels, "init": request.init or ""}  # fmt: skip
+    data = corpus.identity() | {
+        "match": request.match,
+        "split seed": str(request.settings.seed),
+        "labels": request.labels,
+        "init": request.init or "",
+    }
     curve = _resume(request, trainer, data, progress)
     loop.go(_Run(request, trainer, parts, curve, data, progress), checkpoint_minutes=request.checkpoint_minutes)
     return export(request, trainer, corpus, parts, curve)
@@ -94,8 +99,14 @@ def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trai
     if request.init is None:
         return Trainer(replace(request.config, labels=known.names), request.settings, corpus, device, labels=known)
     before = density.load(request.init).reference
-    return Trainer(before.config, request.settings, corpus, device, labels=known.renamed(before.config.labels),
-                   init=before.state_dict())  # fmt: skip
+    return Trainer(
+        before.config,
+        request.settings,
+        corpus,
+        device,
+        labels=known.renamed(before.config.labels),
+        init=before.state_dict(),
+    )
 
 
 def export(
@@ -107,30 +118,53 @@ def export(
         model, parts.train, count=request.starts, generator=torch.Generator().manual_seed(request.settings.seed)
     )
     tensors = dict(model.state_dict())
-    tensors |= {"starts.previous": found.state.previous, "starts.hidden": found.state.hidden,
-                "starts.cell": found.state.cell, "starts.speed": found.speed,
-                "starts.weight": found.weight}  # fmt: skip
+    tensors |= {
+        "starts.previous": found.state.previous,
+        "starts.hidden": found.state.hidden,
+        "starts.cell": found.state.cell,
+        "starts.speed": found.speed,
+        "starts.weight": found.weight,
+    }
     path = request.out / "model.safetensors"
     checkpoints.save(tensors, _card(request, model, corpus, parts, curve, found.names), path)
     return path
 
 
 def _card(
-    request: TrainRequest, model: LstmGmm, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve,
+    request: TrainRequest,
+    model: LstmGmm,
+    corpus: corpora.Corpus,
+    parts: corpora.Split,
+    curve: resume.Curve,
     starts: tuple[str, ...],
-) -> checkpoints.Card:  # fmt: skip
-    data = {"clips": len(corpus.names), "frames": len(corpus.features), **of_card(corpus),
-            "match": request.match, "labels": request.labels,
-            "split_seed": request.settings.seed, "starts": list(starts),
-            "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)}}  # fmt: skip
+) -> checkpoints.Card:
+    data = {
+        "clips": len(corpus.names),
+        "frames": len(corpus.features),
+        **of_card(corpus),
+        "match": request.match,
+        "labels": request.labels,
+        "split_seed": request.settings.seed,
+        "starts": list(starts),
+        "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)},
+    }
     training = {"command": command(request), "settings": asdict(request.settings), "curve": curve}
-    quality = {"test_nats_per_frame": validation_nats(model, parts.test),
-               "windows": window_nats(model, (parts.validation, parts.test)), "mocap": _mocap(parts),
-               "data": state_summary(parts.train.features)}  # fmt: skip
+    quality = {
+        "test_nats_per_frame": validation_nats(model, parts.test),
+        "windows": window_nats(model, (parts.validation, parts.test)),
+        "mocap": _mocap(parts),
+        "data": state_summary(parts.train.features),
+    }
     return checkpoints.Card(
-        kind="lstm-gmm", config=model.config.as_card(), licence=request.licence, data=data, training=training,
-        quality=quality, abilities=asdict(abilities(parts.train)), **checkpoints.Card.of_layout(),
-    )  # fmt: skip
+        kind="lstm-gmm",
+        config=model.config.as_card(),
+        licence=request.licence,
+        data=data,
+        training=training,
+        quality=quality,
+        abilities=asdict(abilities(parts.train)),
+        **checkpoints.Card.of_layout(),
+    )
 
 
 def command(request: TrainRequest) -> str:
@@ -157,9 +191,14 @@ class _Run:
     """What `loop.go` does to a trainer, its curve and its checkpoints."""
 
     def __init__(
-        self, request: TrainRequest, trainer: Trainer, parts: corpora.Split, curve: resume.Curve,
-        data: dict[str, str], progress: Progress,
-    ):  # fmt: skip
+        self,
+        request: TrainRequest,
+        trainer: Trainer,
+        parts: corpora.Split,
+        curve: resume.Curve,
+        data: dict[str, str],
+        progress: Progress,
+    ):
         self.request, self.trainer, self.parts, self.curve = request, trainer, parts, curve
         self.data, self.progress = data, progress
         self.losses: list[float] = []  # since the last line of news

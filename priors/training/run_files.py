@@ -71,9 +71,11 @@ def last_step(run: Path) -> int | None:
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, torch.Tensor]:
     """What an optimiser keeps of each weight, flat."""
-    return {f"{prefix}.{number}.{key}": torch.as_tensor(value)
-            for number, entries in optimiser.state_dict()["state"].items()
-            for key, value in entries.items()}  # fmt: skip
+    return {
+        f"{prefix}.{number}.{key}": torch.as_tensor(value)
+        for number, entries in optimiser.state_dict()["state"].items()
+        for key, value in entries.items()
+    }
 
 
 def optimiser_state(

@@ -85,9 +85,12 @@ class Kind(Generic[C, S]):
 
 
 def train(
-    request: WindowRequest[C, S], kind: Kind[C, S], progress: Progress = lambda line: None, *,
+    request: WindowRequest[C, S],
+    kind: Kind[C, S],
+    progress: Progress = lambda line: None,
+    *,
     warn: Progress = lambda line: None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Train to the end of the recipe and write RUN/model.safetensors; returns its path. `warn` is told of files that
     cannot be used.
 
@@ -97,8 +100,9 @@ def train(
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
     run_files.check_begin(request.out, resume=request.resume)
-    source = Source(request.data, request.out, request.match, request.skip_first, request.strict_data,
-                    request.settings.seed)  # fmt: skip
+    source = Source(
+        request.data, request.out, request.match, request.skip_first, request.strict_data, request.settings.seed
+    )
     corpus, parts = gather(source, progress=progress, warn=warn)
     run = _Run(request, kind, corpus, parts, progress)
     loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
@@ -109,9 +113,13 @@ class _Run(Generic[C, S]):
     """What `loop.go` does to a trainer, its curve and its checkpoints."""
 
     def __init__(
-        self, request: WindowRequest[C, S], kind: Kind[C, S], corpus: corpora.Corpus, parts: corpora.Split,
+        self,
+        request: WindowRequest[C, S],
+        kind: Kind[C, S],
+        corpus: corpora.Corpus,
+        parts: corpora.Split,
         progress: Progress,
-    ):  # fmt: skip
+    ):
         self.request, self.kind, self.parts, self.progress = request, kind, parts, progress
         self.data, self.skipped = corpus.identity(), of_card(corpus)
         self.trainer = kind.trainer(request.config, request.settings, parts.train)
@@ -168,14 +176,24 @@ class _Run(Generic[C, S]):
         request, path = self.request, self.request.out / "model.safetensors"
         held = {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
         card = checkpoints.Card(
-            kind=self.kind.name, config=request.config.as_card(), licence=request.licence,
-            data={**self.data, **self.skipped, "match": request.match, "split_seed": request.settings.seed,
-                  "held_out": held},
-            training={"settings": _fields(request.settings), "curve": self.curve,
-                      "command": command(request, self.kind)},
+            kind=self.kind.name,
+            config=request.config.as_card(),
+            licence=request.licence,
+            data={
+                **self.data,
+                **self.skipped,
+                "match": request.match,
+                "split_seed": request.settings.seed,
+                "held_out": held,
+            },
+            training={
+                "settings": _fields(request.settings),
+                "curve": self.curve,
+                "command": command(request, self.kind),
+            },
             quality={"test": self.kind.validate(self.trainer.network, self.parts.test, request.settings)},
             **checkpoints.Card.of_layout(),
-        )  # fmt: skip
+        )
         checkpoints.save(self.trainer.network.state_dict(), card, path)
         return path
 
@@ -198,8 +216,12 @@ class _Run(Generic[C, S]):
     def _recipe(self) -> dict[str, dict]:
         """What must not change between a run's parts, as JSON gives it back."""
         settings = json.loads(json.dumps(_fields(self.request.settings)))
-        return {"settings": settings, "network": self.request.config.as_card(), "data": self.data,
-                "init": {"name": self.request.init}}  # fmt: skip
+        return {
+            "settings": settings,
+            "network": self.request.config.as_card(),
+            "data": self.data,
+            "init": {"name": self.request.init},
+        }
 
 
 def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:

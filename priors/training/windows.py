@@ -36,8 +36,9 @@ class Window:
         """With gaps, in which the guess is slerp's."""
         known = known & self.present[..., None]
         places = slerped(self.places, self.quats, known)
-        return PositionImage.of_world(places, led(self.heading, known), self.contacts, known=known,
-                                      present=self.present, toes=_TOES)  # fmt: skip
+        return PositionImage.of_world(
+            places, led(self.heading, known), self.contacts, known=known, present=self.present, toes=_TOES
+        )
 
 
 class PositionWindows:

@@ -40,9 +40,14 @@ class Show:
     """
 
     def __init__(
-        self, characters: Sequence[LiveCharacter], orders: Sequence[Orders], *, port: int, fastest: float,
+        self,
+        characters: Sequence[LiveCharacter],
+        orders: Sequence[Orders],
+        *,
+        port: int,
+        fastest: float,
         labels: Mapping[str, Sequence[str]],
-    ):  # fmt: skip
+    ):
         """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group."""
         with redirect_stdout(io.StringIO()), only_own_pages():  # viser greets in a box of its own
             self.server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)

@@ -116,8 +116,9 @@ class Panel:
         self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0, disabled=True)
         self.measured = gui.add_checkbox("Measured steps", False)
         self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, _STEP, disabled=True)
-        self.told = {group: gui.add_dropdown(group.capitalize(), [AS_IT_LIKES, *names])
-                     for group, names in bounds.labels.items()}  # fmt: skip
+        self.told = {
+            group: gui.add_dropdown(group.capitalize(), [AS_IT_LIKES, *names]) for group, names in bounds.labels.items()
+        }
         typed = self._deck.typed
         self._on(self.speed, lambda value: typed(speed=value))
         self._on(self.heading, lambda value: typed(heading=value))
@@ -131,12 +132,16 @@ class Panel:
     def _keys(self, gui: viser.GuiApi) -> None:
         deck = self._deck
         keys: tuple[tuple[Any, str, Callable[[], None]], ...] = (
-            ("W", "Faster", lambda: deck.nudge(speed=_FASTER)), ("S", "Slower", lambda: deck.nudge(speed=-_FASTER)),
+            ("W", "Faster", lambda: deck.nudge(speed=_FASTER)),
+            ("S", "Slower", lambda: deck.nudge(speed=-_FASTER)),
             ("A", "Turn left", lambda: deck.nudge(heading=_TURN)),
-            ("D", "Turn right", lambda: deck.nudge(heading=-_TURN)), ("X", "Stand", lambda: deck.order(speed=0.0)),
-            ("B", "Turn round", lambda: deck.nudge(heading=180.0)), ("P", "Pause or go on", deck.toggle_pause),
-            ("R", "Reset", deck.reset), ("G", "Walk the drawn path", deck.walk_path),
-        )  # fmt: skip
+            ("D", "Turn right", lambda: deck.nudge(heading=-_TURN)),
+            ("X", "Stand", lambda: deck.order(speed=0.0)),
+            ("B", "Turn round", lambda: deck.nudge(heading=180.0)),
+            ("P", "Pause or go on", deck.toggle_pause),
+            ("R", "Reset", deck.reset),
+            ("G", "Walk the drawn path", deck.walk_path),
+        )
         for key, label, action in keys:
             _trigger(gui.add_command(label, hotkey=key), action)
 

@@ -22,9 +22,18 @@ _MOST_SHOWN, _MOST_DRAWN = 1500, 200  # points of a path as it is shown, and as 
 
 def add_grid(scene: viser.SceneApi, name: str) -> None:
     """Squares of a metre, every fifth line stronger, as far as the eye goes."""
-    scene.add_grid(name, plane="xz", infinite_grid=True, cell_size=1.0, section_size=5.0, cell_thickness=0.8,
-                   section_thickness=1.4, fade_distance=40.0, cell_color=_bytes(colours.GRID),
-                   section_color=_bytes(colours.GRID))  # fmt: skip
+    scene.add_grid(
+        name,
+        plane="xz",
+        infinite_grid=True,
+        cell_size=1.0,
+        section_size=5.0,
+        cell_thickness=0.8,
+        section_thickness=1.4,
+        fade_distance=40.0,
+        cell_color=_bytes(colours.GRID),
+        section_color=_bytes(colours.GRID),
+    )
 
 
 class Marks:
@@ -35,10 +44,18 @@ class Marks:
         self._toes = [skeleton.names.index(side) for side in ("leftToes", "rightToes")]
         vertices, faces = _disc()
         self._feet = [
-            scene.add_mesh_simple(f"{name}/foot{k}", vertices, faces, color=_bytes(colour), opacity=0.6, visible=False,
-                                  side="double", cast_shadow=False)
+            scene.add_mesh_simple(
+                f"{name}/foot{k}",
+                vertices,
+                faces,
+                color=_bytes(colour),
+                opacity=0.6,
+                visible=False,
+                side="double",
+                cast_shadow=False,
+            )
             for k, colour in enumerate((colours.LEFT, colours.RIGHT))
-        ]  # fmt: skip
+        ]
 
     def planted(self, joints: Array, contacts: Array) -> None:
         """A disc below each toe (of joints (joints, 3)) whose contact (2,) is 1."""
@@ -88,8 +105,9 @@ class DrawnPath:
         ]
         if (line := _smooth(self.points)) is not None:
             segments = np.stack([line[:-1], line[1:]], axis=1).astype(np.float32)
-            self._shown.append(self._scene.add_line_segments(f"{self._name}/line", segments, _bytes(colours.WISH),
-                                                             thickness=0.025))  # fmt: skip
+            self._shown.append(
+                self._scene.add_line_segments(f"{self._name}/line", segments, _bytes(colours.WISH), thickness=0.025)
+            )
 
 
 def as_ray(origin: Any, direction: Any) -> Array:

@@ -32,8 +32,9 @@ class Orders:
     def command(self) -> Command:
         """The same for a LiveCharacter."""
         facing = None if self.facing is None else math.radians(self.facing)
-        return Command(self.speed, math.radians(self.heading), facing, step_length=self.step_length,
-                       told=tuple(self.told.values()))  # fmt: skip
+        return Command(
+            self.speed, math.radians(self.heading), facing, step_length=self.step_length, told=tuple(self.told.values())
+        )
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,14 @@ class Bounds:
     def _why(self, name: str, asked: Any, held: Any) -> str | None:
         """The sentence, None where it holds as it was asked."""
         if name == "told":
-            return next((f"{label!r} is not a {group} that this prior knows." for group, label in dict(asked).items()
-                         if held.get(group, AS_IT_LIKES) != label), None)  # fmt: skip
+            return next(
+                (
+                    f"{label!r} is not a {group} that this prior knows."
+                    for group, label in dict(asked).items()
+                    if held.get(group, AS_IT_LIKES) != label
+                ),
+                None,
+            )
         if asked == held:
             return None
         if not _is_number(asked):

@@ -81,6 +81,11 @@ class Gauges:
     def _plot(self, title: str, data: tuple[np.ndarray, ...], names: Sequence[str]) -> viser.GuiUplotHandle:
         series = [uplot.Series(label="s")]
         series += [uplot.Series(label=name, stroke=ink, width=2) for name, ink in zip(names, _INKS, strict=False)]
-        return self._gui.add_uplot(data, tuple(series), title=title, aspect=1.8,
-                                   scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
-                                   legend=uplot.Legend(show=True))  # fmt: skip
+        return self._gui.add_uplot(
+            data,
+            tuple(series),
+            title=title,
+            aspect=1.8,
+            scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
+            legend=uplot.Legend(show=True),
+        )

@@ -51,14 +51,21 @@ def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig 
 
 
 def side_by_side(
-    capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig | None = None,
+    capture: Motion,
+    clean: Motion,
+    path: str | PathLike[str],
+    *,
+    rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Film the capture, grey, and the result beside it."""
     before, after = (retarget.to_canonical(motion, rig)[0] for motion in (capture, clean))
     aside = torch.tensor([_APART, 0.0, 0.0], dtype=torch.float64)
-    film([(after, None), (replace(before, root_position=before.root_position + aside), None, "#999999")], path,
-         progress=progress)  # fmt: skip
+    film(
+        [(after, None), (replace(before, root_position=before.root_position + aside), None, "#999999")],
+        path,
+        progress=progress,
+    )
 
 
 def _angle(motion: Motion, name: str) -> np.ndarray:

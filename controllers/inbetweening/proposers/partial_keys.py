@@ -39,8 +39,12 @@ _ARM_SECONDS, _ARM_CALM = 0.15, 15.0
 what hands and feet of walking people reach."""
 _TRUNK_SECONDS, _TRUNK_CALM = 0.25, 3.0
 """The same of hips and trunk."""
-_ARMS = tuple(joint for name, limb in LIMBS.items() if name.endswith("Hand")
-              for joint in (CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end))  # fmt: skip
+_ARMS = tuple(
+    joint
+    for name, limb in LIMBS.items()
+    if name.endswith("Hand")
+    for joint in (CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end)
+)
 _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
@@ -66,8 +70,7 @@ def propose_through(
     posed = _under_hips(second, gap.motion, hips)
     if targets is None:
         return replace(answer, motion=_go_there(second, posed, hips, blind)), None
-    posed = reach_with_body(posed, targets, turning=gap.turns, moving=gap.root,
-                            stray=torch.full(hips.shape, _STILL))[0]  # fmt: skip
+    posed = reach_with_body(posed, targets, turning=gap.turns, moving=gap.root, stray=torch.full(hips.shape, _STILL))[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
     there = replace(answer, motion=_go_there(second, posed, hips | wanted, blind))
     return there, Targets(reached, targets.wanted)
@@ -109,8 +112,10 @@ def _lead(
     facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
     if targets is not None:
         wanted = targets.wanted.any(dim=1) & blind.root & ~hips
-        root = root + reach_with_body(body, targets, turning=blind.turns, moving=blind.root,
-                                      stray=_stray(body, blind.root))[1]  # fmt: skip
+        root = (
+            root
+            + reach_with_body(body, targets, turning=blind.turns, moving=blind.root, stray=_stray(body, blind.root))[1]
+        )
         places = _through(root, knots | wanted, gap.seconds)
         facing = facing + torch.where(knots, 0.0, _turned_by(body.root_position, places, float(body.fps)))
         knots = knots | wanted

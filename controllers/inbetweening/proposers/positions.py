@@ -43,16 +43,21 @@ def proposed(
         known = known | targets.wanted
     stands = contacts.planted(places[:, list(_TOES)], PRIOR_FPS).float()
     image = PositionImage.of_world(
-        places.float()[None], heading(shown.local_quat_xyzw[:, 0]).float()[None], stands[None],
-        known=known[None], present=torch.ones(1, len(places), dtype=torch.bool), toes=_TOES,
-    )  # fmt: skip
+        places.float()[None],
+        heading(shown.local_quat_xyzw[:, 0]).float()[None],
+        stands[None],
+        known=known[None],
+        present=torch.ones(1, len(places), dtype=torch.bool),
+        toes=_TOES,
+    )
     answer = infiller.propose(image)
     wanted = image.to_world(_without_tremble(answer.places, image))[0].double()
     if held:
         wanted = wanted - _slow_way_off(wanted[:, 0] - body.root_position, gap.root)[:, None]
     root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
-    quats = inverse.solve(wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root,
-                                     limbs=_limbs(gap.turns))  # fmt: skip
+    quats = inverse.solve(
+        wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root, limbs=_limbs(gap.turns)
+    )
     quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
     quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
     root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
@@ -63,8 +68,9 @@ def proposed(
 
 def _limbs(lost: Bool[Tensor, "frames joints"]) -> list[inverse.Limb]:
     """Arms and legs; how those bend that are known in no frame nothing tells but the proposal."""
-    return [replace(limb, shown=not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all()))
-            for limb in LIMBS.values()]  # fmt: skip
+    return [
+        replace(limb, shown=not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all())) for limb in LIMBS.values()
+    ]
 
 
 def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:

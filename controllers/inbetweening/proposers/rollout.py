@@ -68,16 +68,27 @@ class RolloutSettings:
     A step that would end too early or too late ends in time."""
     longest: int = 180
     """Frames that are rolled at a time; what is longer is left to the given proposal."""
-    method: LatentMethod = field(default_factory=lambda: LatentMethod(
-        rounds=2, lbfgs=LbfgsSettings(max_iterations=24), budget=Budget(evaluations=96),
-        proposal=Swarm(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7))))  # fmt: skip
+    method: LatentMethod = field(
+        default_factory=lambda: LatentMethod(
+            rounds=2,
+            lbfgs=LbfgsSettings(max_iterations=24),
+            budget=Budget(evaluations=96),
+            proposal=Swarm(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
+        )
+    )
     """The swarm and the search after it."""
 
 
 def rolled(
-    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None = None, *,
-    densities: Sequence[Any], generator: torch.Generator, settings: RolloutSettings | None = None,
-) -> Answer:  # fmt: skip
+    gap: CanonicalGap,
+    proposal: Motion,
+    odds: Float[Tensor, "frames 2"],
+    targets: Targets | None = None,
+    *,
+    densities: Sequence[Any],
+    generator: torch.Generator,
+    settings: RolloutSettings | None = None,
+) -> Answer:
     """The proposal with rollouts in those of its gaps in which nothing is known and that have known frames on both
     sides; the log odds of its contacts; and which gaps these are.
 
@@ -220,9 +231,13 @@ class Roller:
 
 
 def extended(
-    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], *, densities: Sequence[Any],
+    gap: CanonicalGap,
+    proposal: Motion,
+    odds: Float[Tensor, "frames 2"],
+    *,
+    densities: Sequence[Any],
     settings: RolloutSettings | None = None,
-) -> Answer:  # fmt: skip
+) -> Answer:
     """The proposal with the likeliest rollout from where it is last known to its end, if nothing is known there; the
     log odds of its contacts; and by which density, if it does not stay as it is.
 
@@ -329,7 +344,6 @@ def _in_time(
     at = at.clamp(0, last)
     low, high = at.floor().long(), at.ceil().long()
     share = (at - low)[:, None]
-    quats = rotations.slerp(made.local_quat_xyzw[low], made.local_quat_xyzw[high],
-                            share.expand(-1, made.num_joints))  # fmt: skip
+    quats = rotations.slerp(made.local_quat_xyzw[low], made.local_quat_xyzw[high], share.expand(-1, made.num_joints))
     root = torch.lerp(made.root_position[low], made.root_position[high], share)
     return replace(made, root_position=root, local_quat_xyzw=quats), stands[at.round().long()]

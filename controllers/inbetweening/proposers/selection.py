@@ -70,10 +70,17 @@ class ChoiceSettings:
     """Metres that they may go in a frame at any rate."""
     haste: float = 8.0
     """Weight of a metre more than that, m/s."""
-    rolling: RolloutSettings = field(default_factory=lambda: RolloutSettings(
-        temperature=0.0, longest=300, trajectory=0.2, stage=45, method=LatentMethod(
-            rounds=2, proposal=zero_start, lbfgs=LbfgsSettings(max_iterations=16),
-            budget=Budget(evaluations=48))))  # fmt: skip
+    rolling: RolloutSettings = field(
+        default_factory=lambda: RolloutSettings(
+            temperature=0.0,
+            longest=300,
+            trajectory=0.2,
+            stage=45,
+            method=LatentMethod(
+                rounds=2, proposal=zero_start, lbfgs=LbfgsSettings(max_iterations=16), budget=Budget(evaluations=48)
+            ),
+        )
+    )
     """Rollouts: the likeliest ones, without a swarm before L-BFGS, which did not lower the cost here."""
 
 
@@ -90,9 +97,14 @@ class _Candidate:
 
 
 def choose_proposals(
-    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None = None, *,
-    densities: Sequence[Any], settings: ChoiceSettings | None = None,
-) -> Answer:  # fmt: skip
+    gap: CanonicalGap,
+    proposal: Motion,
+    odds: Float[Tensor, "frames 2"],
+    targets: Targets | None = None,
+    *,
+    densities: Sequence[Any],
+    settings: ChoiceSettings | None = None,
+) -> Answer:
     """The proposal, an infiller's, but in gaps where another answer costs a viewer less; and who proposed those.
 
     Gaps in which nothing is known, with known frames on both sides, count; one after the other in time.
@@ -121,9 +133,14 @@ def _knows_enough(gap: CanonicalGap, start: int, stop: int, settings: ChoiceSett
 
 
 def _best(
-    gap: CanonicalGap, before: _Candidate, roller: Roller | None, part: tuple[int, int], settings: ChoiceSettings, *,
+    gap: CanonicalGap,
+    before: _Candidate,
+    roller: Roller | None,
+    part: tuple[int, int],
+    settings: ChoiceSettings,
+    *,
     wanted: Targets | None,
-) -> _Candidate:  # fmt: skip
+) -> _Candidate:
     """Of the infiller's answer, standing still, and rollouts of several tempos, the one that costs least."""
     start, stop = part
     first = replace(before, by=INFILLER, cost=viewers_cost(before.body, before.odds, part, settings))

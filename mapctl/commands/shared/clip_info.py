@@ -48,14 +48,23 @@ def outline(path: Path, rig_text: str | None) -> dict[str, Any]:
     joints = {c: None if j is None else names[j] for c, j in zip(CANONICAL.names, rigmap.joint_of, strict=True)}
     found = rigmap.match
     return {
-        "file": str(path), "rig": rigmap.rig.name, "about": rigmap.rig.about,
+        "file": str(path),
+        "rig": rigmap.rig.name,
+        "about": rigmap.rig.about,
         "score": 1.0 if found is None else round(found.score, 3),
         "sides_exchanged": found is not None and found.sides_exchanged,
-        "rest_pose": rigmap.rest, "tpose_from": rigmap.tpose_from, "up": rigmap.up, "facing": rigmap.facing,
-        "metres_per_unit": bvh.unit_of(motion) or 1.0, "num_joints": motion.num_joints, "frames": motion.num_frames,
-        "fps": float(motion.fps), "seconds": motion.seconds, "joints": joints,
+        "rest_pose": rigmap.rest,
+        "tpose_from": rigmap.tpose_from,
+        "up": rigmap.up,
+        "facing": rigmap.facing,
+        "metres_per_unit": bvh.unit_of(motion) or 1.0,
+        "num_joints": motion.num_joints,
+        "frames": motion.num_frames,
+        "fps": float(motion.fps),
+        "seconds": motion.seconds,
+        "joints": joints,
         "unmapped": [] if found is None else list(found.unmapped),
-    }  # fmt: skip
+    }
 
 
 def _unit(metres: float) -> str:

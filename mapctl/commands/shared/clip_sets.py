@@ -87,8 +87,15 @@ class ClipSet:
         if not clips:
             raise RequestError(f"{folder}: no clip can be measured; {next(iter(skipped.values()))}")
         positions, windows = [c.positions for c in clips if with_windows], [c.windows for c in clips if with_windows]
-        return ClipSet(folder, [clip.motion for clip in clips], _means([clip.measures for clip in clips]), positions,
-                       windows, skipped, tuple(note for clip in clips for note in clip.notes))  # fmt: skip
+        return ClipSet(
+            folder,
+            [clip.motion for clip in clips],
+            _means([clip.measures for clip in clips]),
+            positions,
+            windows,
+            skipped,
+            tuple(note for clip in clips for note in clip.notes),
+        )
 
     def diversity(self) -> realism.Diversity:
         """Of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
@@ -107,9 +114,11 @@ def compared_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism
     fewest = SETTINGS.fewest_clips
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
-            raise RequestError(f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in "
-                               f"each folder{_left_out(clips)} (without --reference a folder of any size is "
-                               "measured)")  # fmt: skip
+            raise RequestError(
+                f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in "
+                f"each folder{_left_out(clips)} (without --reference a folder of any size is "
+                "measured)"
+            )
     draws = torch.Generator().manual_seed(seed)
     with bar("telling apart") as progress:
         return realism.realism_of_windows(

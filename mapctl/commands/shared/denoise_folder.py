@@ -69,8 +69,11 @@ def jobs_of(given: "Denoise") -> tuple[list["Job"], int]:
     if given.report is not None:
         outputs.check_folder(given.report)
     inside = given.out.resolve()
-    sources = sorted(path for path in given.source.rglob("*")
-                     if path.suffix.lower() in formats.READERS and inside not in path.resolve().parents)  # fmt: skip
+    sources = sorted(
+        path
+        for path in given.source.rglob("*")
+        if path.suffix.lower() in formats.READERS and inside not in path.resolve().parents
+    )
     if not sources:
         raise RequestError(f"no {' or '.join(formats.READERS)} below {given.source}")
     jobs = [Job(path, given.out / _written(path.relative_to(given.source))) for path in sources]

@@ -66,8 +66,9 @@ class Walk:
 
         card = self.prior.card
         prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
-        return report.build(self.solution, request=request, seed=self.seed, measures=self.measures,
-                            seconds=self.seconds, prior=prior)  # fmt: skip
+        return report.build(
+            self.solution, request=request, seed=self.seed, measures=self.measures, seconds=self.seconds, prior=prior
+        )
 
     def summary(self) -> list[str]:
         """A few lines for people."""
@@ -75,11 +76,7 @@ class Walk:
 
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
         cost = report.timing(self.solution.windows, seconds=self.seconds)
-        motion, speed, planted = (
-            self.solution.motion,
-            self.measures["speed_m_s"],
-            self.measures["planted_share"],
-        )
+        motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
             f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
@@ -92,9 +89,13 @@ class Walk:
 
 
 def walk(
-    prior: "LstmGmmDensity", request: "Follow", *, seed: int, progress: Progress | None = None,
+    prior: "LstmGmmDensity",
+    request: "Follow",
+    *,
+    seed: int,
+    progress: Progress | None = None,
     person: Wearer | None = None,
-) -> Walk:  # fmt: skip
+) -> Walk:
     """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
     import torch
 
@@ -108,10 +109,15 @@ def walk(
     settings = None if person is None else FollowSettings(footing=Footing(rest_height=person.toe_rest_height))
     began = time.perf_counter()
     solution = follow(
-        prior, request.curve, seconds=request.seconds, speed=request.profile,
-        generator=torch.Generator().manual_seed(seed), progress=progress,
-        skeleton=bones, settings=settings,
-    )  # fmt: skip
+        prior,
+        request.curve,
+        seconds=request.seconds,
+        speed=request.profile,
+        generator=torch.Generator().manual_seed(seed),
+        progress=progress,
+        skeleton=bones,
+        settings=settings,
+    )
     return Walk(request, prior, seed, solution, time.perf_counter() - began, person)
 
 

@@ -52,5 +52,10 @@ def report(name: str, command: Any, motion: "Motion", found: dict[str, Any]) -> 
     from mapctl.metrics.comparison import make_comparable
 
     request = {key: value for key, value in options.as_request(name, command).items() if value is not None}
-    return {"mapctl": __version__, "request": request, "versions": reports.versions(), **found,
-            "measures": metrics.measure(make_comparable(motion, options.read_rig(command.rig))[0])}  # fmt: skip
+    return {
+        "mapctl": __version__,
+        "request": request,
+        "versions": reports.versions(),
+        **found,
+        "measures": metrics.measure(make_comparable(motion, options.read_rig(command.rig))[0]),
+    }

@@ -53,8 +53,15 @@ def best(command: "Tween", asked: "Keyed", infiller: Any, settings: "InfillSetti
     from controllers.inbetweening.variations import best_of
 
     with bar("answers", quiet=command.quiet) as progress:
-        return best_of(asked.motion, asked.keys, infiller, command.best_of, settings=settings,
-                       **_drawn(command, asked), progress=progress)  # fmt: skip
+        return best_of(
+            asked.motion,
+            asked.keys,
+            infiller,
+            command.best_of,
+            settings=settings,
+            **_drawn(command, asked),
+            progress=progress,
+        )
 
 
 def run(command: "Tween", asked: "Keyed") -> None:
@@ -73,10 +80,14 @@ def run(command: "Tween", asked: "Keyed") -> None:
         for one, file in zip(found.each, files, strict=True):
             frames = one.infilled.motion.num_frames
             ms = 1000 * one.infilled.seconds / frames
-            print(f"{file}: {frames} frames through {len(asked.keys.frames)} keys; energy {one.energy:.1f} nats a"
-                  f" frame; {ms:.1f} ms a frame")  # fmt: skip
-        print(f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
-              f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips")  # fmt: skip
+            print(
+                f"{file}: {frames} frames through {len(asked.keys.frames)} keys; energy {one.energy:.1f} nats a"
+                f" frame; {ms:.1f} ms a frame"
+            )
+        print(
+            f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
+            f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips"
+        )
         first = found.each[0].infilled
         for note in (*first.notes, *first.gap_notes):
             print(note)
@@ -90,8 +101,15 @@ def _made(command: "Tween", asked: "Keyed") -> "Variations":
     settings = InfillSettings(method="infiller" if command.method == "infiller" else "map")
     infiller = priors.load_infiller(command.infiller or "infiller")
     with bar("variations", quiet=command.quiet) as progress:
-        return variations(asked.motion, asked.keys, infiller, command.variations, settings=settings,
-                          **_drawn(command, asked), progress=progress)  # fmt: skip
+        return variations(
+            asked.motion,
+            asked.keys,
+            infiller,
+            command.variations,
+            settings=settings,
+            **_drawn(command, asked),
+            progress=progress,
+        )
 
 
 def _drawn(command: "Tween", asked: "Keyed") -> dict[str, Any]:
@@ -100,8 +118,12 @@ def _drawn(command: "Tween", asked: "Keyed") -> dict[str, Any]:
 
     import priors
 
-    return {"rollable": priors.load_choice(command.prior or "auto"), "densities": priors.load_choice(command.prior),
-            "generator": torch.Generator().manual_seed(command.seed), "rig": asked.rig}  # fmt: skip
+    return {
+        "rollable": priors.load_choice(command.prior or "auto"),
+        "densities": priors.load_choice(command.prior),
+        "generator": torch.Generator().manual_seed(command.seed),
+        "rig": asked.rig,
+    }
 
 
 def _as_report(command: "Tween", asked: "Keyed", found: "Variations", files: list[Path]) -> dict[str, Any]:
@@ -111,8 +133,14 @@ def _as_report(command: "Tween", asked: "Keyed", found: "Variations", files: lis
     for one, file in zip(found.each, files, strict=True):
         made = one.infilled
         told = {"keys": key_errors(made.motion, asked.motion, asked.keys, asked.rig), **made.summary()}
-        rows.append({"file": str(file), "energy_nats": one.energy, "energy": one.ledger.summary(),
-                     **results.report("tween", command, made.motion, told)})  # fmt: skip
+        rows.append(
+            {
+                "file": str(file),
+                "energy_nats": one.energy,
+                "energy": one.ledger.summary(),
+                **results.report("tween", command, made.motion, told),
+            }
+        )
     shared = ("mapctl", "request", "versions")
     own = [{key: value for key, value in row.items() if key not in shared} for row in rows]
     return {**{key: rows[0][key] for key in shared}, "diversity": found.diversity._asdict(), "variations": own}

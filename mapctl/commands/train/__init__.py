@@ -109,11 +109,20 @@ class Train:
         checks.check(self, model="a density", foreign=("architecture",), on_gpu=True)
         config, settings = self._recipe()
         return TrainRequest(
-            data=self.data, out=self.out, match=self.match or "", config=config, settings=settings,
-            resume=self.resume, device=self.device, checkpoint_minutes=self.minutes_between_checkpoints, 
-            licence=self.licence, skip_first=self.skip_first, labels=self.labels, init=self.init,
+            data=self.data,
+            out=self.out,
+            match=self.match or "",
+            config=config,
+            settings=settings,
+            resume=self.resume,
+            device=self.device,
+            checkpoint_minutes=self.minutes_between_checkpoints,
+            licence=self.licence,
+            skip_first=self.skip_first,
+            labels=self.labels,
+            init=self.init,
             strict_data=self.strict_data,
-        )  # fmt: skip
+        )
 
     def _recipe(self) -> tuple["LstmGmmConfig", "TrainingSettings"]:
         from priors.lstm_gmm.network import LstmGmmConfig

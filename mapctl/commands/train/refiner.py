@@ -35,7 +35,14 @@ def request(given: "Train") -> "RefinerRequest":
     config, settings = PAPER if given.paper else (RefinerConfig(), AdversarialSettings())
     recipe = checks.asked(given, "batch", "window", "seed", rounds="steps")
     return RefinerRequest(
-        data=given.data, out=given.out, density=given.density, match=given.match, config=config,
-        settings=replace(settings, bfloat16=given.bfloat16, **recipe), resume=given.resume,
-        checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence, strict_data=given.strict_data,
-    )  # fmt: skip
+        data=given.data,
+        out=given.out,
+        density=given.density,
+        match=given.match,
+        config=config,
+        settings=replace(settings, bfloat16=given.bfloat16, **recipe),
+        resume=given.resume,
+        checkpoint_minutes=given.minutes_between_checkpoints,
+        licence=given.licence,
+        strict_data=given.strict_data,
+    )

@@ -34,11 +34,17 @@ def request(given: "Train") -> Any:
     usual = getattr(_runs(given), f"{given.model.capitalize()}Request")(given.data, given.out)
     recipe = checks.asked(given, "steps", "batch", "window", "seed", "learning_rate")
     return replace(
-        usual, match=given.match or "", config=replace(usual.config, **checks.asked(given, *shape)),
-        settings=replace(usual.settings, bfloat16=given.bfloat16, **recipe), resume=given.resume,
-        checkpoint_minutes=given.minutes_between_checkpoints, licence=given.licence, skip_first=given.skip_first,
-        init=given.init, strict_data=given.strict_data,
-    )  # fmt: skip
+        usual,
+        match=given.match or "",
+        config=replace(usual.config, **checks.asked(given, *shape)),
+        settings=replace(usual.settings, bfloat16=given.bfloat16, **recipe),
+        resume=given.resume,
+        checkpoint_minutes=given.minutes_between_checkpoints,
+        licence=given.licence,
+        skip_first=given.skip_first,
+        init=given.init,
+        strict_data=given.strict_data,
+    )
 
 
 _ARTICLES: dict[str, str] = {"denoiser": "a denoiser", "infiller": "an infiller"}

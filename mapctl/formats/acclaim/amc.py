@@ -22,9 +22,15 @@ from mapctl.formats.frame_rate import FASTEST, SLOWEST
 from mapctl.formats.text import MAX_POSES, NUMBER, decode, finite_number, read_bytes, shorten
 
 _KEYWORDS = (
-    ":fully-specified", ":force-all-joints-be-in-file", ":degrees", ":radians", ":samples-per-second",
-    ":asf-file", ":asf-path", ":frame-range",
-)  # fmt: skip
+    ":fully-specified",
+    ":force-all-joints-be-in-file",
+    ":degrees",
+    ":radians",
+    ":samples-per-second",
+    ":asf-file",
+    ":asf-path",
+    ":frame-range",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +160,8 @@ class _Reader:
             self.used = self.seen
         if self.full and self.seen != self.used:
             bone = self.skeleton.names[min(self.seen ^ self.used)]
-            self.fail(f"not every frame up to {self.number} holds {shorten(bone)}, but the file says it is "
-                      "fully specified", self.line)  # fmt: skip
+            self.fail(
+                f"not every frame up to {self.number} holds {shorten(bone)}, but the file says it is fully specified",
+                self.line,
+            )
         self.values.extend(self.row)

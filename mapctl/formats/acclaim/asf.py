@@ -18,9 +18,7 @@ from mapctl.formats.text import NUMBER, decode, finite_number, read_bytes, short
 
 MAX_BONES = 1000
 """Most bones that are read; a body with fingers has about 60."""
-_SECTIONS = frozenset(
-    (":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin")
-)  # fmt: skip
+_SECTIONS = frozenset((":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin"))
 _IGNORED = frozenset(("id", "bodymass", "cofmass", "limits"))
 _ALLOWED = "name, direction, length, axis, dof, limits or end"
 _AXES = {"x": 0, "y": 1, "z": 2}
@@ -106,8 +104,10 @@ class _Reader:
             ends=np.array([self._end(bone) for bone in kept]),
             axis_quat_xyzw=np.array([bone.axis for bone in kept]),
             channels=tuple(bone.channels for bone in kept),
-            root_position=position, length=self.length, degrees=self.degrees,
-        )  # fmt: skip
+            root_position=position,
+            length=self.length,
+            degrees=self.degrees,
+        )
 
     def _sections(self, text: str) -> dict[str, list[Row]]:
         """Rows by section; words behind a section's name, as in `:name body`, are its first row."""
@@ -208,8 +208,11 @@ class _Reader:
             self.fail(f"expected {_ALLOWED}, got {shorten(words[0])}", line)
 
     def _whole(self, bone: _Bone, line: int) -> _Bone:
-        lacks = [key for key, value in (("name", bone.name or None), ("direction", bone.direction),
-                                        ("length", bone.length)) if value is None]  # fmt: skip
+        lacks = [
+            key
+            for key, value in (("name", bone.name or None), ("direction", bone.direction), ("length", bone.length))
+            if value is None
+        ]
         if lacks:
             self.fail(f"the bone of line {bone.line} has no {' and no '.join(lacks)}", line)
         return bone

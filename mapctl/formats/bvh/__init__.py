@@ -111,11 +111,12 @@ def in_unit(motion: Motion, metres_per_unit: float) -> Motion:
     scale, old = metres_per_unit / motion.source.metres_per_unit, motion.skeleton
     ends = {name: (x * scale, y * scale, z * scale) for name, (x, y, z) in old.end_offsets.items()}
     return replace(
-        motion, skeleton=Skeleton(old.names, old.parents, old.offsets * scale, ends),
+        motion,
+        skeleton=Skeleton(old.names, old.parents, old.offsets * scale, ends),
         root_position=motion.root_position * scale,
         moving_offsets={joint: track * scale for joint, track in motion.moving_offsets.items()},
         source=replace(motion.source, metres_per_unit=metres_per_unit),
-    )  # fmt: skip
+    )
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

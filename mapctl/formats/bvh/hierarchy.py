@@ -159,9 +159,13 @@ class _Reader:
         self.open: list[_Node] = []
         self.renamed: list[str] = []
         self.handlers: dict[str, Callable[[], None]] = {
-            "ROOT": self._root, "JOINT": self._joint, "END": self._end,
-            "OFFSET": self._offset, "CHANNELS": self._channels, "}": self._close,
-        }  # fmt: skip
+            "ROOT": self._root,
+            "JOINT": self._joint,
+            "END": self._end,
+            "OFFSET": self._offset,
+            "CHANNELS": self._channels,
+            "}": self._close,
+        }
 
     def take(self, word: str) -> None:
         handler = self.handlers.get(word.upper())
@@ -179,11 +183,12 @@ class _Reader:
             more = f" and {len(self.renamed) - 3} more" if len(self.renamed) > 3 else ""
             tell(f"{self.scanner.path}: names must be unique, so it reads {', '.join(self.renamed[:3])}{more}")
         return Hierarchy(
-            names=tuple(self.joints), parents=tuple(node.parent for node in self.nodes),
+            names=tuple(self.joints),
+            parents=tuple(node.parent for node in self.nodes),
             offsets=tuple(node.offset or _ORIGIN for node in self.nodes),
             channels=tuple(node.channels or () for node in self.nodes),
             end_offsets={joint: node.offset or _ORIGIN for joint, node in self.ends.items()},
-        )  # fmt: skip
+        )
 
     def _root(self) -> None:
         if self.nodes:

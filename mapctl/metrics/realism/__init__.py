@@ -114,14 +114,21 @@ def realism_of_windows(
     accuracy = held_out_accuracy(made, mocap, generator=ours, settings=settings.classifier, tick=tick)
     basis = Basis.of(torch.cat(list(mocap)), settings.dims)
     points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
-    return Realism(accuracy, floor, frechet_distance(points[0], points[1]), frechet_distance(points[2], points[3]),
-                   made_windows=len(points[0]), mocap_windows=len(points[1]))  # fmt: skip
+    return Realism(
+        accuracy,
+        floor,
+        frechet_distance(points[0], points[1]),
+        frechet_distance(points[2], points[3]),
+        made_windows=len(points[0]),
+        mocap_windows=len(points[1]),
+    )
 
 
 def _check_counts(made: int, mocap: int, settings: RealismSettings) -> None:
     if min(made, mocap) < settings.fewest_clips:
-        raise RequestError(f"realism needs at least {settings.fewest_clips} clips of each, made and mocap; "
-                           f"got {made} and {mocap}")  # fmt: skip
+        raise RequestError(
+            f"realism needs at least {settings.fewest_clips} clips of each, made and mocap; got {made} and {mocap}"
+        )
 
 
 def _windows_of(clips: Sequence[Motion], name: str, settings: WindowSettings) -> list[Tensor]:

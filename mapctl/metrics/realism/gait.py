@@ -74,8 +74,11 @@ def _clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor, "piece
     }
     speeds = [body.ground_speed(piece, fps) for piece in hips[: count * frames].split(frames)] if count else []
     means = {name: values[: count * frames].reshape(count, frames).nanmean(1) for name, values in by_frame.items()}
-    return {"step_length_cm": means["step_length_cm"], "speed_m_s": hips.new_tensor(speeds),
-            "turning_deg_s": means["turning_deg_s"]}  # fmt: skip
+    return {
+        "step_length_cm": means["step_length_cm"],
+        "speed_m_s": hips.new_tensor(speeds),
+        "turning_deg_s": means["turning_deg_s"],
+    }
 
 
 def step_lengths(

@@ -173,14 +173,7 @@ def lstm_cell_pullback(above, carry, d_cell, gates, before, tanh_cell, d_gates):
             gates[b, 2 * width : 3 * width],
             gates[b, 3 * width :],
         )
-        up, later, dc, old, squashed, d = (
-            above[b],
-            carry[b, width:],
-            d_cell[b],
-            before[b],
-            tanh_cell[b],
-            d_gates[b],
-        )
+        up, later, dc, old, squashed, d = (above[b], carry[b, width:], d_cell[b], before[b], tanh_cell[b], d_gates[b])
         for u in range(width):
             d[3 * width + u] = (up[u] + later[u]) * squashed[u] * o[u] * (_ONE - o[u])
         for u in range(width):
@@ -198,10 +191,7 @@ def lstm_cell_pullback(above, carry, d_cell, gates, before, tanh_cell, d_gates):
 @_inner
 def choose(settings, count, head, uniform, source):
     """Component and contact bits of one particle from the head's weight and contact rows."""
-    weights, bits = (
-        head[settings.weight : settings.weight + count],
-        head[settings.contact : settings.contact + 2],
-    )
+    weights, bits = (head[settings.weight : settings.weight + count], head[settings.contact : settings.contact + 2])
     best = 0
     for k in range(1, count):
         best = k if weights[k] > weights[best] else best
@@ -267,9 +257,7 @@ def gaussian(settings, head, before, noise, after, mixing):
 
 
 @_inner
-def compose(
-    weights, biases, settings, tape, now, after, noise, choices, t, source, logits, features, density,
-):  # fmt: skip
+def compose(weights, biases, settings, tape, now, after, noise, choices, t, source, logits, features, density):
     """Output layer of one frame: only the chosen component's slice of it is computed."""
     count, size, shared = len(weights.head), settings.continuous, settings.weight
     head, hidden, following = tape.head[now], tape.third[now], tape.frame[after]
@@ -315,9 +303,7 @@ def forward(weights, biases, settings, tape, noise, choices, source, features, d
                 copy(hidden[0], inputs[1], 0)
         affine(weights.fc3, biases.fc3, hidden[1], tape.third[now])
         relu(tape.third[now], width)
-        compose(
-            weights, biases, settings, tape, now, after, noise, choices, t, source, logits, features, density,
-        )  # fmt: skip
+        compose(weights, biases, settings, tape, now, after, noise, choices, t, source, logits, features, density)
 
 
 @_inner
@@ -354,9 +340,20 @@ def compose_pullback(settings, tape, noise, component, t, d_feature, d_density, 
 
 @_entry
 def backward(
-    weights, transposed, nothing, settings, tape, noise, component, d_feature, d_density,
-    d_noise, d_frame, d_input, d_cell,
-):  # fmt: skip
+    weights,
+    transposed,
+    nothing,
+    settings,
+    tape,
+    noise,
+    component,
+    d_feature,
+    d_density,
+    d_noise,
+    d_frame,
+    d_input,
+    d_cell,
+):
     """Pullback of `forward` by back-propagation through time: fills d_noise.
 
     d_frame (batch, Z), d_input (2, batch, 2 W; the hidden state's half) and d_cell (2, batch, W) come in as
@@ -368,9 +365,7 @@ def backward(
     d_gates, d_before = np.zeros((batch, 4 * width), np.float32), np.zeros_like(d_frame)
     d_spread = np.zeros(settings.continuous, np.float32)
     for t in range(noise.shape[1] - 1, -1, -1):
-        compose_pullback(
-            settings, tape, noise, component, t, d_feature, d_density, d_frame, d_noise, d_head, d_spread,
-        )  # fmt: skip
+        compose_pullback(settings, tape, noise, component, t, d_feature, d_density, d_frame, d_noise, d_head, d_spread)
         for b in range(batch):
             k, row = component[b, t], slice(b, b + 1)
             affine_pullback(weights.head[k], transposed.head[k], nothing, d_head[row], d_third[row])
@@ -379,9 +374,14 @@ def backward(
         for layer in (1, 0):
             above = d_above if layer == 1 else d_input[1]
             lstm_cell_pullback(
-                above, d_input[layer], d_cell[layer], tape.gates[t, layer], tape.cell[t, layer],
-                tape.tanh_cell[t, layer], d_gates,
-            )  # fmt: skip
+                above,
+                d_input[layer],
+                d_cell[layer],
+                tape.gates[t, layer],
+                tape.cell[t, layer],
+                tape.tanh_cell[t, layer],
+                d_gates,
+            )
             affine_pullback(weights.lstm[layer], transposed.lstm[layer], nothing, d_gates, d_input[layer])
         relu_pullback(d_input[0], tape.lstm_input[t, 0], width)
         affine_pullback(weights.fc2, transposed.fc2, nothing, d_input[0], d_third)

@@ -120,9 +120,18 @@ def settings_of(model: LstmGmm) -> Settings:
     alone = torch.eye(size).repeat(config.components, 1, 1)
     mixing = np.ascontiguousarray(_numpy(alone if model.mixing is None else model.mixing))
     return Settings(
-        size, rows, 2 * rows, 2 * rows + config.components,
-        np.float32(config.retain), np.float32(config.clamp), low, high, mean, std, mixing,
-    )  # fmt: skip
+        size,
+        rows,
+        2 * rows,
+        2 * rows + config.components,
+        np.float32(config.retain),
+        np.float32(config.clamp),
+        low,
+        high,
+        mean,
+        std,
+        mixing,
+    )
 
 
 def pack(model: LstmGmm) -> tuple[Layers, Layers]:
@@ -197,8 +206,14 @@ def _head_blocks(model: LstmGmm, matrix: Array, columns: int) -> Array:
     rows = padded(size, ROW_STEP)
     height = padded(2 * rows + count + 2, WIDTH_STEP)
     heads = [
-        np.concatenate([_block(m, rows, columns), _block(s, rows, columns), _block(weight, count, columns),
-                        _block(contact, 2, columns)])
+        np.concatenate(
+            [
+                _block(m, rows, columns),
+                _block(s, rows, columns),
+                _block(weight, count, columns),
+                _block(contact, 2, columns),
+            ]
+        )
         for m, s in zip(np.split(mean, count), np.split(log_sigma, count), strict=True)
-    ]  # fmt: skip
+    ]
     return np.stack([_block(head, height, columns) for head in heads])

@@ -89,8 +89,10 @@ class FastRollout:
 
     def _check(self, plan: Plan, noise: Tensor) -> None:
         if plan.component.shape != noise.shape[:2] or plan.contacts.shape != (*noise.shape[:2], 2):
-            raise ValueError(f"the plan is for {tuple(plan.component.shape)} particles and frames, "
-                             f"the noise for {tuple(noise.shape[:2])}")  # fmt: skip
+            raise ValueError(
+                f"the plan is for {tuple(plan.component.shape)} particles and frames, "
+                f"the noise for {tuple(noise.shape[:2])}"
+            )
         if plan.component.amin() < 0 or plan.component.amax() >= self._config.components:
             raise ValueError(f"the plan names a component outside 0 to {self._config.components - 1}")
 
@@ -107,19 +109,14 @@ class FastRollout:
         tape.cell[0] = 0
         tape.cell[0, :, :batch, :width] = _array(state.cell)
         run = _Run(
-            tape, _rows(_array(noise), rows), Choices(*(_rows(part, rows) for part in choices)),
-            np.empty((rows, frames, size), np.float32), np.empty((rows, frames), np.float32),
-        )  # fmt: skip
-        self._kernels.forward(
-            self._weights,
-            self._biases,
-            settings,
             tape,
-            run.noise,
-            run.choices,
-            source,
-            run.features,
-            run.density,
+            _rows(_array(noise), rows),
+            Choices(*(_rows(part, rows) for part in choices)),
+            np.empty((rows, frames, size), np.float32),
+            np.empty((rows, frames), np.float32),
+        )
+        self._kernels.forward(
+            self._weights, self._biases, settings, tape, run.noise, run.choices, source, run.features, run.density
         )
         return run
 
@@ -137,17 +134,22 @@ class FastRollout:
         d_noise, d_frame = np.empty_like(run.noise), np.zeros_like(run.tape.frame[0])
         d_input, d_cell = np.zeros_like(run.tape.lstm_input[0]), np.zeros_like(run.tape.cell[0])
         self._kernels.backward(
-            self._weights, self._transposed, self._no_bias, self._settings, run.tape, run.noise, run.choices.component,
-            _rows(_array(d_features), rows), _rows(_array(d_density), rows),
-            d_noise, d_frame, d_input, d_cell,
-        )  # fmt: skip
-        d_previous = d_frame[:batch, :size] / self._settings.std[:size]
-        return (
-            d_noise[:batch],
-            d_previous,
-            d_input[:, :batch, lanes : lanes + width],
-            d_cell[:, :batch, :width],
+            self._weights,
+            self._transposed,
+            self._no_bias,
+            self._settings,
+            run.tape,
+            run.noise,
+            run.choices.component,
+            _rows(_array(d_features), rows),
+            _rows(_array(d_density), rows),
+            d_noise,
+            d_frame,
+            d_input,
+            d_cell,
         )
+        d_previous = d_frame[:batch, :size] / self._settings.std[:size]
+        return (d_noise[:batch], d_previous, d_input[:, :batch, lanes : lanes + width], d_cell[:, :batch, :width])
 
 
 class _Rollout(torch.autograd.Function):

@@ -56,14 +56,20 @@ class CorruptionSettings:
 LIMBS = tuple(
     tuple(CANONICAL.index(name) for name in names)
     for names in (
-        ("leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand"), ("leftUpperArm", "leftLowerArm", "leftHand"),
+        ("leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand"),
+        ("leftUpperArm", "leftLowerArm", "leftHand"),
         ("rightShoulder", "rightUpperArm", "rightLowerArm", "rightHand"),
-        ("rightUpperArm", "rightLowerArm", "rightHand"), ("leftLowerArm", "leftHand"), ("rightLowerArm", "rightHand"),
-        ("leftUpperLeg", "leftLowerLeg", "leftFoot", "leftToes"), ("leftFoot", "leftToes"),
-        ("rightUpperLeg", "rightLowerLeg", "rightFoot", "rightToes"), ("rightFoot", "rightToes"),
-        ("neck", "head"), ("spine", "chest"),
+        ("rightUpperArm", "rightLowerArm", "rightHand"),
+        ("leftLowerArm", "leftHand"),
+        ("rightLowerArm", "rightHand"),
+        ("leftUpperLeg", "leftLowerLeg", "leftFoot", "leftToes"),
+        ("leftFoot", "leftToes"),
+        ("rightUpperLeg", "rightLowerLeg", "rightFoot", "rightToes"),
+        ("rightFoot", "rightToes"),
+        ("neck", "head"),
+        ("spine", "chest"),
     )
-)  # fmt: skip
+)
 """Joints that are lost together."""
 
 
@@ -75,11 +81,14 @@ def clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
     height = LAYOUT.pick(features, "root_height")
     quats = local_rotations(features, heading)
     return Capture(
-        torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1), quats[..., 0, :],
+        torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
+        quats[..., 0, :],
         LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3)),
-        torch.ones(batch, frames, dtype=torch.bool), torch.ones(batch, frames, _JOINTS, dtype=torch.bool),
-        torch.zeros(batch), torch.zeros(batch, _JOINTS),
-    )  # fmt: skip
+        torch.ones(batch, frames, dtype=torch.bool),
+        torch.ones(batch, frames, _JOINTS, dtype=torch.bool),
+        torch.zeros(batch),
+        torch.zeros(batch, _JOINTS),
+    )
 
 
 def corrupted(clean: Capture, settings: CorruptionSettings, generator: torch.Generator) -> Capture:
@@ -94,10 +103,14 @@ def corrupted(clean: Capture, settings: CorruptionSettings, generator: torch.Gen
     found = spiky & (draw.uniform(batch, frames, _JOINTS) < settings.found)
     error = torch.exp(settings.told * draw.normal(batch, _JOINTS + 1))
     return Capture(
-        clean.root + draw.normal(batch, frames, 3) * sigma_root[:, None, None], quats[:, :, 0],
-        rotations.to_rotation_vector(quats[:, :, 1:]), ~nothing, ~(lost | found | nothing[..., None]),
-        sigma_root * error[:, -1], sigma * error[:, :-1],
-    )  # fmt: skip
+        clean.root + draw.normal(batch, frames, 3) * sigma_root[:, None, None],
+        quats[:, :, 0],
+        rotations.to_rotation_vector(quats[:, :, 1:]),
+        ~nothing,
+        ~(lost | found | nothing[..., None]),
+        sigma_root * error[:, -1],
+        sigma * error[:, :-1],
+    )
 
 
 _MOST_TURNED = 0.6  # radians of noise; more is no noise but another motion
@@ -106,8 +119,9 @@ _MOST_TURNED = 0.6  # radians of noise; more is no noise but another motion
 def _bone_lengths() -> Float[Tensor, " joints"]:
     """From each canonical joint to the next, metres; of the last ones, the bone before."""
     lengths = CANONICAL.offsets.norm(dim=-1).float()
-    return torch.stack([lengths[below[0]] if (below := CANONICAL.children(joint)) else lengths[joint]
-                        for joint in range(_JOINTS)])  # fmt: skip
+    return torch.stack(
+        [lengths[below[0]] if (below := CANONICAL.children(joint)) else lengths[joint] for joint in range(_JOINTS)]
+    )
 
 
 class _Draw:

@@ -67,8 +67,12 @@ class DenoiserTrainer(Trainer[DenoiserNetwork]):
     def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
         """RequestError where no clip is as long as a window."""
         self.settings, self.windows = settings, Windows(corpus, settings)
-        super().__init__(lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16), steps=settings.steps,
-                         learning_rate=settings.learning_rate, seed=settings.seed)  # fmt: skip
+        super().__init__(
+            lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
 
     def losses(self) -> dict[str, Tensor]:
         """Of a batch drawn anew."""
@@ -93,8 +97,12 @@ class Windows:
         settings = self.settings
         groups = torch.multinomial(self.chances, settings.batch, replacement=True, generator=generator)
         shares = torch.rand(settings.batch, generator=generator)
-        picked = torch.stack([self.groups[group][int(share * len(self.groups[group]))]
-                              for group, share in zip(groups.tolist(), shares.tolist(), strict=True)])  # fmt: skip
+        picked = torch.stack(
+            [
+                self.groups[group][int(share * len(self.groups[group]))]
+                for group, share in zip(groups.tolist(), shares.tolist(), strict=True)
+            ]
+        )
         windows = self.corpus.features[picked[:, None] + torch.arange(settings.window)]
         mirrored = torch.rand(settings.batch, generator=generator) < 0.5
         windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows).clone()
@@ -139,10 +147,20 @@ def losses(
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
     turned = (cleaned.angles - angles).abs().mean()
     contacts = cross_entropy(cleaned.contacts.float(), bits)
-    loss = (place + settings.pace * slip.mean() + settings.feet * feet + settings.angles * turned
-            + settings.contacts * contacts)  # fmt: skip
-    return {"loss": loss, "error_cm": place, "feet_cm_frame": feet, "angles_deg": torch.rad2deg(turned),
-            "contacts_nats": contacts}  # fmt: skip
+    loss = (
+        place
+        + settings.pace * slip.mean()
+        + settings.feet * feet
+        + settings.angles * turned
+        + settings.contacts * contacts
+    )
+    return {
+        "loss": loss,
+        "error_cm": place,
+        "feet_cm_frame": feet,
+        "angles_deg": torch.rad2deg(turned),
+        "contacts_nats": contacts,
+    }
 
 
 def joint_positions(cleaned: Cleaned) -> Float[Tensor, "batch frames joints 3"]:

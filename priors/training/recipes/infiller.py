@@ -62,8 +62,12 @@ class InfillerTrainer(Trainer[InfillerNetwork]):
     def __init__(self, config: InfillerConfig, settings: InfillerSettings, corpus: Corpus):
         self.settings = settings
         self.windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
-        super().__init__(lambda: InfillerNetwork(config, bfloat16=settings.bfloat16), steps=settings.steps,
-                         learning_rate=settings.learning_rate, seed=settings.seed)  # fmt: skip
+        super().__init__(
+            lambda: InfillerNetwork(config, bfloat16=settings.bfloat16),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
         mean, std = self.windows.moments()
         self.network.mean.copy_(mean)
         self.network.std.copy_(std.clamp_min(_LEAST_SPREAD))
@@ -101,8 +105,14 @@ def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: In
     contacts = (guessed * unsure).sum() / unsure.sum().clamp_min(1)
     loss = place + settings.pace * pace + settings.feet * feet + settings.contacts * contacts
     error = ((wrong - wrong[..., :1, :]).norm(dim=-1).detach() * lacking).sum() / lacking.sum().clamp_min(1)
-    return {"loss": loss, "place": place, "pace": pace, "feet_cm_frame": feet, "contacts_nats": contacts,
-            "error_cm": error}  # fmt: skip
+    return {
+        "loss": loss,
+        "place": place,
+        "pace": pace,
+        "feet_cm_frame": feet,
+        "contacts_nats": contacts,
+        "error_cm": error,
+    }
 
 
 def _weights(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:

@@ -69,9 +69,19 @@ class TrainingSettings:
 
 PAPER = (
     LstmGmmConfig(width=500, components=5, retain=0.0, correlated=False, knows_noise=False),
-    TrainingSettings(batch=20, window=50, optimiser="rmsprop", schedule="epochs", noise_range=1.0, bit_flips=0.0,
-                     mirror=False, weight_decay=0.0, steps=30_000, matching=MatchingSettings(begin=1.0)),
-)  # fmt: skip
+    TrainingSettings(
+        batch=20,
+        window=50,
+        optimiser="rmsprop",
+        schedule="epochs",
+        noise_range=1.0,
+        bit_flips=0.0,
+        mirror=False,
+        weight_decay=0.0,
+        steps=30_000,
+        matching=MatchingSettings(begin=1.0),
+    ),
+)
 """The variant as the paper prints it (30,000 iterations)."""
 
 
@@ -94,9 +104,15 @@ class Trainer:
     """Model, optimiser and generator, one step at a time."""
 
     def __init__(
-        self, config: LstmGmmConfig, settings: TrainingSettings, corpus: Corpus, device: str = "cpu", *,
-        labels: Labels | None = None, init: Mapping[str, Tensor] | None = None,
-    ):  # fmt: skip
+        self,
+        config: LstmGmmConfig,
+        settings: TrainingSettings,
+        corpus: Corpus,
+        device: str = "cpu",
+        *,
+        labels: Labels | None = None,
+        init: Mapping[str, Tensor] | None = None,
+    ):
         """`labels` of the corpus' clips, the network's own; `init` holds weights and statistics to begin with."""
         self.settings, self.device, self.step = settings, device, 0
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -149,8 +165,13 @@ class Trainer:
 
     def state(self) -> dict:
         """Everything a bit-exact continuation needs; tensors and plain numbers only."""
-        return {"model": self.model.state_dict(), "optimiser": self.optimiser.state_dict(), "step": self.step,
-                "generator": self.generator.get_state(), "settings": asdict(self.settings)}  # fmt: skip
+        return {
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "generator": self.generator.get_state(),
+            "settings": asdict(self.settings),
+        }
 
     def load_state(self, state: dict) -> None:
         """Continue from what `state` gave."""

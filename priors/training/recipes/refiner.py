@@ -90,12 +90,28 @@ class AdversarialSettings:
 
 
 PAPER = (
-    RefinerConfig(width=500, memory=1000, lookahead=0, limit=1e6,
-                  joints=("head", "leftHand", "rightHand", "leftToes", "rightToes")),
-    AdversarialSettings(rounds=2000, optimiser="rmsprop", refiner_rate=2e-3, critic_rate=5e-3, critic_width=500,
-                        head_start=0, critic_updates=1, refiner_updates=5, critic_around=0, critic_slow=0.0,
-                        moments=0.0, average=0.0),
-)  # fmt: skip
+    RefinerConfig(
+        width=500,
+        memory=1000,
+        lookahead=0,
+        limit=1e6,
+        joints=("head", "leftHand", "rightHand", "leftToes", "rightToes"),
+    ),
+    AdversarialSettings(
+        rounds=2000,
+        optimiser="rmsprop",
+        refiner_rate=2e-3,
+        critic_rate=5e-3,
+        critic_width=500,
+        head_start=0,
+        critic_updates=1,
+        refiner_updates=5,
+        critic_around=0,
+        critic_slow=0.0,
+        moments=0.0,
+        average=0.0,
+    ),
+)
 """The variant as the paper prints it; it does not say how long it trained."""
 
 
@@ -131,14 +147,21 @@ class AdversarialTrainer:
             torch.default_generator.manual_seed(settings.seed)
             self.refiner = RefinerNetwork(config, **statistics)
             reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
-            self.critic = Critic(config.joints, width=settings.critic_width, around=settings.critic_around,
-                                 slow=settings.critic_slow, **reach)  # fmt: skip
+            self.critic = Critic(
+                config.joints,
+                width=settings.critic_width,
+                around=settings.critic_around,
+                slow=settings.critic_slow,
+                **reach,
+            )
         self.averaged = deepcopy(self.refiner).requires_grad_(False)
         self.given = settings.window + self.refiner.before + config.lookahead
         self.captured = window_starts(corpus.lengths, settings.window)
         self.sampled = window_starts(raw.lengths, self.given)
-        self.optimisers = [self._optimiser(self.refiner, settings.refiner_rate),
-                           self._optimiser(self.critic, settings.critic_rate)]  # fmt: skip
+        self.optimisers = [
+            self._optimiser(self.refiner, settings.refiner_rate),
+            self._optimiser(self.critic, settings.critic_rate),
+        ]
         with torch.no_grad():
             first = [self.refiner(self._raw())[0] for _ in range(-(-settings.history // settings.batch))]
         self.history = History(torch.cat(first)[: settings.history])
@@ -168,8 +191,11 @@ class AdversarialTrainer:
 
     def state(self) -> dict[str, Tensor]:
         """Everything a bit-exact continuation needs, flat."""
-        tensors = {"generator": self.generator.get_state(), "history": self.history.windows,
-                   "counts": torch.tensor([self.round, self.updates])}  # fmt: skip
+        tensors = {
+            "generator": self.generator.get_state(),
+            "history": self.history.windows,
+            "counts": torch.tensor([self.round, self.updates]),
+        }
         tensors |= {f"averaged.{name}": value for name, value in self.averaged.state_dict().items()}
         for kind, model, optimiser in self._sides():
             tensors |= {f"{kind}.{name}": value for name, value in model.state_dict().items()}
@@ -261,10 +287,12 @@ def _statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str,
     bits = LAYOUT.slices["contacts"]
     mean[bits], std[bits] = 0.5, 0.5
     starts = window_starts(corpus.lengths, window)[:: max(1, window)]
-    reach = torch.cat([
-        end_effectors(features[rows[:, None] + torch.arange(window)], config.joints).flatten(0, 1)
-        for rows in starts.split(512)
-    ])  # fmt: skip
+    reach = torch.cat(
+        [
+            end_effectors(features[rows[:, None] + torch.arange(window)], config.joints).flatten(0, 1)
+            for rows in starts.split(512)
+        ]
+    )
     return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}
 
 
