@@ -12,7 +12,7 @@ from tiny_infiller import save_tiny_infiller
 import mapctl
 from mapctl import retarget
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 GOOD = """
 body = "walk.bvh"
 [[key]]

@@ -15,7 +15,7 @@ import mapctl
 from mapctl import cli, formats
 from mapctl.formats import npz, usd
 
-DOCS = (Path(__file__).parent.parent / "docs" / "formats.md").read_text("utf-8")
+DOCS = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
 OUT = [pytest.param(ending, marks=needs_usd if ending.startswith(".usd") else ()) for ending in formats.WRITERS]
 

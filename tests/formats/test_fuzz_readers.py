@@ -10,7 +10,7 @@ import pytest
 from acclaim import Bone, Pair
 from fuzz_readers import READERS, Specimen, case, main, run_case, specimens
 from hypothesis import given, settings
-from test_asf_amc import assert_same_places
+from test_acclaim import assert_same_places
 from test_bvh_malformed import GOOD
 
 import mapctl

@@ -12,7 +12,7 @@ import pytest
 
 from mapctl import __version__
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 DATA = ("mapctl/rigs/*.toml", "priors/weights/*", "scenes/*.toml", "scenes/data/*")
 LOCAL = shutil.ignore_patterns("__pycache__", ".*")

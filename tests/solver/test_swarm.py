@@ -18,7 +18,7 @@ from mapctl.errors import RequestError
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.swarm import SwarmResult, SwarmSettings, best_of, swarm
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def sphere(x: Tensor) -> Tensor:

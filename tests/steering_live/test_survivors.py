@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import generator
+from test_receding_horizon import BEGUN, METHOD, SHORT, context, solver, terms_of
 from test_steer import AHEAD, QUICK, begun
 from test_terms_contract import trial
-from test_window import BEGUN, METHOD, SHORT, context, solver, terms_of
 
 from controllers.steering import loop, steer
 from controllers.steering.loop import LoopSettings

@@ -9,7 +9,7 @@ import mapctl
 from mapctl.metrics import worst_frame
 from mapctl.skeleton import CANONICAL
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", "rightToes")]
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import generator, moved, tiny_density, walk
-from test_gap_image import shown
+from test_position_image import shown
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infiller
 

@@ -9,10 +9,10 @@ import pytest
 import mapctl
 from mapctl.cli import parse
 
-README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
 
 
-TERMS = (Path(__file__).parent.parent / "docs" / "terms.md").read_text(encoding="utf-8")
+TERMS = (Path(__file__).parents[2] / "docs" / "terms.md").read_text(encoding="utf-8")
 
 
 def run(code: str, tmp_path, monkeypatch) -> dict:

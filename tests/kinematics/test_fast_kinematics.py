@@ -21,7 +21,7 @@ from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.trial import Trial
 
 PAST = 8
-ROOT = FilePath(__file__).resolve().parent.parent
+ROOT = FilePath(__file__).resolve().parents[2]
 CLOSED = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0], [0.0, 0.0]]).double()
 SPIRAL = torch.linspace(0, 6, 600).double()
 CURVES = {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 # `mapctl` is the core; the other three know it and never each other.
 MAY_IMPORT = {
     "mapctl": {"mapctl"},
