@@ -5,8 +5,8 @@ from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.following.follow import FollowSettings, follow
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.infill import InfillSettings, infill
-from controllers.inbetweening.keyframes import Key, Keys
 from controllers.inbetweening.tween import tween
+from mapctl.intent.keyframes import Key, Keys
 
 __all__ = [
     "DenoiseSettings",

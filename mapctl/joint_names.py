@@ -1,23 +1,124 @@
-"""Joints as people name them: by the rig's own or canonical names, in any case; and what may be meant."""
+"""Joints as people name them: side and body part by a name, which joint a name stands for, and what may be meant."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import SequenceMatcher
-from typing import TYPE_CHECKING
+from enum import Enum
+from functools import lru_cache, partial
 
 from mapctl.errors import RequestError
-from mapctl.joint_parts import Part, Role, Side, role
-from mapctl.joint_roles import plain_name
-
-if TYPE_CHECKING:
-    from mapctl.motion import Motion
-    from mapctl.retarget.rigs import Rig
 
 _FEW = 3  # names in a refusal
+
+
+# Beginnings that say which program made the rig rather than what the joint is.
+_PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint|def)[ _-]+)", re.IGNORECASE)
+
+
+class Part(Enum):
+    """A body part; a bone belongs to the part of the joint it starts at."""
+
+    HIPS = "hips"
+    TORSO = "torso"
+    NECK = "neck"
+    HEAD = "head"
+    SHOULDER = "shoulder"
+    UPPER_ARM = "upper arm"
+    LOWER_ARM = "lower arm"
+    HAND = "hand"
+    FINGER = "finger"
+    UPPER_LEG = "upper leg"
+    LOWER_LEG = "lower leg"
+    FOOT = "foot"
+    TOES = "toes"
+    OTHER = "other"
+
+
+class Side(Enum):
+    """Which half of the body."""
+
+    LEFT = "left"
+    RIGHT = "right"
+    MIDDLE = "middle"
+
+
 _LIMBS = (
     {Part.SHOULDER, Part.UPPER_ARM, Part.LOWER_ARM, Part.HAND, Part.FINGER},
     {Part.UPPER_LEG, Part.LOWER_LEG, Part.FOOT, Part.TOES},
     {Part.HIPS, Part.TORSO, Part.NECK, Part.HEAD},
 )
+
+
+@dataclass(frozen=True)
+class Role:
+    """Side and part of one joint."""
+
+    side: Side
+    part: Part
+
+
+# The first pattern that the lower-case name without its side holds decides, so the narrow ones stand first.
+_PARTS = (
+    (r"thumb|index|middle|mid\d|ring\d|ring$|pinky|little|finger", Part.FINGER),
+    (r"toe", Part.TOES),
+    (r"foot|ankle", Part.FOOT),
+    (r"upper_?leg|up_?leg|thigh|femur", Part.UPPER_LEG),
+    (r"lower_?leg|shin|calf|knee|tibia|leg", Part.LOWER_LEG),
+    (r"fore_?arm|lower_?arm|low_?arm|elbow|radius", Part.LOWER_ARM),
+    (r"hand|wrist|palm", Part.HAND),
+    (r"collar|clavicle", Part.SHOULDER),
+    (r"upper_?arm|up_?arm|shldr|humerus|arm", Part.UPPER_ARM),
+    (r"shoulder", Part.SHOULDER),
+    (r"neck", Part.NECK),
+    (r"head|skull", Part.HEAD),
+    (r"hip|pelvis|root|buttock", Part.HIPS),
+    (r"spine|chest|abdomen|torso|back|waist|thorax|belly", Part.TORSO),
+)
+
+
+# Spelled out; alone between separators; before a capital (`lThigh`); before a Latin name (`lfemur`).
+_SIDE = (
+    r"{word}|{title}|{upper}|(?:^|[_.:\- ])[{letter}](?=[_.\- ]|$)|(?:^|:)[{letter}](?=[A-Z])"
+    r"|^{small}(?=femur|tibia|foot|toes|humerus|radius|wrist|hand|fingers|thumb|clavicle|hipjoint)"
+)
+
+
+_SIDES = tuple(
+    (
+        side,
+        re.compile(
+            _SIDE.format(
+                word=word, title=word.title(), upper=word.upper(), letter=word[0] + word[0].upper(), small=word[0]
+            )
+        ),
+    )
+    for side, word in ((Side.LEFT, "left"), (Side.RIGHT, "right"))
+)
+
+
+@lru_cache(maxsize=4096)
+def plain_name(name: str) -> str:
+    """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
+    strip = partial(_PREFIX.sub, "")
+    # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
+    return re.sub(r"[^a-z0-9]", "", (strip(strip(name)) or name).lower())
+
+
+def role(name: str) -> Role:
+    """Side and part of a joint by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
+    for side, pattern in _SIDES:
+        found = pattern.search(name)
+        if found:
+            return Role(side, _part(name[: found.start()] + name[found.end() :]))
+    return Role(Side.MIDDLE, _part(name))
+
+
+def _part(name: str) -> Part:
+    for pattern, part in _PARTS:
+        if re.search(pattern, name.lower()):
+            return part
+    return Part.OTHER
 
 
 def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mapping[str, int]] = dict) -> int | None:
@@ -43,18 +144,6 @@ def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mappin
         if wanted.lower() in lower:
             return lower[wanted.lower()]
     return None
-
-
-def canonical_joints(motion: "Motion", rig: "Rig | None" = None) -> dict[str, int]:
-    """The joint of a motion's rig by canonical name, those that it has; none where the rig cannot be told."""
-    from mapctl.retarget import map_rig
-    from mapctl.skeleton import CANONICAL
-
-    try:
-        joint_of = map_rig(motion.skeleton, rig, motion=motion).joint_of
-    except RequestError:
-        return {}
-    return {name: joint for name, joint in zip(CANONICAL.names, joint_of, strict=True) if joint is not None}
 
 
 def suggest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> list[str]:

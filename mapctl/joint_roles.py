@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
 
 from mapctl.errors import RequestError
+from mapctl.joint_names import Part, Role, Side, plain_name, role, shorten
 from mapctl.skeleton import Skeleton
 
 # Without their side, best guess first: VRM, Bandai Namco, Mixamo, Daz, Biped, Unreal, ASF, SMPL.
@@ -13,9 +13,6 @@ _TOES = ("toes", "toebase", "toe", "toe0", "toejoint", "ball", "toeend", "foot",
 _UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint")
 _HIPS = ("hips", "hip", "pelvis")
 _ROOTS = ("rootjoint", "root")  # of rigs without hips
-
-# Beginnings that say which program made the rig rather than what the joint is.
-_PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint|def)[ _-]+)", re.IGNORECASE)
 
 
 def find_hips(skeleton: Skeleton) -> int:
@@ -37,14 +34,6 @@ def find_feet(skeleton: Skeleton) -> tuple[int, int]:
 def find_upper_legs(skeleton: Skeleton) -> tuple[int, int]:
     """Indices of the left and right upper leg, whose line tells facing; RequestError if there are none."""
     return _find_pair(skeleton, _UPPER_LEGS, "upper leg")
-
-
-@lru_cache(maxsize=4096)
-def plain_name(name: str) -> str:
-    """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
-    strip = partial(_PREFIX.sub, "")
-    # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
-    return re.sub(r"[^a-z0-9]", "", (strip(strip(name)) or name).lower())
 
 
 def _find_pair(skeleton: Skeleton, parts: Sequence[str], role: str) -> tuple[int, int]:
@@ -81,6 +70,21 @@ def _plain_names(skeleton: Skeleton) -> list[str]:
 
 
 def _missing(skeleton: Skeleton, role: str) -> RequestError:
-    from mapctl.joint_names import shorten  # late: it knows rigs' names by this module
-
     return RequestError(f"cannot tell the {role} of this rig by name; its joints are {shorten(skeleton.names)}")
+
+
+def roles(skeleton: Skeleton) -> tuple[Role, ...]:
+    """The role of every joint, settled by what else the rig has.
+
+    Where there are collars, a `shoulder` is the upper arm; without thighs, a hip with a side is one.
+    """
+    found = [role(name) for name in skeleton.names]
+    collars = any(re.search("collar|clavicle", name, re.IGNORECASE) for name in skeleton.names)
+    thighs = any(r.part is Part.UPPER_LEG for r in found)
+    for joint, name in enumerate(skeleton.names):
+        side, part = found[joint].side, found[joint].part
+        if collars and part is Part.SHOULDER and "shoulder" in name.lower():
+            found[joint] = Role(side, Part.UPPER_ARM)
+        if not thighs and part is Part.HIPS and side is not Side.MIDDLE:
+            found[joint] = Role(side, Part.UPPER_LEG)
+    return tuple(found)

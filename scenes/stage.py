@@ -11,7 +11,7 @@ import torch
 from mapctl.contacts import planted
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
-from mapctl.joint_parts import Side
+from mapctl.joint_names import Side
 from mapctl.mesh import colours
 from mapctl.mesh.mannequin import Body
 from mapctl.mesh.primitives import Array, Surface, merge

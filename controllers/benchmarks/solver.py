@@ -16,7 +16,8 @@ from mapctl.curves import Curve
 from mapctl.features import LAYOUT, PRIOR_FPS, ground_speed
 from mapctl.metrics import measure
 from mapctl.metrics.states import state_summary
-from mapctl.problem.latent_noise import Context, Latents
+from mapctl.problem.context import Context
+from mapctl.problem.latent_noise import Latents
 from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.problem.warm_start import BestOf, Swarm

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.keyframes import Keys
 from controllers.inbetweening.proposers.rollout import likeliest, rolled
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import best_of
 from mapctl import metrics
 from mapctl.features import PRIOR_FPS
+from mapctl.intent.keyframes import Keys
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener

@@ -11,7 +11,7 @@ from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command, Limits
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Abilities
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.terms import Footing

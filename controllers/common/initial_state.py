@@ -11,7 +11,8 @@ from torch import Tensor
 from mapctl.curves import Curve
 from mapctl.features import LAYOUT, Place, decode, ground_speed, root_places
 from mapctl.numerics import gaussian
-from mapctl.problem.latent_noise import Context, Latents
+from mapctl.problem.context import Context
+from mapctl.problem.latent_noise import Latents
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import Committed
 from mapctl.rotations import wrap_angle

@@ -19,13 +19,13 @@ from mapctl.features import Place, decode, root_places
 from mapctl.inbetweening.effector_targets import Targets
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import last_seen, next_seen
 from mapctl.problem import density_selection
 from mapctl.problem.density_selection import Choice, Stretch
+from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
 from mapctl.problem.pose_offsets import Guide, Poses
-from mapctl.problem.solution import Ledger
 from mapctl.recording import Capture
-from mapctl.recording.recording import last_seen, next_seen
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, minimise

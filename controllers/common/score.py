@@ -11,8 +11,8 @@ from controllers.common.map_refinement import StandingSettings, rest_height
 from mapctl.features import LAYOUT, PRIOR_FPS, Place, encode, root_places
 from mapctl.motion import Motion
 from mapctl.problem import density_selection
+from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
-from mapctl.problem.solution import Ledger
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Clearance, Likelihood, Seam, Support, Term

@@ -17,7 +17,7 @@ from controllers.denoising.lead_transition import passage
 from controllers.denoising.result import Denoised, joined
 from controllers.denoising.segment import DenoiseSettings, Piece
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Denoiser
 from mapctl.recording.inspection import examine
 from mapctl.recording.masks import Mask, after, by_own_names, masked, part_of, written_back

@@ -12,9 +12,10 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import runs
 from mapctl.problem.density_selection import Stretch
-from mapctl.problem.solution import Ledger
-from mapctl.recording.artefacts import Fault, runs
+from mapctl.problem.ledger import Ledger
+from mapctl.recording.artefacts import Fault
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 

@@ -16,8 +16,8 @@ from controllers.common.character import Stature
 from mapctl.contacts import STEADY, steadied
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place
+from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import Committed, WindowSettings, WindowSolver
-from mapctl.problem.solution import Ledger
 from mapctl.problem.window_solvers import GuidedMethod
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import Closeness, Footing, Noise, Term

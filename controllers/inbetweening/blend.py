@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from controllers.common.feasibility import JERKLESS
+from controllers.inbetweening.feasibility import JERKLESS
 from controllers.inbetweening.keyframes import limb_end
 from controllers.inbetweening.pipeline import Infilled, InfillSettings, fill
 from mapctl import rotations

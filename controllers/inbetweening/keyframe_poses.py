@@ -11,11 +11,12 @@ from pathlib import Path
 
 import torch
 
-from controllers.inbetweening.keyframes import Key, Keys, limb_end
+from controllers.inbetweening.keyframes import limb_end
 from mapctl import formats, rotations
 from mapctl.errors import MapctlError, RequestError
 from mapctl.inbetweening.missing import Lost, straight
 from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey
+from mapctl.intent.keyframes import Key, Keys
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, from_canonical, settled

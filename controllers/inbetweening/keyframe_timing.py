@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from controllers.inbetweening.keyframes import Keys
 from mapctl import rotations
+from mapctl.intent.keyframes import Keys
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.retarget import to_canonical

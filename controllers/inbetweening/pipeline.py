@@ -26,9 +26,9 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import Targets, missed, reached
 from mapctl.inbetweening.missing import Lost, put_back, straight
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.numerics.intervals import runs
+from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Inbetweener
-from mapctl.recording.artefacts import runs
 from mapctl.recording.frequency_bands import upsampled
 from mapctl.retarget import from_canonical, places_on_rig, to_canonical
 from mapctl.retarget.rigs import Rig

@@ -12,9 +12,9 @@ from controllers.common.map_refinement import StandingSettings, stand
 from controllers.inbetweening.canonical_gap import CanonicalGap
 from mapctl.inbetweening.effector_targets import Targets
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.numerics.intervals import runs
+from mapctl.problem.ledger import Ledger
 from mapctl.recording import Capture
-from mapctl.recording.artefacts import runs
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings

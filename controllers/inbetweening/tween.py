@@ -9,12 +9,13 @@ from typing import Any
 
 import torch
 
-from controllers.common import feasibility
-from controllers.inbetweening.keyframes import Key, Keys, lost_between, missed_by, targets_of
+from controllers.inbetweening.feasibility import between_keys
+from controllers.inbetweening.keyframes import lost_between, missed_by, targets_of
 from controllers.inbetweening.pipeline import Infilled, InfillSettings, end_notes, fill
 from controllers.inbetweening.proposers.answers import Another
 from controllers.inbetweening.proposers.selection import choose_proposals
 from mapctl.inbetweening.missing import Lost, straight
+from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import RigMap, settled, to_canonical
@@ -42,7 +43,7 @@ def tween(
     wanted = keys.checked(motion)
     canonical, rigmap, shown = shown_by(wanted, motion, rig)
     lost, targets = lost_between(wanted, motion, rigmap), targets_of(wanted, shown, rigmap)
-    hasty = feasibility.between_keys(shown, canonical, rigmap, lost, targets)
+    hasty = between_keys(shown, canonical, rigmap, lost, targets)
     if another is None and (settings is None or settings.method == "map"):
         another = partial(choose_proposals, densities=rollable)
     done = fill(

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from controllers.common.score import energy_of
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.keyframes import Keys
 from controllers.inbetweening.pipeline import Infilled, InfillSettings
 from controllers.inbetweening.proposers.answers import Answer
 from controllers.inbetweening.proposers.rollout import RolloutSettings, likeliest, rolled
@@ -19,9 +18,10 @@ from controllers.inbetweening.tween import tween
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import Targets
+from mapctl.intent.keyframes import Keys
 from mapctl.metrics.realism import Diversity, sample_diversity
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig

@@ -23,7 +23,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, Wish
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.problem.ledger import Ledger
 from mapctl.rotations import sign_continuous
 
 

@@ -21,9 +21,10 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
 from mapctl.intent.steering import Command, Limits, Wish
 from mapctl.motion import Motion
-from mapctl.problem.latent_noise import Context
+from mapctl.problem.context import Context
+from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import Committed, WindowSettings, WindowSolver
-from mapctl.problem.solution import Ledger, Outcome
+from mapctl.problem.solution import Outcome
 from mapctl.problem.warm_start import BestOf, SteeringKnots
 from mapctl.problem.window_solvers import LatentMethod, Method, SolvedWindow
 from mapctl.skeleton import CANONICAL, Skeleton

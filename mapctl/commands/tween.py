@@ -141,7 +141,8 @@ class Tween:
     def _asked(self, request: "KeyRequest | None") -> "Keyed":
         """The motion that holds the keys, these, and its rig where it is known."""
         from controllers.inbetweening.keyframe_poses import Keyed
-        from controllers.inbetweening.keyframes import Keys, check_limbs
+        from controllers.inbetweening.keyframes import check_limbs
+        from mapctl.intent.keyframes import Keys
 
         rig = options.read_rig(self.rig)
         if request is not None:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.recording.recording import filled, filled_angle, last_seen, next_seen
+from mapctl.numerics.intervals import filled, filled_angle, last_seen, next_seen
 from mapctl.skeleton import CANONICAL
 
 

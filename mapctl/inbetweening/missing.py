@@ -10,8 +10,8 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import filled, last_seen, next_seen
 from mapctl.recording.masks import Mask, hidden
-from mapctl.recording.recording import filled, last_seen, next_seen
 from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL
 

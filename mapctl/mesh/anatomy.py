@@ -8,8 +8,8 @@ import numpy as np
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.joint_parts import Part, Role, Side, roles
-from mapctl.joint_roles import find_hips
+from mapctl.joint_names import Part, Role, Side
+from mapctl.joint_roles import find_hips, roles
 from mapctl.mesh.primitives import Array, frame_along, unit
 from mapctl.motion import Motion
 

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mapctl.joint_parts import Part, Side
+from mapctl.joint_names import Part, Side
 from mapctl.mesh import colours
 from mapctl.mesh.anatomy import Anatomy, Foot
 from mapctl.mesh.primitives import Array, RoundedBoxes, Surface, frame_along

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.metrics.smoothing import slow_part
+from mapctl.numerics.gaussian import slow_part
 from mapctl.rotations import unwrap_angle
 
 TURN_SECONDS = 0.35

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves.curve import Curve
-from mapctl.metrics.smoothing import gaussian_kernel, slow_part
 from mapctl.numerics import gaussian
+from mapctl.numerics.gaussian import gaussian_kernel, slow_part
 
 LOW_PASS_SECONDS = 0.5
 """Standard deviation of the Gaussian that takes natural sway out of the path error."""

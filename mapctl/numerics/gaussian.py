@@ -41,3 +41,16 @@ def convolved(
         channels, side = torch.nn.functional.pad(channels, (side, side), mode="replicate"), 0
     out = torch.nn.functional.conv1d(channels, taps.to(values)[None, None], padding=side)[:, 0].T
     return out.reshape(values.shape)
+
+
+def gaussian_kernel(seconds: float, fps: float) -> Float[Tensor, "taps"]:
+    """Weights that sum to one; `seconds` is the standard deviation."""
+    return kernel(seconds * fps, int(3 * seconds * fps))
+
+
+def slow_part(values: Float[Tensor, "frames"], *, seconds: float, fps: float) -> Float[Tensor, "frames"]:
+    """The smoothed signal, every frame of it: near the ends the weights are those of the frames there are."""
+    kernel = gaussian_kernel(seconds, fps)
+    both = torch.stack([values, torch.ones_like(values)], dim=-1)
+    summed, weight = convolved(both, kernel, "nothing").unbind(dim=-1)
+    return summed / weight

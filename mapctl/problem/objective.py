@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.problem.solution import Ledger, LedgerEntry
+from mapctl.problem.ledger import Ledger, LedgerEntry
 from mapctl.terms.base import Term
 from mapctl.terms.trial import Trial
 

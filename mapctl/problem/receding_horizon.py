@@ -15,8 +15,9 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, Place, root_places
-from mapctl.problem.latent_noise import Context
-from mapctl.problem.solution import Ledger, Outcome, WindowRecord
+from mapctl.problem.context import Context
+from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import Outcome, WindowRecord
 from mapctl.problem.window_solvers import LatentMethod, Method
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton

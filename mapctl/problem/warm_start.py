@@ -13,7 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.latent_noise import Context, Latents
+from mapctl.problem.context import Context
+from mapctl.problem.latent_noise import Latents
 from mapctl.problem.objective import Objective
 from mapctl.solver.budget import Meter
 from mapctl.solver.swarm import SwarmSettings, best_of, swarm

@@ -10,9 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.latent_noise import Context, Latents, States
+from mapctl.problem.context import Context
+from mapctl.problem.feature_states import States
+from mapctl.problem.latent_noise import Latents
+from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
-from mapctl.problem.solution import Ledger
 from mapctl.problem.warm_start import Proposal, zero_start
 from mapctl.protocols import Plan
 from mapctl.solver.budget import Budget, Meter

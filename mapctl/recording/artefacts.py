@@ -1,11 +1,13 @@
 """What was wrong with a recording, as a list that a person can read."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from mapctl.numerics.intervals import runs
 
 NOISE_DEG, NOISE_CM = 0.5, 0.2
 """Noise below this is not worth a line: optical capture has as much."""
@@ -85,12 +87,3 @@ def feet(
         for foot, start, stop in runs(floats)
         if stop - start >= _SHORTEST
     ]
-
-
-def runs(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, int, int]]:
-    """Column, first frame and one past the last of each run of true, column by column."""
-    edge = torch.zeros(1, mask.shape[1], dtype=torch.int8)
-    change = torch.diff(mask.to(torch.int8), dim=0, prepend=edge, append=edge).T
-    starts, stops = (change == 1).nonzero(), (change == -1).nonzero()
-    for (column, start), (_, stop) in zip(starts.tolist(), stops.tolist(), strict=True):
-        yield column, start, stop

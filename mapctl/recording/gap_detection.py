@@ -6,7 +6,7 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.recording.artefacts import runs
+from mapctl.numerics.intervals import runs
 from mapctl.recording.inspection import examine
 from mapctl.recording.masks import ALL, ROOT, Mask
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import filled, last_seen
 from mapctl.recording.masks import Mask, masked, traveller
 from mapctl.recording.noise_estimation import angle_noise, place_noise
-from mapctl.recording.recording import filled, last_seen
 from mapctl.recording.spike_detection import angle_spikes, place_spikes
 
 _FROZEN_SECONDS = 0.1  # that a joint which moves otherwise does not move at all

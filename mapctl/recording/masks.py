@@ -12,10 +12,11 @@ from torch import Tensor
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.missing import Missing
 from mapctl.formats.text import read_table, shorten
-from mapctl.joint_names import canonical_joints, find_joint, nearest
-from mapctl.joint_parts import roles
+from mapctl.joint_names import find_joint, nearest
+from mapctl.joint_roles import roles
 from mapctl.motion import Motion
-from mapctl.recording.artefacts import runs
+from mapctl.numerics.intervals import runs
+from mapctl.retarget import canonical_joints
 from mapctl.retarget.rigs import Rig
 
 _COLUMNS = ("joint", "start", "stop")

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import filled, filled_angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,33 +81,3 @@ def _continuous_vectors(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor
     """Rotation vectors without the jump at a half turn, short ones in most frames, if the signs are continuous."""
     sign = torch.where(quats[..., 3].mean(dim=0, keepdim=True) < 0, -1.0, 1.0)
     return rotations.to_long_rotation_vector(quats * sign[..., None])
-
-
-def filled(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
-    """Frames that were not seen, straight between those around them; beyond the first and last seen, as these are."""
-    before, after = last_seen(seen), next_seen(seen)
-    start = torch.take_along_dim(values, before[..., None], dim=1)
-    stop = torch.take_along_dim(values, after[..., None], dim=1)
-    frame = torch.arange(values.shape[1], device=values.device)
-    weight = ((frame - before).to(values) / (after - before).clamp_min(1)).clamp(0, 1)
-    return torch.lerp(start, stop, weight[..., None])
-
-
-def filled_angle(angle: Float[Tensor, "batch frames"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
-    """Angles, radians, not wrapped; frames that were not seen are `filled` the short way round."""
-    # Unseen frames may show anything: whole turns are counted from one seen frame to the next.
-    held = torch.take_along_dim(angle, last_seen(seen), dim=1)
-    return filled(rotations.unwrap_angle(held)[..., None], seen)[..., 0]
-
-
-def last_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
-    """For each frame the last one at or before it that was seen; before the first of them, that one."""
-    frame = torch.arange(seen.shape[1], device=seen.device)
-    last = torch.where(seen, frame, -1).cummax(dim=1).values
-    first = torch.where(seen.any(dim=1), seen.to(torch.uint8).argmax(dim=1), 0)
-    return torch.where(last < 0, first[:, None], last)
-
-
-def next_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
-    """For each frame the first one at or after it that was seen; after the last of them, that one."""
-    return seen.shape[1] - 1 - last_seen(seen.flip(1)).flip(1)

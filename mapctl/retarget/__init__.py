@@ -286,3 +286,12 @@ def _shortest_turn(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float
         return rotations.rotation_vector_to_matrix(axis / axis.norm() * torch.pi)
     sine = axis.norm().clamp_min(1e-12)
     return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
+
+
+def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:
+    """The joint of a motion's rig by canonical name, those that it has; none where the rig cannot be told."""
+    try:
+        joint_of = map_rig(motion.skeleton, rig, motion=motion).joint_of
+    except RequestError:
+        return {}
+    return {name: joint for name, joint in zip(CANONICAL.names, joint_of, strict=True) if joint is not None}

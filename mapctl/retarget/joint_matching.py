@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import nearest, shorten
-from mapctl.joint_parts import Part, Role, Side, roles
-from mapctl.joint_roles import find_hips, plain_name
+from mapctl.joint_names import Part, Role, Side, nearest, plain_name, shorten
+from mapctl.joint_roles import find_hips, roles
 from mapctl.motion import Motion
 from mapctl.retarget import topology
 from mapctl.retarget.pose_axes import Poses, swapped

@@ -79,7 +79,8 @@ def known() -> tuple[Rig, ...]:
         about="The canonical skeleton: VRM names, a T-pose with all rotations zero.",
     )
     paths = sorted(
-        (p for p in files(__package__).joinpath("presets").iterdir() if p.name.endswith(".toml")), key=lambda p: p.name
+        (p for p in files("mapctl.retarget").joinpath("presets").iterdir() if p.name.endswith(".toml")),
+        key=lambda p: p.name,
     )
     return canonical, *(_rig(tomllib.loads(path.read_text("utf-8"))) for path in paths)
 

@@ -10,10 +10,9 @@ from rig_maker import Make, make, names_of, person, versions_of
 from controllers.inbetweening.keyframes import limb_end
 from mapctl.errors import MapctlError, RequestError
 from mapctl.inbetweening.effector_targets import LIMBS
-from mapctl.joint_names import canonical_joints, find_joint, nearest, shorten, suggest
-from mapctl.joint_parts import Side, role
+from mapctl.joint_names import Side, find_joint, nearest, role, shorten, suggest
 from mapctl.recording.masks import ALL, ROOT, Mask, by_own_names, masked
-from mapctl.retarget import map_rig, rigs
+from mapctl.retarget import canonical_joints, map_rig, rigs
 from mapctl.skeleton import CANONICAL
 
 VERSIONS = [(rig.name, version) for rig in rigs.known() for version in range(versions_of(rig.name))]

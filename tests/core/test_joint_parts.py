@@ -3,7 +3,8 @@
 import pytest
 from scenes_walks import walk
 
-from mapctl.joint_parts import Part, Role, Side, role, roles
+from mapctl.joint_names import Part, Role, Side, role
+from mapctl.joint_roles import roles
 from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
 
 NAMES = {

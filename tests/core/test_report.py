@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from mapctl import curves, report
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger, LedgerEntry, Outcome, Solution, Status, WindowRecord
+from mapctl.problem.ledger import Ledger, LedgerEntry
+from mapctl.problem.solution import Outcome, Solution, Status, WindowRecord
 from mapctl.skeleton import CANONICAL
 
 FRAMES = 90

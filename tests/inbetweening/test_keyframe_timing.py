@@ -12,9 +12,9 @@ from tiny_infiller import card, network
 from controllers.benchmarks import keyframe_timing
 from controllers.benchmarks.keyframe_timing import Pairs, fitted, pairs_of, timing
 from controllers.inbetweening.keyframe_timing import FEATURES, WEIGHTS, pair_features, suggest
-from controllers.inbetweening.keyframes import Key, Keys
 from mapctl import retarget
 from mapctl.inbetweening.missing import Lost, put_back
+from mapctl.intent.keyframes import Key, Keys
 from priors import checkpoints
 
 KEYS = Keys((0, 20, 50, 89))

@@ -10,10 +10,10 @@ from captures import on_rig
 from helpers import walk
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.keyframes import Key, Keys
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.tween import tween
 from mapctl.inbetweening.effector_targets import LIMBS
+from mapctl.intent.keyframes import Key, Keys
 from mapctl.metrics import worst_frame
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL

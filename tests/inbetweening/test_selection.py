@@ -10,12 +10,12 @@ from tiny_infiller import tiny_infiller
 from controllers.inbetweening.canonical_gap import CanonicalGap
 from controllers.inbetweening.error_estimates import sureness_of
 from controllers.inbetweening.geometry.footholds import hold_planted
-from controllers.inbetweening.keyframes import Keys
 from controllers.inbetweening.proposers.rollout import RolloutSettings
 from controllers.inbetweening.proposers.selection import STANDING, ChoiceSettings, choose_proposals, viewers_cost
 from controllers.inbetweening.tween import tween
 from mapctl import contacts
 from mapctl.inbetweening.missing import Lost, straight
+from mapctl.intent.keyframes import Keys
 from mapctl.problem.window_solvers import LatentMethod
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget

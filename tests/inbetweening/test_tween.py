@@ -9,12 +9,12 @@ from helpers import random_motion, walk
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.keyframes import Key, Keys
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.tween import key_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import Lost, put_back, straight
+from mapctl.intent.keyframes import Key, Keys
 
 RIGS = ("canonical", "bandai", "daz")
 ON_RIGS = [*((rig, 30) for rig in RIGS), ("daz", 120)]

@@ -15,12 +15,12 @@ import mapctl
 import priors
 from controllers.inbetweening import infill
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.keyframes import Keys
 from controllers.inbetweening.proposers.rollout import RolloutSettings, rolled
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import best_of, variations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import Lost
+from mapctl.intent.keyframes import Keys
 from mapctl.problem.warm_start import Swarm
 from mapctl.problem.window_solvers import LatentMethod
 from mapctl.recording.masks import Mask

@@ -8,7 +8,7 @@ from controllers.generation.foot_cleanup import FinishSettings, finish
 from mapctl.contacts import without_short_runs
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, Place
-from mapctl.problem.latent_noise import Context
+from mapctl.problem.context import Context
 from mapctl.problem.receding_horizon import WindowSettings
 from mapctl.problem.window_solvers import GuidedMethod
 from mapctl.terms import Closeness, Footing

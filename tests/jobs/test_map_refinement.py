@@ -14,11 +14,11 @@ from mapctl import rotations
 from mapctl.contacts import steadied
 from mapctl.features import PRIOR_FPS, Place
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import runs
 from mapctl.problem import density_selection
 from mapctl.problem.objective import Objective
 from mapctl.problem.pose_offsets import Guide, Poses
 from mapctl.recording import Capture
-from mapctl.recording.artefacts import runs
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings

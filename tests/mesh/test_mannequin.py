@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes_walks import renamed, scaled, walk
 
-from mapctl.joint_parts import Part, Side
+from mapctl.joint_names import Part, Side
 from mapctl.mesh import colours
 from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.mannequin import Body

@@ -10,8 +10,8 @@ import torch
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.metrics import body, feet, measure, path, reference
-from mapctl.metrics.smoothing import gaussian_kernel, slow_part
 from mapctl.motion import Motion
+from mapctl.numerics.gaussian import gaussian_kernel, slow_part
 from mapctl.rotations import about_y, from_rotation_vector
 from mapctl.skeleton import CANONICAL
 

@@ -6,7 +6,9 @@ from catalogue import excite
 from helpers import corpus, finite_difference, generator, noise, tiny_model, walk
 
 from mapctl.features import LAYOUT, Place
-from mapctl.problem.latent_noise import Context, Latents, States
+from mapctl.problem.context import Context
+from mapctl.problem.feature_states import States
+from mapctl.problem.latent_noise import Latents
 from mapctl.problem.objective import Objective
 from mapctl.protocols import Plan
 from mapctl.terms import Footing, Likelihood, Noise, Seam

@@ -11,7 +11,8 @@ from controllers.common.initial_state import choose_start
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, root_places
-from mapctl.problem.latent_noise import Context, Latents
+from mapctl.problem.context import Context
+from mapctl.problem.latent_noise import Latents
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import WindowSettings, WindowSolver
 from mapctl.problem.solution import Outcome

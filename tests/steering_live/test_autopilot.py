@@ -12,7 +12,7 @@ from controllers.steering.steer import SteerFrames
 from mapctl import curves
 from mapctl.intent.steering import Command, Limits
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger
+from mapctl.problem.ledger import Ledger
 
 LINE = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 5.0]]))
 

@@ -8,7 +8,7 @@ from helpers import generator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapctl.recording.artefacts import runs
+from mapctl.numerics.intervals import runs
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.gap_masks import GapSettings, known_places
 

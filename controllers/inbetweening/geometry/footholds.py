@@ -6,9 +6,8 @@ from torch import Tensor
 
 from mapctl.kinematics.whole_body import bend_limbs
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import filled, runs
 from mapctl.numerics.smooth_offsets import spread
-from mapctl.recording.artefacts import runs
-from mapctl.recording.recording import filled
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.foot_contact import TOES
 

@@ -11,7 +11,7 @@ from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.recording.artefacts import runs
+from mapctl.numerics.intervals import runs
 
 _OFF = 1.0  # metres that a gap's edge may lie beside the curve
 

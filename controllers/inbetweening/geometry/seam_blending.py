@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.numerics import smooth_offsets
-from mapctl.recording.artefacts import runs
+from mapctl.numerics.intervals import runs
 
 _REACH = 0.1  # seconds over which an offset fades away from its edge
 _ONE_IN_FIVE = 0.8

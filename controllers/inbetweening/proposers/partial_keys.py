@@ -23,10 +23,9 @@ from mapctl.inbetweening.effector_targets import LIMBS, Targets
 from mapctl.kinematics import heading
 from mapctl.kinematics.whole_body import bend_limbs, reach_with_body
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import last_seen, next_seen, runs
 from mapctl.numerics.smooth_offsets import spread
 from mapctl.protocols import Inbetweener
-from mapctl.recording.artefacts import runs
-from mapctl.recording.recording import last_seen, next_seen
 from mapctl.skeleton import CANONICAL
 
 _SINGLE = 5  # frames at the prior's rate: hips that are known for longer, a network goes along with

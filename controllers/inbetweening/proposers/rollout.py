@@ -23,11 +23,11 @@ from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, encode, root_place
 from mapctl.inbetweening.effector_targets import Targets
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import runs
 from mapctl.problem import density_selection
-from mapctl.problem.latent_noise import Context
+from mapctl.problem.context import Context
 from mapctl.problem.warm_start import SteeringKnots, Swarm, zero_start
 from mapctl.problem.window_solvers import LatentMethod, SolvedWindow
-from mapctl.recording.artefacts import runs
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings

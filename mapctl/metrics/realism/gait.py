@@ -12,8 +12,8 @@ from mapctl import contacts
 from mapctl.errors import RequestError
 from mapctl.joint_roles import find_feet, find_hips
 from mapctl.metrics import body
-from mapctl.metrics.smoothing import slow_part
 from mapctl.motion import Motion
+from mapctl.numerics.gaussian import slow_part
 from mapctl.rotations import unwrap_angle
 
 PIECE_SECONDS = 3.0

@@ -1,0 +1,63 @@
+"""The ledger of a solve: energy and physical residual by term and frame."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class LedgerEntry:
+    """One term over all frames."""
+
+    name: str
+    """The term's name."""
+    unit: str
+    """Of the residual."""
+    energy: Float[Tensor, " frames"]
+    """Nats."""
+    residual: Float[Tensor, " frames"]
+    """How far the wish is missed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ledger:
+    """Energy and physical residual by term and frame."""
+
+    entries: tuple[LedgerEntry, ...] = ()
+    """One for each term."""
+
+    def join(self, other: "Ledger") -> "Ledger":
+        """This ledger's frames followed by the other's; a term that only one of them lists is 0 in the other's."""
+        if not self.entries:
+            return other
+        mine, theirs = ({entry.name: entry for entry in ledger.entries} for ledger in (self, other))
+        return Ledger(tuple(_joined(mine.get(name), theirs.get(name), self, other) for name in mine | theirs))
+
+    def slice(self, frames: int) -> "Ledger":
+        """The first frames."""
+        return Ledger(tuple(replace(e, energy=e.energy[:frames], residual=e.residual[:frames]) for e in self.entries))
+
+    def summary(self) -> dict[str, dict[str, float | str]]:
+        """For a report: by term the total energy, and mean, 95th percentile and maximum of the residual."""
+        return {
+            entry.name: {
+                "energy_nats": float(entry.energy.sum()),
+                "residual_unit": entry.unit,
+                "residual_mean": float(entry.residual.mean()),
+                "residual_p95": float(torch.quantile(entry.residual.double(), 0.95)),
+                "residual_max": float(entry.residual.max()),
+            }
+            for entry in self.entries
+        }
+
+
+def _joined(before: LedgerEntry | None, after: LedgerEntry | None, first: Ledger, second: Ledger) -> LedgerEntry:
+    """One term of two ledgers, of which one may not have it."""
+    some = before or after
+    assert some is not None, "the term comes from one of them"
+    nothing = [torch.zeros_like(ledger.entries[0].energy) for ledger in (first, second)]
+    sides = zip((before, after), nothing, strict=True)
+    energies, residuals = zip(*((e.energy, e.residual) if e else (zero, zero) for e, zero in sides), strict=True)
+    return LedgerEntry(some.name, some.unit, torch.cat(energies), torch.cat(residuals))
