@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mapctl.skeleton import Skeleton as Skeleton
 
 # torch takes a second to import; `mapctl --help` must not wait for it, so public names arrive on first use.
-_HOMES = {
+_MODULE_OF = {
     "load": "mapctl.formats",
     "Motion": "mapctl.motion",
     "Skeleton": "mapctl.skeleton",
@@ -23,7 +23,7 @@ _HOMES = {
 
 
 def __getattr__(name: str):
-    if name not in _HOMES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'mapctl' has no attribute {name!r}")
-    module = import_module(_HOMES[name])
-    return module if _HOMES[name] == f"mapctl.{name}" else getattr(module, name)
+    module = import_module(_MODULE_OF[name])
+    return module if _MODULE_OF[name] == f"mapctl.{name}" else getattr(module, name)

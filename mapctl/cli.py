@@ -20,11 +20,11 @@ import tyro
 
 from mapctl import __version__
 from mapctl.commands import COMMANDS, Command
-from mapctl.commands.shared.path_walk import INTERRUPTED
+from mapctl.commands.shared.path_walk import EXIT_INTERRUPTED
 from mapctl.errors import MapctlError, RequestError
 from mapctl.runtime import interruption
 
-_WRONG, _UNREAD, _SIGNALLED = 2, 1, 128
+_EXIT_INVALID, _EXIT_UNREAD_OUTPUT, _EXIT_SIGNAL_BASE = 2, 1, 128
 _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
     "live": {"viser"},
@@ -32,9 +32,9 @@ _EXTRAS = {
     "cluster": {"ray"},
 }
 """Packages by the extra that installs them."""
-_COLOURS = re.compile(r"\x1b\[[\d;]*m")
+_ANSI_COLOUR = re.compile(r"\x1b\[[\d;]*m")
 _HINT = re.compile(r"Available subcommands: .*|Perhaps you meant: -[\w-]+")
-_PLAINER = (
+_MESSAGE_REWRITES = (
     (r" Got errors:.*", ""),
     (r"no type matching (.+) could be instantiated from \[(.*?)\]", r"expected \1, got \2"),
     (r"invalid literal for int\(\) with base 10: ", "expected a whole number, got "),
@@ -49,25 +49,25 @@ _STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `mapctl` with the given words (those of the process if None); returns the exit status."""
-    received = interruption.listen() if argv is None else []
+    received = interruption.raise_on_signals() if argv is None else []
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        status = _version() if words == ["--version"] else parse(words).run()
+        status = _print_version() if words == ["--version"] else parse(words).run()
         sys.stdout.flush()
-        if status == INTERRUPTED:
-            status = _ended(received, "what was solved until then is written")
+        if status == EXIT_INTERRUPTED:
+            status = _report_interruption(received, "what was solved until then is written")
     except MapctlError as error:
-        status = _say(str(error), _WRONG)
+        status = _print_error(str(error), _EXIT_INVALID)
     except KeyboardInterrupt as stop:
-        status = _ended(received, str(stop))
+        status = _report_interruption(received, str(stop))
     except ModuleNotFoundError as error:
-        status = _say(_missing(error.name or str(error)), _WRONG)
+        status = _print_error(_describe_missing_package(error.name or str(error)), _EXIT_INVALID)
     except BrokenPipeError:
-        _forget_output()
-        status = _UNREAD
+        _discard_output()
+        status = _EXIT_UNREAD_OUTPUT
     except OSError as error:
-        _forget_output()
-        status = _say(f"{error.filename or 'input or output'}: {error.strerror or error}", _WRONG)
+        _discard_output()
+        status = _print_error(f"{error.filename or 'input or output'}: {error.strerror or error}", _EXIT_INVALID)
     return status
 
 
@@ -81,7 +81,7 @@ def parse(words: Sequence[str]) -> Command:
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        raise RequestError(f"{_essence(explained.getvalue())} (see {_help(words)})") from None
+        raise RequestError(f"{_shorten_usage_error(explained.getvalue())} (see {_help_command(words)})") from None
 
 
 _DESCRIPTION = (
@@ -90,7 +90,7 @@ _DESCRIPTION = (
 )
 
 
-def _version() -> int:
+def _print_version() -> int:
     print(f"mapctl {__version__}")
     return 0
 
@@ -99,13 +99,13 @@ def _subcommand(name: str, kind: type[Command]) -> Any:
     return Annotated[kind, tyro.conf.subcommand(name, prefix_name=False)]
 
 
-def _essence(box: str) -> str:
+def _shorten_usage_error(box: str) -> str:
     """What tyro explains in a box of many lines, in one: its first paragraph, and a hint if there is one.
 
     The box has a title line, and rules between its paragraphs; colours where standard output is a terminal.
     """
     paragraphs = [""]
-    for line in _COLOURS.sub("", box).splitlines()[1:]:
+    for line in _ANSI_COLOUR.sub("", box).splitlines()[1:]:
         text = line.strip("│ ")
         if text and not text.strip("─-╰╯"):
             paragraphs.append("")
@@ -113,16 +113,16 @@ def _essence(box: str) -> str:
             paragraphs[-1] = f"{paragraphs[-1]} {text}".strip()
     first, *others = [*filter(None, paragraphs)] or ["the command cannot be understood"]
     hints = filter(None, (_HINT.match(paragraph) for paragraph in others))
-    for pattern, plainer in _PLAINER:
+    for pattern, plainer in _MESSAGE_REWRITES:
         first = re.sub(pattern, plainer, first)
     return ". ".join([first.strip().rstrip("."), *(hint.group() for hint in hints)])
 
 
-def _help(words: Sequence[str]) -> str:
+def _help_command(words: Sequence[str]) -> str:
     return f"mapctl {words[0]} --help" if words and words[0] in COMMANDS else "mapctl --help"
 
 
-def _missing(module: str) -> str:
+def _describe_missing_package(module: str) -> str:
     package = module.partition(".")[0]
     for extra, packages in _EXTRAS.items():
         if package in packages:
@@ -130,19 +130,19 @@ def _missing(module: str) -> str:
     return f"this needs the package {package}, which is not installed"
 
 
-def _say(message: str, status: int) -> int:
+def _print_error(message: str, status: int) -> int:
     print(f"mapctl: {' '.join(message.split())}", file=sys.stderr)
     return status
 
 
-def _ended(received: Sequence[int], kept: str) -> int:
+def _report_interruption(received: Sequence[int], kept: str) -> int:
     """Say that work was ended, and what there is of it; without a signal it was Ctrl-C."""
     number = received[-1] if received else signal.SIGINT
     how = "interrupted" if number == signal.SIGINT else "terminated"
-    return _say("; ".join(filter(None, (how, kept))), _SIGNALLED + number)
+    return _print_error("; ".join(filter(None, (how, kept))), _EXIT_SIGNAL_BASE + number)
 
 
-def _forget_output() -> None:
+def _discard_output() -> None:
     """The interpreter flushes standard output once more at exit, which would fail again (see Python's signal page)."""
     try:
         sys.stdout.flush()

@@ -23,11 +23,11 @@ class ContactSettings:
     """The floor is this percentile of the toe's own height in the clip."""
     shortest: float = 0.1
     """Contacts shorter than this are dropped, seconds: 3 frames at 30 fps."""
-    speed_step: float = 1 / 30
+    speed_window: float = 1 / 30
     """Toe speed is the mean over about this time, seconds, or a fast camera's noise looks like motion."""
 
 
-def planted(
+def detect_contacts(
     toe_positions: Float[Tensor, "frames feet 3"] | Float[ndarray, "frames feet 3"],
     fps: float | Fraction,
     settings: ContactSettings = ContactSettings(),
@@ -40,21 +40,21 @@ def planted(
     toes, fps = torch.as_tensor(toe_positions), float(fps)
     if len(toes) == 0 or not fps > 0:
         raise RequestError(f"contacts need frames and a positive frame rate, got {len(toes)} at {fps:g} fps")
-    step = max(1, round(settings.speed_step * fps))
-    low = toes[..., 1] < floor_heights(toes, settings) + settings.reach
+    step = max(1, round(settings.speed_window * fps))
+    low = toes[..., 1] < estimate_floor_heights(toes, settings) + settings.reach
     slow = (toes[step:] - toes[:-step])[..., ::2].norm(dim=-1) * (fps / step) < settings.slow
-    stands = without_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
+    stands = remove_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
     return torch.cat([low[:step] & (stands[:1] if len(stands) else False), stands])
 
 
-def floor_heights(
+def estimate_floor_heights(
     toe_positions: Float[Tensor, "frames feet 3"], settings: ContactSettings = ContactSettings()
 ) -> Float[Tensor, "feet"]:
     """Height of the floor under each toe joint, metres: a low percentile of the toe's own height."""
     return torch.quantile(toe_positions[..., 1], settings.floor_percentile / 100, dim=0)
 
 
-def without_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
+def remove_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
     """Runs of true shorter than `shortest` frames become false: a morphological opening."""
     if len(stands) < shortest:
         return torch.zeros_like(stands)
@@ -73,10 +73,10 @@ def support_speed(
     return torch.where(close.any(dim=-1), torch.where(close, speeds, torch.inf).amin(dim=-1), 0.0)
 
 
-STEADY = 3
+MIN_CONTACT_FRAMES = 3
 """Frames at the prior's rate that a contact, or a gap in one, lasts at least: `ContactSettings.shortest`."""
 
 
-def steadied(stands: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
+def debounced(stands: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
     """Contacts at the prior's rate without gaps, and then without contacts, of less than STEADY frames."""
-    return without_short_runs(~without_short_runs(~stands, STEADY), STEADY)
+    return remove_short_runs(~remove_short_runs(~stands, MIN_CONTACT_FRAMES), MIN_CONTACT_FRAMES)

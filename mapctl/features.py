@@ -18,7 +18,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.errors import MapctlError
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 PRIOR_FPS = 30
 """Frames per second of every prior: steps and turns a frame mean nothing at another rate, so results are resampled."""
@@ -72,7 +72,7 @@ LAYOUT = FeatureLayout(
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class GroundPose:
     """Where the root stands on the ground and which way it faces."""
 
     position_xz: Float[Tensor, "*batch 2"]
@@ -80,23 +80,23 @@ class Place:
     heading: Float[Tensor, "*batch"]
     """Radians about +Y; 0 faces +Z."""
 
-    def moved(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "Place":
+    def displace(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "GroundPose":
         """One step of Eq. 4: displaced in its own heading frame, then turned."""
         step = rotations.rotate_ground(displacement_heading, self.heading)
-        return Place(self.position_xz + step, self.heading + turn)
+        return GroundPose(self.position_xz + step, self.heading + turn)
 
-    def before(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "Place":
+    def before(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "GroundPose":
         """The place from which one such step leads here."""
         heading = self.heading - turn
-        return Place(self.position_xz - rotations.rotate_ground(displacement_heading, heading), heading)
+        return GroundPose(self.position_xz - rotations.rotate_ground(displacement_heading, heading), heading)
 
     @staticmethod
-    def origin(dtype: torch.dtype = torch.float32) -> "Place":
+    def origin(dtype: torch.dtype = torch.float32) -> "GroundPose":
         """At the origin, facing +Z."""
-        return Place(torch.zeros(2, dtype=dtype), torch.zeros((), dtype=dtype))
+        return GroundPose(torch.zeros(2, dtype=dtype), torch.zeros((), dtype=dtype))
 
 
-def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], Place]:
+def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], GroundPose]:
     """Features of a canonical motion (float64) and the place from which `decode` leads back to it.
 
     The first frame has no past: it repeats the second frame's displacement, and the place returned lies that much
@@ -114,14 +114,16 @@ def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], Place]:
     tilt_vector = rotations.to_rotation_vector(tilt)
     joints = rotations.to_rotation_vector(motion.local_quat_xyzw[:, 1:]).flatten(1)
     toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
-    planted = torch.as_tensor(contacts.planted(motion.joint_positions()[:, toes], float(motion.fps))).to(step.dtype)
+    planted = torch.as_tensor(contacts.detect_contacts(motion.joint_positions()[:, toes], float(motion.fps))).to(
+        step.dtype
+    )
     height = motion.root_position[:, 1:2]
     features = torch.cat([step, turn[:, None], height, tilt_vector[:, [0, 2]], joints, planted], dim=-1)
-    return features, Place(ground[0], heading[0]).before(step[0], turn[0])
+    return features, GroundPose(ground[0], heading[0]).before(step[0], turn[0])
 
 
-def root_places(
-    features: Float[Tensor, "*batch frames size"], start: Place
+def integrate_root(
+    features: Float[Tensor, "*batch frames size"], start: GroundPose
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames"]]:
     """Root ground positions (world, metres) and headings (radians, not wrapped) by Eq. 4. The one root integration."""
     turns = LAYOUT.pick(features, "heading_change")[..., 0]
@@ -135,7 +137,7 @@ def ground_speed(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batc
     return LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * PRIOR_FPS
 
 
-def local_rotations(
+def decode_local_rotations(
     features: Float[Tensor, "*batch frames size"], heading: Float[Tensor, "*batch frames"]
 ) -> Float[Tensor, "*batch frames joints 4"]:
     """Local rotations (xyzw) of all joints; the hips' is its heading times its tilt."""
@@ -147,19 +149,19 @@ def local_rotations(
     return torch.cat([hips.unsqueeze(-2), quats[..., 1:, :]], dim=-2)
 
 
-def decode(features: Float[Tensor, "frames size"], start: Place, *, skeleton: Skeleton = CANONICAL) -> Motion:
+def decode(features: Float[Tensor, "frames size"], start: GroundPose, *, skeleton: Skeleton = CANONICAL) -> Motion:
     """The canonical motion at PRIOR_FPS that the features describe from `start`; inverse of `encode` at that rate."""
     features = features.detach().double()
-    ground, heading = root_places(features, Place(start.position_xz.double(), start.heading.double()))
+    ground, heading = integrate_root(features, GroundPose(start.position_xz.double(), start.heading.double()))
     height = LAYOUT.pick(features, "root_height")
     root = torch.cat([ground[:, :1], height, ground[:, 1:]], dim=-1)
-    quats = rotations.sign_continuous(local_rotations(features, heading))
+    quats = rotations.make_sign_continuous(decode_local_rotations(features, heading))
     return Motion(skeleton, Fraction(PRIOR_FPS), root, quats)
 
 
 def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
     """Features of the motion mirrored left to right."""
-    swap = [CANONICAL.index(mirrored_name(name)) - 1 for name in CANONICAL.names[1:]]
+    swap = [CANONICAL.index(mirror_name(name)) - 1 for name in CANONICAL.names[1:]]
     vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))[..., swap, :]
     flip = features.new_tensor
     return torch.cat(

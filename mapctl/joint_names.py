@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 
 from mapctl.errors import RequestError
 
-_FEW = 3  # names in a refusal
+_MAX_SUGGESTIONS = 3  # names in a refusal
 
 
 # Beginnings that say which program made the rig rather than what the joint is.
@@ -98,23 +98,23 @@ _SIDES = tuple(
 
 
 @lru_cache(maxsize=4096)
-def plain_name(name: str) -> str:
+def normalise_name(name: str) -> str:
     """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
     strip = partial(_PREFIX.sub, "")
     # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
     return re.sub(r"[^a-z0-9]", "", (strip(strip(name)) or name).lower())
 
 
-def role(name: str) -> Role:
+def classify_joint(name: str) -> Role:
     """Side and part of a joint by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
     for side, pattern in _SIDES:
         found = pattern.search(name)
         if found:
-            return Role(side, _part(name[: found.start()] + name[found.end() :]))
-    return Role(Side.MIDDLE, _part(name))
+            return Role(side, _classify_part(name[: found.start()] + name[found.end() :]))
+    return Role(Side.MIDDLE, _classify_part(name))
 
 
-def _part(name: str) -> Part:
+def _classify_part(name: str) -> Part:
     for pattern, part in _PARTS:
         if re.search(pattern, name.lower()):
             return part
@@ -134,10 +134,10 @@ def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mappin
     if wanted in known:
         return known[wanted]
     lower = {name.lower(): joint for name, joint in known.items()}
-    for spelled in (str.lower, plain_name):
+    for spelled in (str.lower, normalise_name):
         alike = [joint for joint, name in enumerate(names) if spelled(name) == spelled(wanted)]
         if len(alike) > 1:
-            several = " and ".join(names[joint] for joint in alike[:_FEW])
+            several = " and ".join(names[joint] for joint in alike[:_MAX_SUGGESTIONS])
             raise RequestError(f"{wanted!r} may be {several}; write it as the rig does")
         if alike:
             return alike[0]
@@ -146,14 +146,14 @@ def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mappin
     return None
 
 
-def suggest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> list[str]:
+def suggest_joints(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> list[str]:
     """The few names nearest to a wanted one, the nearest first.
 
     They stay on the side and the limb that it tells, if any name is there. `roles` tell what the names are, else the
     names themselves do.
     """
-    told = dict(zip(names, map(role, names) if roles is None else roles, strict=True))
-    asked, plain = role(wanted), plain_name(wanted)
+    told = dict(zip(names, map(classify_joint, names) if roles is None else roles, strict=True))
+    asked, plain = classify_joint(wanted), normalise_name(wanted)
 
     def kept(fits: Callable[[Role], bool], some: Sequence[str]) -> Sequence[str]:
         return [name for name in some if fits(told[name])] or some
@@ -163,17 +163,17 @@ def suggest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = No
     for limb in _LIMBS:
         if asked.part in limb:
             names = kept(lambda r, limb=limb: r.part in limb, names)
-    likeness = {name: SequenceMatcher(None, plain, plain_name(name)).ratio() for name in names}
-    return sorted(names, key=lambda name: (told[name].part is not asked.part, -likeness[name]))[:_FEW]
+    likeness = {name: SequenceMatcher(None, plain, normalise_name(name)).ratio() for name in names}
+    return sorted(names, key=lambda name: (told[name].part is not asked.part, -likeness[name]))[:_MAX_SUGGESTIONS]
 
 
-def nearest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> str:
+def describe_nearest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> str:
     """The end of a refusal: which names are nearest."""
-    first, *others = [*suggest(wanted, names, roles)] or ["none"]
+    first, *others = [*suggest_joints(wanted, names, roles)] or ["none"]
     return f"the nearest is {first}" + (f", then {' and '.join(others)}" if others else "")
 
 
-def shorten(names: Sequence[str]) -> str:
+def abbreviate_names(names: Sequence[str]) -> str:
     """The first few of many names, and how many there are."""
-    more = len(names) - 2 * _FEW
-    return ", ".join(names[: 2 * _FEW]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - 2 * _MAX_SUGGESTIONS
+    return ", ".join(names[: 2 * _MAX_SUGGESTIONS]) + (f" and {more} more" if more > 0 else "")

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import Part, Role, Side, plain_name, role, shorten
+from mapctl.joint_names import Part, Role, Side, abbreviate_names, classify_joint, normalise_name
 from mapctl.skeleton import Skeleton
 
 # Without their side, best guess first: VRM, Bandai Namco, Mixamo, Daz, Biped, Unreal, ASF, SMPL.
@@ -17,13 +17,13 @@ _ROOTS = ("rootjoint", "root")  # of rigs without hips
 
 def find_hips(skeleton: Skeleton) -> int:
     """Index of the hips; RequestError lists the joints if none is named so."""
-    names = _plain_names(skeleton)
-    for match, parts in ((_exactly, _HIPS), (_at_the_end, _HIPS), (_exactly, _ROOTS)):
+    names = _normalise_names(skeleton)
+    for match, parts in ((_match_exactly, _HIPS), (_match_suffix, _HIPS), (_match_exactly, _ROOTS)):
         for part in parts:
             joint = match(names, {part})
             if joint is not None:
                 return joint
-    raise _missing(skeleton, "hips")
+    raise _unknown_joint_error(skeleton, "hips")
 
 
 def find_feet(skeleton: Skeleton) -> tuple[int, int]:
@@ -37,48 +37,50 @@ def find_upper_legs(skeleton: Skeleton) -> tuple[int, int]:
 
 
 def _find_pair(skeleton: Skeleton, parts: Sequence[str], role: str) -> tuple[int, int]:
-    names = _plain_names(skeleton)
-    for match in (_exactly, _at_the_end):
+    names = _normalise_names(skeleton)
+    for match in (_match_exactly, _match_suffix):
         for part in parts:
-            left, right = match(names, _sided(part, "left")), match(names, _sided(part, "right"))
+            left, right = match(names, _side_spellings(part, "left")), match(names, _side_spellings(part, "right"))
             if left is not None and right is not None:
                 return left, right
-    raise _missing(skeleton, f"left and right {role}")
+    raise _unknown_joint_error(skeleton, f"left and right {role}")
 
 
-def _sided(part: str, side: str) -> set[str]:
+def _side_spellings(part: str, side: str) -> set[str]:
     """Plain ways to write a part of one side: leftfoot, footleft, lfoot, footl."""
     return {f"{mark}{part}" for mark in (side, side[0])} | {f"{part}{mark}" for mark in (side, side[0])}
 
 
-def _exactly(names: Sequence[str], wanted: set[str]) -> int | None:
-    return _first(names, wanted.__contains__)
+def _match_exactly(names: Sequence[str], wanted: set[str]) -> int | None:
+    return _find_first(names, wanted.__contains__)
 
 
-def _at_the_end(names: Sequence[str], wanted: set[str]) -> int | None:
+def _match_suffix(names: Sequence[str], wanted: set[str]) -> int | None:
     """After an unknown beginning (`Character1_LeftFoot`); words as short as `lfoot` prove too little."""
     telling = tuple(word for word in wanted if len(word) >= 6 and ("left" in word or "right" in word))
-    return _first(names, lambda name: name.endswith(telling or tuple(wanted & {"hips", "pelvis"})))
+    return _find_first(names, lambda name: name.endswith(telling or tuple(wanted & {"hips", "pelvis"})))
 
 
-def _first(names: Sequence[str], fits: Callable[[str], bool]) -> int | None:
+def _find_first(names: Sequence[str], fits: Callable[[str], bool]) -> int | None:
     return next((joint for joint, name in enumerate(names) if fits(name)), None)
 
 
-def _plain_names(skeleton: Skeleton) -> list[str]:
-    return [plain_name(name) for name in skeleton.names]
+def _normalise_names(skeleton: Skeleton) -> list[str]:
+    return [normalise_name(name) for name in skeleton.names]
 
 
-def _missing(skeleton: Skeleton, role: str) -> RequestError:
-    return RequestError(f"cannot tell the {role} of this rig by name; its joints are {shorten(skeleton.names)}")
+def _unknown_joint_error(skeleton: Skeleton, role: str) -> RequestError:
+    return RequestError(
+        f"cannot tell the {role} of this rig by name; its joints are {abbreviate_names(skeleton.names)}"
+    )
 
 
-def roles(skeleton: Skeleton) -> tuple[Role, ...]:
+def classify_joints(skeleton: Skeleton) -> tuple[Role, ...]:
     """The role of every joint, settled by what else the rig has.
 
     Where there are collars, a `shoulder` is the upper arm; without thighs, a hip with a side is one.
     """
-    found = [role(name) for name in skeleton.names]
+    found = [classify_joint(name) for name in skeleton.names]
     collars = any(re.search("collar|clavicle", name, re.IGNORECASE) for name in skeleton.names)
     thighs = any(r.part is Part.UPPER_LEG for r in found)
     for joint, name in enumerate(skeleton.names):

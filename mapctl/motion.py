@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.skeleton import Skeleton, mirrored_name
+from mapctl.skeleton import Skeleton, mirror_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Motion:
         """Frames start to stop (half-open); RequestError if they are not all there."""
         if not 0 <= start < stop <= self.num_frames:
             raise RequestError(f"frames {start}:{stop} are not within 0:{self.num_frames}")
-        return self._with_frames(lambda values: values[start:stop])
+        return self._map_frames(lambda values: values[start:stop])
 
     def join(self, other: "Motion") -> "Motion":
         """This motion followed by `other`, which must have the same skeleton and frame rate; nothing is moved."""
@@ -130,7 +130,7 @@ class Motion:
         flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
         # A reflection through x = 0 keeps rotation about x and reverses rotation about y and z.
         flip_quat = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
-        ends = {mirrored_name(n): (-x, y, z) for n, (x, y, z) in self.skeleton.end_offsets.items()}
+        ends = {mirror_name(n): (-x, y, z) for n, (x, y, z) in self.skeleton.end_offsets.items()}
         skeleton = Skeleton(names, self.skeleton.parents, self.skeleton.offsets[swap] * flip, ends)
         moving = {swap[j]: v * flip for j, v in self.moving_offsets.items()}
         return replace(
@@ -152,7 +152,7 @@ class Motion:
         """A joint's offset in every frame, animated or not."""
         return self.moving_offsets.get(joint, self.skeleton.offsets[joint].expand(self.num_frames, 3))
 
-    def _with_frames(self, pick) -> "Motion":
+    def _map_frames(self, pick) -> "Motion":
         moving = {j: pick(v) for j, v in self.moving_offsets.items()}
         return replace(
             self,

@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mapctl.inbetweening import PositionImage, Proposed
+from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.recording import Capture, Cleaned
 
 State = TypeVar("State")
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class DiscreteChoices:
     """The discrete choices along a rollout, fixed while its noise is optimised."""
 
     component: Int[Tensor, "batch frames"]
@@ -44,18 +44,18 @@ class Density(Protocol[State]):
         """The state after the committed frames were seen."""
         ...
 
-    def plan(self, state: State, noise: Float[Tensor, "batch frames continuous"]) -> Plan:
+    def plan(self, state: State, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest discrete choices along the rollout that the noise gives."""
         ...
 
     def latents(
         self, features: Float[Tensor, "batch frames size"], state: State
-    ) -> tuple[Plan, Float[Tensor, "batch frames continuous"]]:
+    ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames continuous"]]:
         """The plan and the noise whose rollout is the features."""
         ...
 
     def rollout(
-        self, state: State, noise: Float[Tensor, "batch frames continuous"], plan: Plan
+        self, state: State, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """Features x = mu_k + sigma_k noise with the plan's components k, and their log density; differentiable."""
         ...
@@ -65,7 +65,7 @@ class Density(Protocol[State]):
 class Inbetweener(Protocol):
     """Proposes the frames and joints that a motion lacks."""
 
-    def propose(self, image: PositionImage) -> Proposed:
+    def propose(self, image: PositionImage) -> ProposedPositions:
         """All joints in all frames; known ones may move."""
         ...
 
@@ -93,7 +93,7 @@ class Refiner(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Starts:
+class InitialStates:
     """Moments of mocap from which a density may begin: its state after a stretch of a clip."""
 
     state: Any
@@ -107,7 +107,7 @@ class Starts:
 
 
 @dataclass(frozen=True)
-class Abilities:
+class DataLimits:
     """What the training data show, so that impossible wishes can be named with numbers."""
 
     slowest: float
@@ -118,6 +118,6 @@ class Abilities:
     """Turning of the travel direction, rad/s, 99.5th percentile of one-second means."""
 
     @property
-    def fastest_asked(self) -> float:
+    def max_steering_speed(self) -> float:
         """Highest speed that is asked of the prior while steering, m/s: a tenth beyond what its data show."""
         return 1.1 * self.fastest

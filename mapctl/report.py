@@ -21,7 +21,7 @@ from mapctl.problem.solution import Solution, WindowRecord
 _PACKAGES = ("torch", "numpy", "scipy", "numba")
 
 
-def build(
+def build_report(
     solution: Solution,
     *,
     request: Mapping[str, Any],
@@ -38,50 +38,50 @@ def build(
         "mapctl": __version__,
         "request": dict(request),
         "seed": seed,
-        "versions": versions(),
+        "versions": package_versions(),
         "prior": {name: value for name, value in prior.items() if name != "quality"},
-        "status": status(solution),
-        "motion": outline(solution.motion),
+        "status": summarise_status(solution),
+        "motion": summarise_motion(solution.motion),
         "ledger": solution.ledger.summary(),
         "measures": dict(measures),
-        "mocap": mocap_values(prior.get("quality", {})),
-        "timing": timing(solution.windows, seconds=seconds),
+        "mocap": reference_measures(prior.get("quality", {})),
+        "timing": summarise_timing(solution.windows, seconds=seconds),
     }
 
 
-def write(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
+def write_report(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
     """Write a report whole or not at all; RequestError if the place cannot be written."""
-    write_text(path, as_json(report))
+    write_text(path, to_json(report))
 
 
-def as_json(values: Any) -> str:
+def to_json(values: Any) -> str:
     """Indented JSON that every parser reads: NaN and infinities are null."""
-    return json.dumps(_finite(values), indent=1, allow_nan=False) + "\n"
+    return json.dumps(_replace_non_finite(values), indent=1, allow_nan=False) + "\n"
 
 
-def status(solution: Solution) -> dict[str, Any]:
+def summarise_status(solution: Solution) -> dict[str, Any]:
     """How the solve ended: text (the message), outcome, ok, notes."""
     ended = solution.status
     return {"text": ended.text, "outcome": ended.outcome.value, "ok": ended.ok, "notes": list(ended.notes)}
 
 
-def outline(motion: Motion) -> dict[str, float]:
+def summarise_motion(motion: Motion) -> dict[str, float]:
     """Frames, frames per second and seconds."""
     return {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds}
 
 
-def path_measures(motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None) -> dict[str, float]:
+def measure_path(motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None) -> dict[str, float]:
     """All measures of a motion that was to go `wanted_m` metres along the curve, at whatever speed."""
     seconds = (motion.num_frames - 1) / float(motion.fps)
     return metrics.measure(motion, curve, speed=wanted_m / seconds, joint=joint)
 
 
-def mocap_values(quality: Mapping[str, Any]) -> dict[str, Any]:
+def reference_measures(quality: Mapping[str, Any]) -> dict[str, Any]:
     """What held-out mocap shows, by measure: mean, p2, p98; empty where the prior's card has no table."""
     return dict(quality.get("mocap", {}))
 
 
-def timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict[str, float | int | None]:
+def summarise_timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict[str, float | int | None]:
     """Compute of each delivered frame (a window's time over the frames it commits), ms, and its company.
 
     A followed curve has no due times, so there are no late frames to count.
@@ -113,20 +113,20 @@ def peak_memory_mb() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Of mapctl, Python and the packages that decide the numbers, and the platform."""
     installed = {name: metadata.version(name) for name in _PACKAGES}
     return {"mapctl": __version__, "python": platform.python_version(), **installed, "platform": platform.platform()}
 
 
-def _finite(values: Any) -> Any:
+def _replace_non_finite(values: Any) -> Any:
     """The same tree with null for NaN and infinities."""
     match values:
         case float():
             return values if math.isfinite(values) else None
         case Mapping():
-            return {str(name): _finite(value) for name, value in values.items()}
+            return {str(name): _replace_non_finite(value) for name, value in values.items()}
         case list() | tuple():
-            return [_finite(value) for value in values]
+            return [_replace_non_finite(value) for value in values]
         case _:
             return values

@@ -56,7 +56,7 @@ def rotate_ground(vector_xz: Float[Tensor, "*#batch 2"], angle: Float[Tensor, "*
     return torch.stack([cosine * x + sine * z, cosine * z - sine * x], dim=-1)
 
 
-def sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[Tensor, "frames *joints 4"]:
+def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[Tensor, "frames *joints 4"]:
     """The same rotations with signs chosen so that neighbouring frames lie in one half of the sphere."""
     dots = (quat_xyzw[1:] * quat_xyzw[:-1]).sum(-1)
     signs = torch.cumprod(torch.where(dots < 0, -1.0, 1.0).to(quat_xyzw.dtype), dim=0)

@@ -42,9 +42,9 @@ class Skeleton:
         try:
             return self.names.index(name)
         except ValueError:
-            from mapctl.joint_names import nearest  # late: it knows skeletons
+            from mapctl.joint_names import describe_nearest  # late: it knows skeletons
 
-            raise MapctlError(f"no joint {name!r}; {nearest(name, self.names)}") from None
+            raise MapctlError(f"no joint {name!r}; {describe_nearest(name, self.names)}") from None
 
     def matches(self, other: "Skeleton", tolerance: float = 1e-6) -> bool:
         """Same joints, tree and bone offsets (within `tolerance` metres)."""
@@ -57,11 +57,11 @@ class Skeleton:
         Sides are told by the canonical `left` and `right` alone. MapctlError for a skeleton that has none, names sides
         in another way (which would pass for the middle), or lacks a partner.
         """
-        foreign = [name for name in self.names if mirrored_name(name) == name and _OTHER_SIDES.search(name)]
-        if foreign or all(mirrored_name(name) == name for name in self.names):
+        foreign = [name for name in self.names if mirror_name(name) == name and _FOREIGN_SIDE_NAMES.search(name)]
+        if foreign or all(mirror_name(name) == name for name in self.names):
             some = ", ".join((foreign or self.names)[:3])
             raise MapctlError(f"cannot tell left from right by the joints {some}; use retarget.to_canonical first")
-        return [self.index(mirrored_name(name)) for name in self.names]
+        return [self.index(mirror_name(name)) for name in self.names]
 
     def children(self, joint: int) -> list[int]:
         """Indices of the joint's children."""
@@ -99,7 +99,7 @@ _ENDS = {
 }
 
 
-def _canonical() -> Skeleton:
+def _build_canonical() -> Skeleton:
     bones: list[tuple[str, str, tuple[float, float, float]]] = list(_SPINE)
     for side, sign in (("left", 1), ("right", -1)):
         for limb in (_LEFT_ARM, _LEFT_LEG):
@@ -111,9 +111,9 @@ def _canonical() -> Skeleton:
     return Skeleton(names, parents, offsets, _ENDS)
 
 
-CANONICAL = _canonical()
+CANONICAL = _build_canonical()
 # How other rigs name sides: Hand_R, Bip01 L Hand, LeftHand, rHand, RHand, footleft.
-_OTHER_SIDES = re.compile(
+_FOREIGN_SIDE_NAMES = re.compile(
     r"(?i:(?:^|[^a-z0-9])(?:l|r|left|right)(?:$|[^a-z0-9]))|Left|Right|^[lrLR](?=[A-Z][a-z])|(?i:left|right)$"
 )
 TOE_REST_HEIGHT = 0.0425
@@ -126,7 +126,7 @@ def leg_length(skeleton: Skeleton) -> float:
     return float(skeleton.offsets[bones].norm(dim=-1).sum())
 
 
-def mirrored_name(name: str) -> str:
+def mirror_name(name: str) -> str:
     """The joint of the other side: `leftHand` for `rightHand`; other names are their own mirror image."""
     for side, other in (("left", "right"), ("right", "left")):
         if name.startswith(side):

@@ -54,4 +54,4 @@ def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":
     if name != "auto":
         return load_refiner(name)
     own = f"{prior}-refiner"
-    return load_refiner(own) if own in checkpoints.bundled() else None
+    return load_refiner(own) if own in checkpoints.list_bundled() else None

@@ -46,7 +46,7 @@ class Card:
     """Speeds and turning that the data show."""
 
     @staticmethod
-    def of_layout() -> dict[str, Any]:
+    def layout_fields() -> dict[str, Any]:
         """The two layout fields for the features of this code."""
         return {"layout": [list(block) for block in LAYOUT.blocks], "fingerprint": LAYOUT.fingerprint()}
 
@@ -56,7 +56,7 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
 
     CheckpointError, and nothing written, for a card that holds NaN or infinity, which JSON does not know.
     """
-    text = as_json(vars(card), path, indent=1)
+    text = encode_json(vars(card), path, indent=1)
     kept = {
         name: t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t
         for name, t in tensors.items()
@@ -67,7 +67,7 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
         write_tensors(path, kept)
 
 
-def as_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:
+def encode_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:
     """JSON that every parser reads; CheckpointError, naming the file it was for, where a number is not finite."""
     try:
         return json.dumps(values, indent=indent, allow_nan=False) + "\n"
@@ -89,7 +89,7 @@ def load(path: Path) -> tuple[dict[str, Tensor], Card]:
 
 
 @contextmanager
-def opened(name: str, kind: str, *, called: str | None = None) -> Iterator[tuple[dict[str, Tensor], Card]]:
+def open_checkpoint(name: str, kind: str, *, called: str | None = None) -> Iterator[tuple[dict[str, Tensor], Card]]:
     """Tensors and card of a bundled name, a file or a run folder, for building the network within.
 
     CheckpointError for weights of another kind than this, which messages call `called`, and where what is built of the
@@ -113,7 +113,7 @@ def read_card(path: Path) -> Card:
         raise CheckpointError(f"{path}: no readable card ({error})") from error
 
 
-def bundled() -> list[str]:
+def list_bundled() -> list[str]:
     """Names of the priors that come with the package."""
     found = (p.name for p in files("priors.weights").iterdir())
     return sorted(name.removesuffix(".safetensors") for name in found if name.endswith(".safetensors"))
@@ -125,9 +125,9 @@ def locate(name: str) -> Path:
     for candidate in (path, path / "model.safetensors", Path(f"{name}.safetensors")):
         if candidate.is_file() and candidate.suffix == ".safetensors":
             return candidate
-    if name in bundled():
+    if name in list_bundled():
         with as_file(files("priors.weights") / f"{name}.safetensors") as place:
             return place
     raise CheckpointError(
-        f"no prior {name!r}: neither a file nor one of {', '.join(bundled()) or 'the bundled (none)'}"
+        f"no prior {name!r}: neither a file nor one of {', '.join(list_bundled()) or 'the bundled (none)'}"
     )

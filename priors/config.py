@@ -24,7 +24,7 @@ class NetworkConfig:
         return cls(**{**config, **{name: tuple(config[name]) for name in tuples}})
 
 
-def check_least(settings: Any, least: int, *names: str) -> None:
+def require_at_least(settings: Any, least: int, *names: str) -> None:
     """RequestError unless each of these fields is at least so much."""
     for name in names:
         if getattr(settings, name) < least:

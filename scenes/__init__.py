@@ -38,15 +38,15 @@ def __getattr__(name: str):
     return module if _HOMES[name] == f"scenes.{name}" else getattr(module, name)
 
 
-def ready() -> tuple[str, ...]:
+def list_scenes() -> tuple[str, ...]:
     """Names of the scenes that come with mapctl."""
     return tuple(sorted(p.name.removesuffix(".toml") for p in files("scenes").iterdir() if p.name.endswith(".toml")))
 
 
-def find(scene: str) -> Path:
+def find_scene(scene: str) -> Path:
     """The path of a scene file or of a ready scene by name; RequestError lists these if there is neither."""
     if Path(scene).is_file() or Path(scene).suffix:
         return Path(scene)
-    if scene not in ready():
-        raise RequestError(f"no scene file {scene!r}; ready scenes: {', '.join(ready())}")
+    if scene not in list_scenes():
+        raise RequestError(f"no scene file {scene!r}; ready scenes: {', '.join(list_scenes())}")
     return Path(str(files("scenes") / f"{scene}.toml"))

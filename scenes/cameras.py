@@ -12,9 +12,9 @@ from mapctl.errors import RequestError
 from mapctl.mesh.primitives import Array, unit
 
 _UP = np.array([0.0, 1.0, 0.0])
-_ROOM = 1.12
+_FRAMING_MARGIN = 1.12
 """How much larger the picture is than what must be seen."""
-_MOST_FRAMES = 400
+_MAX_FRAMES = 400
 """Frames looked at to find the distance; more of a long motion would not change it."""
 
 
@@ -93,7 +93,7 @@ def look_at(eye: Array, target: Array, up: Array = _UP) -> Array:
     return pose
 
 
-def orientation(settings: CameraSettings) -> Array:
+def camera_axes(settings: CameraSettings) -> Array:
     """(3, 3) columns right, up and back of the camera."""
     usual = 0.0 if settings.kind == "top" else _AZIMUTH_DEG
     azimuth = np.radians(usual if settings.azimuth_deg is None else settings.azimuth_deg)
@@ -106,7 +106,7 @@ def orientation(settings: CameraSettings) -> Array:
     return look_at(back, np.zeros(3))[:3, :3]
 
 
-def fit(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
+def fit_eye(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
     """The nearest place (3,) from which a camera with the given axes sees all points (n, 3), in the middle.
 
     Each side of the picture bounds the eye by a plane. Left and right, and top and bottom, meet in two
@@ -114,17 +114,17 @@ def fit(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
     """
     right, up, back = (points @ axes).T
     wide, high = aspect * np.tan(fov / 2), np.tan(fov / 2)
-    away = max(_apex(right, back, wide), _apex(up, back, high))
+    away = max(_find_apex(right, back, wide), _find_apex(up, back, high))
     depth = away - back
-    return axes @ np.array([_centred(right, depth), _centred(up, depth), away])
+    return axes @ np.array([_find_centre(right, depth), _find_centre(up, depth), away])
 
 
-def _apex(across: Array, back: Array, slope: float) -> float:
+def _find_apex(across: Array, back: Array, slope: float) -> float:
     """How far back the tightest wedge of a slope starts that opens over all points."""
     return float(((across / slope + back).max() + (-across / slope + back).max()) / 2)
 
 
-def _centred(across: Array, depth: Array) -> float:
+def _find_centre(across: Array, depth: Array) -> float:
     """The place across that has the outermost points of both sides equally far from the middle."""
     depth = np.maximum(depth, 1e-6)
 
@@ -135,24 +135,26 @@ def _centred(across: Array, depth: Array) -> float:
     return cast(float, brentq(lopsided, across.min() - 1e-6, across.max() + 1e-6, xtol=1e-6))
 
 
-def views(settings: CameraSettings, points: Array, targets: Array, *, fps: float, size: tuple[int, int]) -> list[View]:
+def compute_views(
+    settings: CameraSettings, points: Array, targets: Array, *, fps: float, size: tuple[int, int]
+) -> list[View]:
     """One view a frame.
 
     `points` (frames or 1, n, 3) must be seen; a following camera follows `targets` (frames, 3). `size` is
     the picture's width and height, pixels.
     """
-    axes, fov = orientation(settings), np.radians(settings.fov_deg)
+    axes, fov = camera_axes(settings), np.radians(settings.fov_deg)
     centre = np.zeros_like(targets)
     if settings.kind == "follow":
         centre = _smooth(targets, settings.smooth_seconds * fps)
         centre[:, 1] = np.median(targets[:, 1])
     seen = points - (centre[:, None] if len(points) == len(centre) else 0.0)
-    seen = seen[:: max(1, len(seen) // _MOST_FRAMES)].reshape(-1, 3)
-    framed = 2 * np.arctan(np.tan(fov / 2) * settings.zoom / _ROOM)
-    eye = fit(seen, axes, fov=framed, aspect=size[0] / size[1])
+    seen = seen[:: max(1, len(seen) // _MAX_FRAMES)].reshape(-1, 3)
+    framed = 2 * np.arctan(np.tan(fov / 2) * settings.zoom / _FRAMING_MARGIN)
+    eye = fit_eye(seen, axes, fov=framed, aspect=size[0] / size[1])
     pose = np.eye(4)
     pose[:3, :3] = axes
-    return [View(_moved(pose, eye + shift), float(fov), *size) for shift in centre]
+    return [View(_move_camera(pose, eye + shift), float(fov), *size) for shift in centre]
 
 
 def _smooth(path: Array, sigma: float) -> Array:
@@ -162,7 +164,7 @@ def _smooth(path: Array, sigma: float) -> Array:
     return gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]
 
 
-def _moved(pose: Array, eye: Array) -> Array:
+def _move_camera(pose: Array, eye: Array) -> Array:
     moved = pose.copy()
     moved[:3, 3] = eye
     return moved

@@ -14,56 +14,56 @@ _GAP = 0.008
 """Between pictures, as a share of the width."""
 _GHOST_STRIDE = 1.0
 """Ghosts stand about this far apart, metres."""
-_MOST_GHOSTS = 16
+_MAX_GHOSTS = 16
 """Of all actors together, but at least four each."""
 
 
 @dataclass(frozen=True)
-class Row:
+class StillRow:
     """How the stills look."""
 
     count: int
     """Stills beside each other."""
-    tall: float
+    height_over_width: float
     """Height of one over its width."""
     kind: str
     """Their camera."""
 
 
-def contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Array:
+def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Array:
     """(height, width, 3) uint8 of the given width; the ghosts' picture has `size`, the stills come below."""
     wide = replace(camera, kind="top" if camera.kind == "top" else "fixed")
-    top = brush.paint(stage.views(wide, size)[0], stage.ghosts(_ghosts(stage)))
-    row = _row(stage, camera, size)
+    top = brush.paint(stage.views(wide, size)[0], stage.compose_ghosts(_choose_ghost_frames(stage)))
+    row = _choose_row(stage, camera, size)
     gap = max(2, round(_GAP * size[0]))
     width = (size[0] - (row.count - 1) * gap) // row.count
-    height = max(1, round(width * row.tall))
+    height = max(1, round(width * row.height_over_width))
     sheet = np.full((size[1] + gap + height, size[0], 3), 255, np.uint8)
     sheet[: size[1]] = top
     views = stage.views(replace(camera, kind=row.kind), (width, height))
-    for k, moment in enumerate(_spread(stage.num_frames - 1, row.count)):
+    for k, moment in enumerate(_space_evenly(stage.num_frames - 1, row.count)):
         left = round(k * (size[0] - width) / (row.count - 1))
-        still = _labelled(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
+        still = _add_label(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
         sheet[size[1] + gap :, left : left + width] = still
     return sheet
 
 
-def _row(stage: Stage, camera: CameraSettings, size: tuple[int, int]) -> Row:
+def _choose_row(stage: Stage, camera: CameraSettings, size: tuple[int, int]) -> StillRow:
     """One actor is seen close in upright stills; several need the whole picture."""
     if len(stage.players) == 1:
-        return Row(6, 1.15, "top" if camera.kind == "top" else "follow")
-    return Row(4, size[1] / size[0], camera.kind)
+        return StillRow(6, 1.15, "top" if camera.kind == "top" else "follow")
+    return StillRow(4, size[1] / size[0], camera.kind)
 
 
-def _spread(last: int, count: int) -> list[int]:
+def _space_evenly(last: int, count: int) -> list[int]:
     return [round(k) for k in np.linspace(0, last, count)]
 
 
-def _ghosts(stage: Stage) -> list[int]:
+def _choose_ghost_frames(stage: Stage) -> list[int]:
     """Frames about a stride apart for who goes furthest; without the first where a loop ends there."""
     paths = [player.body.anatomy.hips_world[:, [0, 2]] for player in stage.players]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
-    most = max(4, _MOST_GHOSTS // len(paths))
+    most = max(4, _MAX_GHOSTS // len(paths))
     furthest = paths[int(np.argmax(lengths))]
     # Someone who sways on the spot goes a long way too, but not far.
     reach = np.linalg.norm(furthest - furthest[0], axis=1).max()
@@ -71,10 +71,10 @@ def _ghosts(stage: Stage) -> list[int]:
     if count == 1:
         return [stage.num_frames // 2]
     loop = max(lengths) > 3 * _GHOST_STRIDE and np.linalg.norm(furthest[-1] - furthest[0]) < _GHOST_STRIDE
-    return _spread(stage.num_frames - 1, count + 1)[1:] if loop else _spread(stage.num_frames - 1, count)
+    return _space_evenly(stage.num_frames - 1, count + 1)[1:] if loop else _space_evenly(stage.num_frames - 1, count)
 
 
-def _labelled(picture: Array, text: str) -> Array:
+def _add_label(picture: Array, text: str) -> Array:
     from PIL import Image, ImageDraw, ImageFont
 
     image = Image.fromarray(picture)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from mapctl.mesh import colours
-from mapctl.mesh.mannequin import Body
+from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import View
 
@@ -14,7 +14,7 @@ from scenes.cameras import View
 class Figure:
     """One body in one pose."""
 
-    body: Body
+    body: Mannequin
     """Whose."""
     frame: int
     """Of its own motion."""
@@ -25,7 +25,7 @@ class Figure:
         """Its skin."""
         skin = self.body.surface(self.frame)
         rgba = skin.rgba.copy()
-        rgba[:, :3] = colours.mix(rgba[:, :3], colours.rgb(colours.BACKGROUND), self.fade)
+        rgba[:, :3] = colours.blend_colours(rgba[:, :3], colours.rgb(colours.BACKGROUND), self.fade)
         return Surface(skin.vertices, skin.faces, rgba, skin.normals)
 
 

@@ -13,16 +13,16 @@ from mapctl.errors import RequestError
 from mapctl.formats import atomic
 from mapctl.mesh.primitives import Array
 from scenes.cameras import CameraSettings
-from scenes.contact_sheet import contact_sheet
+from scenes.contact_sheet import draw_contact_sheet
 from scenes.content import Painter
-from scenes.renderers.select import RendererName, painter
+from scenes.renderers.select import RendererName, select_painter
 from scenes.stage import Shot, Stage
 from scenes.writers import gif_writer, mp4_writer, save_png
 
 WRITERS = {".mp4": mp4_writer, ".gif": gif_writer}
 ENDINGS = (*WRITERS, ".png")
 """What `film` can write."""
-_SMALLEST, _LARGEST = 16, 8192
+_MIN_PIXELS, _MAX_PIXELS = 16, 8192
 
 PathOrText = str | PathLike[str]
 
@@ -43,13 +43,13 @@ def film(
     left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
     the way over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
     them. `size` is the width and height in pixels (MP4 rounds up to even). `progress` is called with frames
-    done and all frames. `renderer` is that of `scenes.renderers.select.painter`. RequestError for endings, sizes
+    done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for endings, sizes
     and places that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
     stage, brush, camera = (
         Stage([Shot(*actor) for actor in actors], fps),
-        painter(renderer),
+        select_painter(renderer),
         camera or CameraSettings(),
     )
     moving, sheets = (
@@ -57,9 +57,9 @@ def film(
         [p for p in paths if p.suffix.lower() == ".png"],
     )
     if moving:
-        _shoot(moving, stage, brush, camera, size, progress)
+        _write_films(moving, stage, brush, camera, size, progress)
     if sheets:
-        picture = contact_sheet(stage, brush, camera, size)
+        picture = draw_contact_sheet(stage, brush, camera, size)
         for path in sheets:
             save_png(path, picture)
     return paths
@@ -68,8 +68,8 @@ def film(
 def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path]:
     """The paths, or RequestError before any long work."""
     width, height = size
-    if not (_SMALLEST <= width <= _LARGEST and _SMALLEST <= height <= _LARGEST):
-        raise RequestError(f"the size must be {_SMALLEST} to {_LARGEST} pixels a side, got {width}x{height}")
+    if not (_MIN_PIXELS <= width <= _MAX_PIXELS and _MIN_PIXELS <= height <= _MAX_PIXELS):
+        raise RequestError(f"the size must be {_MIN_PIXELS} to {_MAX_PIXELS} pixels a side, got {width}x{height}")
     for path in out:
         ending = Path(path).suffix.lower()
         if ending not in ENDINGS:
@@ -80,13 +80,13 @@ def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path
     return [Path(path) for path in out]
 
 
-def frames(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Iterator[Array]:
+def render_frames(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Iterator[Array]:
     """Every picture of a film in turn, (height, width, 3) uint8."""
     for frame, view in enumerate(stage.views(camera, size)):
         yield brush.paint(view, stage.content(frame))
 
 
-def _shoot(
+def _write_films(
     paths: Sequence[Path],
     stage: Stage,
     brush: Painter,
@@ -99,7 +99,7 @@ def _shoot(
         for path in paths:
             scratch = open_files.enter_context(atomic.atomic_path(path))
             writers.append(open_files.enter_context(WRITERS[path.suffix.lower()](scratch, size, stage.fps)))
-        for done, picture in enumerate(frames(stage, brush, camera, size), start=1):
+        for done, picture in enumerate(render_frames(stage, brush, camera, size), start=1):
             for write in writers:
                 write(np.ascontiguousarray(picture))
             if progress is not None:

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface, unit
 
-TILE_HEIGHT, LINE_HEIGHT, WISH_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT = (
+TILE_HEIGHT, LINE_HEIGHT, TARGET_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT = (
     0.0,
     0.002,
     0.004,
@@ -20,35 +20,35 @@ TILE_HEIGHT, LINE_HEIGHT, WISH_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT 
 LIGHT = unit(np.array([-0.34, -1.0, -0.28]))
 """Direction in which the light of the shadows travels."""
 _LINE, _MAJOR_LINE = 0.014, 0.03
-_MOST_TILES = 60
-_NEAR, _FAR = 2.0, 6.5
+_MAX_TILES = 60
+_FADE_START, _FADE_END = 2.0, 6.5
 _SHADOW_CELLS = 52
 _SHADOW_STRENGTH = 0.5
 
 
-def grid(places: Array) -> Surface:
+def build_grid(places: Array) -> Surface:
     """Squares of 1 m and lines, every fifth stronger, around the places (n, 2) x, z; they fade with distance.
 
     Where the places are more than 60 m apart the squares grow to 5 m, 25 m and so on.
     """
-    low, high = places.min(axis=0) - _FAR, places.max(axis=0) + _FAR
+    low, high = places.min(axis=0) - _FADE_END, places.max(axis=0) + _FADE_END
     step = 1.0
-    while (high - low).max() / step > _MOST_TILES:
+    while (high - low).max() / step > _MAX_TILES:
         step *= 5
     first, last = np.floor(low / step).astype(int), np.ceil(high / step).astype(int)
     x, z = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
     tree = KDTree(places)
-    tiles = _tiles(x, z, step)
-    lines = [_lines(x, z, step), _lines(z, x, step)[:, ::-1, ::-1]]
+    tiles = _build_tiles(x, z, step)
+    lines = [_build_lines(x, z, step), _build_lines(z, x, step)[:, ::-1, ::-1]]
     strong = np.concatenate([np.repeat(x % 5 == 0, len(z) - 1), np.repeat(z % 5 == 0, len(x) - 1)])
     quads = np.concatenate([tiles, *lines])
     height = np.repeat([TILE_HEIGHT, LINE_HEIGHT], [len(tiles), len(strong)])
     rgb = np.where(np.arange(len(quads))[:, None] < len(tiles), colours.rgb(colours.TILE), colours.rgb(colours.GRID))
     strength = np.concatenate([np.ones(len(tiles)), np.where(strong, 1.0, 0.62)])
-    return _faded(quads, height, rgb, strength, tree)
+    return _fade_quads(quads, height, rgb, strength, tree)
 
 
-def _tiles(x: Array, z: Array, step: float) -> Array:
+def _build_tiles(x: Array, z: Array, step: float) -> Array:
     """Every second square of a chessboard, (quads, 4, 2)."""
     a, b = np.meshgrid(x[:-1], z[:-1], indexing="ij")
     dark = (a + b) % 2 == 0
@@ -56,7 +56,7 @@ def _tiles(x: Array, z: Array, step: float) -> Array:
     return (corner + np.array([[0, 0], [0, 1], [1, 1], [1, 0]])) * step
 
 
-def _lines(x: Array, z: Array, step: float) -> Array:
+def _build_lines(x: Array, z: Array, step: float) -> Array:
     """Lines along z in pieces of one square, so that they can fade, (quads, 4, 2)."""
     a, b = np.meshgrid(x, z[:-1], indexing="ij")
     half = np.where(a % 5 == 0, _MAJOR_LINE, _LINE).reshape(-1, 1) / 2 * step**0.5
@@ -65,21 +65,21 @@ def _lines(x: Array, z: Array, step: float) -> Array:
     return np.stack([np.concatenate([left, left, right, right], 1), np.concatenate([near, far, far, near], 1)], axis=-1)
 
 
-def _faded(quads: Array, height: Array, rgb: Array, strength: Array, tree: KDTree) -> Surface:
+def _fade_quads(quads: Array, height: Array, rgb: Array, strength: Array, tree: KDTree) -> Surface:
     """Quads whose colours turn into the background's; opaque, for eight bits of opacity show as rings."""
     distance = tree.query(quads.reshape(-1, 2))[0].reshape(-1, 4)
-    share = np.clip((_FAR - distance) / (_FAR - _NEAR), 0, 1)
+    share = np.clip((_FADE_END - distance) / (_FADE_END - _FADE_START), 0, 1)
     shown = strength[:, None] * share * share * (3 - 2 * share)
     kept = shown.max(axis=1) > 0
     quads, shown, many = quads[kept], shown[kept], int(kept.sum())
     vertices = np.insert(quads, 1, np.broadcast_to(height[kept, None], (many, 4)), axis=-1).reshape(-1, 3)
     background = colours.rgb(colours.BACKGROUND)
-    colour = colours.mix(background, np.repeat(rgb[kept], 4, axis=0), shown.reshape(-1, 1))
+    colour = colours.blend_colours(background, np.repeat(rgb[kept], 4, axis=0), shown.reshape(-1, 1))
     rgba = np.concatenate([colour, np.ones((4 * many, 1))], axis=1)
-    return Surface(vertices, _quad_faces(np.arange(4 * many).reshape(-1, 4)), rgba)
+    return Surface(vertices, _triangulate_quads(np.arange(4 * many).reshape(-1, 4)), rgba)
 
 
-def ribbon(points: Array, *, width: float, rgb: Array, height: float) -> Surface:
+def build_ribbon(points: Array, *, width: float, rgb: Array, height: float) -> Surface:
     """A flat band along points (n, 2) x, z on the ground, or (n, 3) in space, of constant width in metres."""
     space = np.insert(points, 1, 0.0, axis=1) if points.shape[1] == 2 else points
     space = space + np.array([0.0, height, 0.0])
@@ -89,15 +89,15 @@ def ribbon(points: Array, *, width: float, rgb: Array, height: float) -> Surface
     vertices = np.stack([space + side, space - side], axis=1).reshape(-1, 3)
     index = np.arange(2 * len(space)).reshape(-1, 2)
     quads = np.concatenate([index[:-1], index[1:, ::-1]], axis=1)
-    return Surface(vertices, _quad_faces(quads), np.tile([*rgb, 1.0], (len(vertices), 1)))
+    return Surface(vertices, _triangulate_quads(quads), np.tile([*rgb, 1.0], (len(vertices), 1)))
 
 
-def part_of_ribbon(whole: Surface, points: int) -> Surface:
+def cut_ribbon(whole: Surface, points: int) -> Surface:
     """The first `points` points of a ribbon."""
     return Surface(whole.vertices[: 2 * points], whole.faces[: 2 * max(points - 1, 0)], whole.rgba[: 2 * points])
 
 
-def discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: int = 24) -> Surface:
+def build_discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: int = 24) -> Surface:
     """Marks on the ground at centres (n, 2) x, z in colours (n, 3): a pale disc with a strong rim."""
     turn = np.arange(corners) * 2 * np.pi / corners
     circle = np.stack([np.sin(turn), np.cos(turn)], axis=-1)
@@ -109,12 +109,12 @@ def discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: int = 2
     following = np.roll(ring, -1, axis=1)
     fan = np.stack([np.zeros(corners, int), ring[0], following[0]], axis=-1)
     bands = [np.stack([ring[k], ring[k + 1], following[k + 1], following[k]], axis=-1) for k in range(2)]
-    faces = np.concatenate([fan, _quad_faces(np.concatenate(bands))])
+    faces = np.concatenate([fan, _triangulate_quads(np.concatenate(bands))])
     shifts = len(rings) * np.arange(len(centres))[:, None, None]
     return Surface(np.insert(flat, 1, MARK_HEIGHT, axis=1), (faces + shifts).reshape(-1, 3), rgba)
 
 
-def shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
+def build_shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
     """Soft shadow of capsules (n, 2, 3) on the ground, darker and sharper the closer they are to it.
 
     Each capsule falls along LIGHT; the higher it is the more its edge is blurred, as under a large lamp.
@@ -126,15 +126,17 @@ def shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
     low, high = (flat - margin).min(axis=(0, 1)), (flat + margin).max(axis=(0, 1))
     x, z = (np.linspace(a, b, _SHADOW_CELLS, dtype=np.float32) for a, b in zip(low, high, strict=True))
     places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
-    alpha = _SHADOW_STRENGTH * (1 - _light_left(places, *(v.astype(np.float32) for v in (flat, blur, radii))))
+    alpha = _SHADOW_STRENGTH * (
+        1 - _compute_transmittance(places, *(v.astype(np.float32) for v in (flat, blur, radii)))
+    )
     rgba = np.concatenate([np.tile(colours.rgb(colours.SHADOW), (len(places), 1)), alpha[:, None]], axis=1)
     index = np.arange(len(places)).reshape(_SHADOW_CELLS, _SHADOW_CELLS)
     quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
     shown = alpha[quads].max(axis=1) > 0.004
-    return Surface(np.insert(places, 1, SHADOW_HEIGHT + 0.0005 * layer, axis=1), _quad_faces(quads[shown]), rgba)
+    return Surface(np.insert(places, 1, SHADOW_HEIGHT + 0.0005 * layer, axis=1), _triangulate_quads(quads[shown]), rgba)
 
 
-def _light_left(places: Array, flat: Array, blur: Array, radii: Array) -> Array:
+def _compute_transmittance(places: Array, flat: Array, blur: Array, radii: Array) -> Array:
     """Share of light that reaches each place (m, 2) past all capsules."""
     left = np.ones(len(places), dtype=np.float32)
     for (start, stop), soft, radius in zip(flat, blur, radii, strict=True):
@@ -150,6 +152,6 @@ def _light_left(places: Array, flat: Array, blur: Array, radii: Array) -> Array:
     return left
 
 
-def _quad_faces(quads: Array) -> Array:
+def _triangulate_quads(quads: Array) -> Array:
     """Two triangles for each quad (n, 4), next to each other so that the drawing order stays."""
     return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)

@@ -19,10 +19,10 @@ from scenes.cameras import CameraSettings
 
 _FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".png"), (".bvh", ".npz"), (".json",)
 _ENDINGS = (*_FILMS, *_MOTIONS, *_REPORTS)
-_MOST_SECONDS = 3600.0
+_MAX_SECONDS = 3600.0
 
-Seconds = Annotated[float, Field(gt=0, le=_MOST_SECONDS)]
-Place = Annotated[float, Field(ge=-1000, le=1000)]
+Seconds = Annotated[float, Field(gt=0, le=_MAX_SECONDS)]
+Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Actor:
     """Of everything random about this actor."""
     colour: str | None = None
     """Of the torso: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
-    offset: tuple[Place, Place] = (0.0, 0.0)
+    offset: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     """Where the curve's origin goes, x and z, metres."""
     turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """How far the curve is turned about its origin before that, degrees; positive turns +Z toward +X."""
-    start_seconds: Annotated[float, Field(ge=0, le=_MOST_SECONDS)] = 0.0
+    start_seconds: Annotated[float, Field(ge=0, le=_MAX_SECONDS)] = 0.0
     """When the actor starts; until then it stands in its first pose."""
 
 
@@ -74,41 +74,41 @@ class SceneDescription:
 
     def films(self, folder: PathLike[str] | str) -> list[Path]:
         """Paths of videos and pictures."""
-        return self._paths(folder, _FILMS)
+        return self._select_paths(folder, _FILMS)
 
     def reports(self, folder: PathLike[str] | str) -> list[Path]:
         """Paths of JSON reports."""
-        return self._paths(folder, _REPORTS)
+        return self._select_paths(folder, _REPORTS)
 
     def motions(self, folder: PathLike[str] | str) -> Mapping[str, list[Path]]:
         """Actor name to its motion's paths; `walk.bvh` becomes `walk-NAME.bvh` where there are several."""
-        paths = self._paths(folder, _MOTIONS)
+        paths = self._select_paths(folder, _MOTIONS)
         if len(self.actors) == 1:
             return {self.actors[0].name: paths}
         return {a.name: [p.with_name(f"{p.stem}-{a.name}{p.suffix}") for p in paths] for a in self.actors}
 
-    def _paths(self, folder: PathLike[str] | str, endings: tuple[str, ...]) -> list[Path]:
+    def _select_paths(self, folder: PathLike[str] | str, endings: tuple[str, ...]) -> list[Path]:
         return [Path(folder) / name for name in self.outputs if PurePath(name).suffix.lower() in endings]
 
 
 def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]]:
     """The scene and each actor's curve in the world, checked. FileFormatError names the file and the key."""
     try:
-        scene = toml.read(path, SceneDescription, what="scene file", unknown=_allowed)
+        scene = toml.read(path, SceneDescription, what="scene file", unknown=_list_allowed_keys)
     except RequestError as error:
         raise FileFormatError(path, f"camera: {error}") from error
-    scene = _with_names(scene)
+    scene = _name_actors(scene)
     _check(path, scene)
     placed = []
     for number, actor in enumerate(scene.actors):
         try:
-            placed.append(place(actor, Path(path).parent))
+            placed.append(transform_curve(actor, Path(path).parent))
         except MapctlError as error:
             raise FileFormatError(path, f"actors[{number}].curve: {error}") from error
     return scene, tuple(placed)
 
 
-def place(actor: Actor, folder: Path) -> Curve:
+def transform_curve(actor: Actor, folder: Path) -> Curve:
     """The actor's curve turned and moved to its place; files are relative to `folder`."""
     is_file = PurePath(actor.curve).suffix.lower() in (".csv", ".svg")
     curve = curves.read(folder / actor.curve if is_file else actor.curve)
@@ -120,12 +120,12 @@ def place(actor: Actor, folder: Path) -> Curve:
     return curves.from_points(points, closed=curve.closed)
 
 
-def _allowed(key: Sequence[int | str]) -> str:
+def _list_allowed_keys(key: Sequence[int | str]) -> str:
     known = {"actors": Actor, "camera": CameraSettings} if len(key) > 1 else {}
     return f"allowed: {', '.join(item.name for item in fields(known.get(str(key[0]), SceneDescription)))}"
 
 
-def _with_names(scene: SceneDescription) -> SceneDescription:
+def _name_actors(scene: SceneDescription) -> SceneDescription:
     named = [replace(a, name=a.name or f"actor{k}") for k, a in enumerate(scene.actors, start=1)]
     return replace(scene, actors=tuple(named))
 

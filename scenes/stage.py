@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from mapctl.contacts import planted
+from mapctl.contacts import detect_contacts
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.joint_names import Side
 from mapctl.mesh import colours
-from mapctl.mesh.mannequin import Body
-from mapctl.mesh.primitives import Array, Surface, merge
+from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from mapctl.motion import Motion
 from scenes import overlays
-from scenes.cameras import CameraSettings, View, views
+from scenes.cameras import CameraSettings, View, compute_views
 from scenes.content import Content, Figure
 
 _RIBBON_STEP = 0.06
@@ -37,10 +37,10 @@ class Shot(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Player:
+class StagedActor:
     """An actor made ready: its body, and its ribbons and contacts worked out once."""
 
-    body: Body
+    body: Mannequin
     wish: Surface | None
     trail: Surface
     planted: Array
@@ -60,11 +60,11 @@ class Stage:
         if not shots:
             raise RequestError("a film needs at least one actor")
         self.fps = Fraction(fps or shots[0].motion.fps).limit_denominator(100_000)
-        self.players = [_player(shot, k, len(shots), self.fps) for k, shot in enumerate(shots)]
+        self.players = [_prepare_actor(shot, k, len(shots), self.fps) for k, shot in enumerate(shots)]
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
-        self._grid = overlays.grid(self._places()[:, [0, 2]])
+        self._grid = overlays.build_grid(self._places()[:, [0, 2]])
         wishes = [player.wish for player in self.players if player.wish is not None]
-        self._still = merge([self._grid, *wishes])
+        self._still = merge_surfaces([self._grid, *wishes])
 
     @property
     def seconds(self) -> float:
@@ -74,12 +74,12 @@ class Stage:
     def content(self, film_frame: int) -> Content:
         """Everything at one frame."""
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
-        trails = [overlays.part_of_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
-        marks = [_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
+        trails = [overlays.cut_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
+        marks = [_build_contact_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
         ground = [self._still, *trails, *(m for m in marks if m is not None)]
         return Content(ground, figures)
 
-    def ghosts(self, film_frames: Sequence[int]) -> Content:
+    def compose_ghosts(self, film_frames: Sequence[int]) -> Content:
         """All actors at several moments in one picture, earlier ones paler, with the whole trails."""
         fades = np.linspace(0.62, 0.0, len(film_frames)) if len(film_frames) > 1 else [0.0]
         moments = list(zip(film_frames, fades, strict=True))
@@ -102,7 +102,7 @@ class Stage:
             places = [p.wish.vertices for p in self.players if p.wish is not None]
             still = np.concatenate([seen.reshape(-1, 3), *places])
             seen = still[None]
-        return views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
+        return compute_views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
 
     def _places(self) -> Array:
         """(n, 3) where anything happens, for the grid."""
@@ -110,42 +110,42 @@ class Stage:
         return np.concatenate([*paths, *(p.wish.vertices for p in self.players if p.wish is not None)])
 
 
-def _player(shot: Shot, number: int, count: int, fps: Fraction) -> Player:
+def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> StagedActor:
     if not 0 <= shot.start_seconds < 3600:
         raise RequestError(f"start_seconds must be from 0 to 3600, got {shot.start_seconds:g}")
     motion = shot.motion.resample(fps)
-    colour = colours.rgb(shot.colour or colours.default(number))
-    body = Body(motion, colour)
+    colour = colours.rgb(shot.colour or colours.default_colour(number))
+    body = Mannequin(motion, colour)
     # One actor has a red wish and a yellow trail as in the paper; among several both must say whose they are.
-    wish, trod = colours.rgb(colours.WISH), colours.rgb(colours.TRAIL)
+    wish, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
-        wish, trod = colours.mix(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
-    ribbon = None if shot.curve is None else _wish(shot.curve, wish)
+        wish, trod = colours.blend_colours(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
+    ribbon = None if shot.curve is None else _build_curve_ribbon(shot.curve, wish)
     path = body.anatomy.hips_world[:, [0, 2]]
-    trail = overlays.ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT)
-    return Player(body, ribbon, trail, _planted(body, float(fps)), round(shot.start_seconds * fps))
+    trail = overlays.build_ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT)
+    return StagedActor(body, ribbon, trail, _detect_foot_contacts(body, float(fps)), round(shot.start_seconds * fps))
 
 
-def _wish(curve: Curve, rgb: Array) -> Surface:
+def _build_curve_ribbon(curve: Curve, rgb: Array) -> Surface:
     """A band along the curve; its dense points are thinned to what a picture shows."""
     points = curve.points.detach().cpu().numpy()
     keep = max(1, round(_RIBBON_STEP / max(curve.length / (len(points) - 1), 1e-6)))
     thin = np.concatenate([points[:-1:keep], points[-1:]])
-    return overlays.ribbon(thin, width=0.11, rgb=rgb, height=overlays.WISH_HEIGHT)
+    return overlays.build_ribbon(thin, width=0.11, rgb=rgb, height=overlays.TARGET_HEIGHT)
 
 
-def _planted(body: Body, fps: float) -> Array:
+def _detect_foot_contacts(body: Mannequin, fps: float) -> Array:
     balls = [foot.ball for foot in body.anatomy.feet]
     if len(balls) != 2:
         return np.zeros((body.num_frames, len(balls)), bool)
-    return planted(torch.from_numpy(body.anatomy.points.world[:, balls]), fps).numpy()
+    return detect_contacts(torch.from_numpy(body.anatomy.points.world[:, balls]), fps).numpy()
 
 
-def _marks(player: Player, frame: int) -> Surface | None:
+def _build_contact_marks(player: StagedActor, frame: int) -> Surface | None:
     """A disc under the ball of every foot that stands, in its side's colour."""
     feet = [foot for foot, stands in zip(player.body.anatomy.feet, player.planted[frame], strict=True) if stands]
     if not feet:
         return None
     centres = player.body.anatomy.points.world[frame, [foot.ball for foot in feet]][:, [0, 2]]
     sides = [colours.rgb(colours.LEFT if foot.side is Side.LEFT else colours.RIGHT) for foot in feet]
-    return overlays.discs(centres, np.array(sides), radius=0.1 * player.body.anatomy.scale)
+    return overlays.build_discs(centres, np.array(sides), radius=0.1 * player.body.anatomy.scale)

@@ -30,7 +30,7 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 
     4:2:0 colour needs even sides, so odd ones get one more row or column like their last.
     """
-    av = _package("av")
+    av = _import_package("av")
     # The encoder says what it does on standard error unless told not to.
     av.logging.set_level(av.logging.ERROR)
     width, height = (side + side % 2 for side in size)
@@ -57,15 +57,15 @@ def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
     GIF counts in hundredths of a second; the delays alternate so that the whole keeps its time. Over 50
     pictures a second only every second, third, ... is kept. RequestError when it outgrows 600 megapixels.
     """
-    image = _package("PIL.Image")
+    image = _import_package("PIL.Image")
     stride, count, pictures = math.ceil(fps / _GIF_FPS), 0, []
 
     def write(picture: Array) -> None:
         nonlocal count
         count += 1
         if (count - 1) % stride == 0:
-            _check_room(len(pictures) + 1, size)
-            pictures.append(_quantized(image, picture, pictures[0] if pictures else None))
+            _check_gif_size(len(pictures) + 1, size)
+            pictures.append(_quantize(image, picture, pictures[0] if pictures else None))
 
     yield write
     ends = [round(100 * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
@@ -73,24 +73,24 @@ def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
     pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=delays, loop=0)
 
 
-def _check_room(pictures: int, size: tuple[int, int]) -> None:
+def _check_gif_size(pictures: int, size: tuple[int, int]) -> None:
     most = int(_GIF_PIXELS) // (size[0] * size[1])
     if pictures > most:
         raise RequestError(f"a GIF of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4")
 
 
-def _quantized(image, picture: Array, first):
+def _quantize(image, picture: Array, first):
     """With the palette of the first picture, or for the first with one of its own."""
     whole, plain = image.fromarray(picture), image.Dither.NONE
     if first is None:
-        sample = image.fromarray(np.concatenate([picture, _swatches(picture.shape[1], picture.shape[0] // 12)]))
+        sample = image.fromarray(np.concatenate([picture, _make_swatches(picture.shape[1], picture.shape[0] // 12)]))
         first = sample.quantize(_GIF_COLOURS, method=image.Quantize.MAXCOVERAGE, dither=plain)
     return whole.quantize(palette=first, dither=plain)
 
 
-def _swatches(width: int, height: int) -> Array:
+def _make_swatches(width: int, height: int) -> Array:
     """(4 * ceil(height / 4), width, 3): colours in light and shade that the first picture may lack."""
-    shown = (colours.LEFT, colours.RIGHT, colours.WISH, colours.TRAIL)
+    shown = (colours.LEFT, colours.RIGHT, colours.TARGET, colours.TRAIL)
     light = np.linspace(0.55, 1.0, width)[:, None]
     rows = np.stack([colours.rgb(colour) * light * 255 for colour in shown])
     return np.repeat(rows.astype(np.uint8), math.ceil(height / len(shown)), axis=0)
@@ -98,12 +98,12 @@ def _swatches(width: int, height: int) -> Array:
 
 def save_png(path: Path, picture: Array) -> None:
     """Write one picture (height, width, 3) uint8, whole or not at all."""
-    image = _package("PIL.Image")
+    image = _import_package("PIL.Image")
     with atomic.atomic_path(path) as scratch:
         image.fromarray(picture).save(scratch, format="PNG", optimize=True)
 
 
-def _package(name: str):
+def _import_package(name: str):
     from importlib import import_module
 
     try:

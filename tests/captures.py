@@ -67,7 +67,7 @@ def on_rig(rig: str, frames: int = 90, *, fps: int = 30, seed: int = 0, turn_rat
     if rig == "canonical":
         return motion
     skeleton = bandai_skeleton() if rig == "bandai" else cmu_skeleton()
-    rigged = retarget.from_canonical(motion, retarget.map_rig(skeleton))
+    rigged = retarget.from_canonical(motion, retarget.identify_rig(skeleton))
     if rig == "bandai":
         return rigged
     quats = rigged.local_quat_xyzw.clone()

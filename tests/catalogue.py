@@ -8,18 +8,18 @@ from mapctl.curves import Curve
 from mapctl.features import encode
 from mapctl.terms import (
     Clearance,
-    Closeness,
-    Footing,
+    FootContact,
+    Jerk,
     Keyframe,
+    LatentPrior,
     Likelihood,
-    Noise,
+    MotionTracking,
     Observation,
     Path,
-    Seam,
-    Steps,
+    RootVelocity,
+    StepLength,
     Support,
     Term,
-    Travel,
 )
 from priors.lstm_gmm.network import LstmGmm
 
@@ -47,20 +47,20 @@ _OBSERVED = Observation(
 
 TERMS: dict[str, Term] = {
     "likelihood": Likelihood(temperature=2.0),
-    "noise": Noise(sigma=0.7),
+    "noise": LatentPrior(sigma=0.7),
     "path of the hips": Path(curves.line(length=3), _ARCS),
     "path of a hand": Path(curves.circle(radius=3), _ARCS, joint="leftHand"),
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
-    "footing": Footing(),
-    "steps": Steps(0.6),
+    "footing": FootContact(),
+    "steps": StepLength(0.6),
     "support": Support(rest_height=0.08),
     "observation": _OBSERVED,
     "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
-    "seam": Seam(sigma=300.0),
-    "closeness": Closeness(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_turn=0.3),
+    "seam": Jerk(sigma=300.0),
+    "closeness": MotionTracking(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_heading=0.3),
     "keyframe": Keyframe(0.3 + 0.1 * torch.rand(FRAMES, 21, 3, generator=generator(9)).double(), _MASK, 0.1),
-    "travel": Travel(_VELOCITIES, _VELOCITIES[:9] - 0.2),
-    "travel, facing": Travel(_VELOCITIES, _VELOCITIES[:3], facing=4 * torch.arange(FRAMES).double()),
+    "travel": RootVelocity(_VELOCITIES, _VELOCITIES[:9] - 0.2),
+    "travel, facing": RootVelocity(_VELOCITIES, _VELOCITIES[:3], facing=4 * torch.arange(FRAMES).double()),
 }
 """Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
 

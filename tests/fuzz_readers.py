@@ -314,9 +314,9 @@ def _real(path: Path) -> Iterator[Specimen]:
     elif ending == ".npz":
         yield Specimen(path.name, "npz", path.read_bytes())
     elif ending == ".amc":
-        from mapctl.formats.acclaim import paths
+        from mapctl.formats.acclaim import find_paths
 
-        asf, lines = paths(path)[0].read_bytes(), path.read_bytes().splitlines(keepends=True)
+        asf, lines = find_paths(path)[0].read_bytes(), path.read_bytes().splitlines(keepends=True)
         fourth = next((k for k, line in enumerate(lines) if line.split() == [b"4"]), len(lines))
         yield Specimen(path.name, "amc", b"".join(lines[:fourth]), asf)
         yield Specimen(path.name, "asf", asf, b"".join(lines[:fourth]))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from mapctl import cli, retarget, rotations
-from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.motion import Motion
 from mapctl.retarget import rigs
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
@@ -23,8 +23,8 @@ from priors.checkpoints import Card
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus
-from priors.training.initial_states import abilities, choose
-from priors.training.recipes.lstm_gmm import statistics
+from priors.training.initial_states import measure_data_limits, select_initial_states
+from priors.training.recipes.lstm_gmm import compute_feature_statistics
 
 STRIDE = 0.25
 """Swing of the upper legs, radians."""
@@ -107,7 +107,7 @@ def turn_between(a_xyzw: Tensor, b_xyzw: Tensor) -> float:
 
 def bandai_skeleton() -> Skeleton:
     """Canonical bones under Bandai Namco names and joint frames, below a static root."""
-    rig = next(r for r in rigs.known() if r.name == "bandai-namco")
+    rig = next(r for r in rigs.known_rigs() if r.name == "bandai-namco")
     frames = [Rotation.identity()]
     for name in CANONICAL.names:
         x, y = (torch.tensor(rig.tpose[name][axis], dtype=torch.float64) for axis in ("x", "y"))
@@ -124,7 +124,7 @@ def bandai_skeleton() -> Skeleton:
 
 def cmu_skeleton() -> Skeleton:
     """Canonical bones under CMU (Daz) names with bent limbs, one finger, and End Sites for the toes."""
-    rig = next(r for r in rigs.known() if r.name == "cmu-daz")
+    rig = next(r for r in rigs.known_rigs() if r.name == "cmu-daz")
     kept = [name for name in CANONICAL.names if name in rig.joints]
     names = [rig.joints[name] for name in kept]
     parents = [
@@ -151,7 +151,7 @@ def corpus(count: int = 5, frames: int = 100) -> Corpus:
 def write_corpus(folder: Path, count: int = 5, frames: int = 80) -> Path:
     """The walks as BVH files of the Bandai Namco rig."""
     folder.mkdir(parents=True, exist_ok=True)
-    rigmap = retarget.map_rig(bandai_skeleton())
+    rigmap = retarget.identify_rig(bandai_skeleton())
     for number, motion in enumerate(walks(count, frames)):
         retarget.from_canonical(motion, rigmap).save(folder / f"walk-{number}.bvh")
     return folder
@@ -167,7 +167,7 @@ def tiny_model(
     dtype: torch.dtype = torch.float32,
 ) -> LstmGmm:
     """An untrained network with the statistics of the walks: it walks on at their mean pose and speed."""
-    mean, std = statistics(corpus().features)
+    mean, std = compute_feature_statistics(corpus().features)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         config = LstmGmmConfig(width=width, components=components, retain=retain, correlated=correlated)
@@ -181,9 +181,9 @@ def tiny_density(
     """The network as the solver takes it, on the reference path, with starts from the walks."""
     model = tiny_model(width=width, components=components, seed=seed)
     data = corpus()
-    found = choose(model, data, count=starts, generator=generator(seed))
-    shown, names = asdict(abilities(data)), {"starts": list(found.names)}
-    card = Card("lstm-gmm", model.config.as_card(), licence="none", data=names, abilities=shown, **Card.of_layout())
+    found = select_initial_states(model, data, count=starts, generator=generator(seed))
+    shown, names = asdict(measure_data_limits(data)), {"starts": list(found.names)}
+    card = Card("lstm-gmm", model.config.as_card(), licence="none", data=names, abilities=shown, **Card.layout_fields())
     density = LstmGmmDensity("tiny", model.to(dtype), found, card, use_fast=False)
     if dtype is not torch.float32:
         for part in ("previous", "hidden", "cell"):
@@ -195,12 +195,12 @@ def walking_trial(frames: int) -> Trial:
     """So many frames of a walk, no toe planted, and the two before them."""
     motion = walk(frames + 2)
     vectors, start = encode(motion)
-    ground, heading = root_places(vectors[:2], start)
+    ground, heading = integrate_root(vectors[:2], start)
     nothing = torch.zeros(1, frames, 1).double()
     bits = torch.zeros(1, frames, 2, dtype=torch.bool)
     return Trial(
         vectors[None, 2:],
-        Place(ground[-1], heading[-1]),
+        GroundPose(ground[-1], heading[-1]),
         nothing,
         nothing[..., 0],
         bits,

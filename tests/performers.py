@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mapctl import retarget, rotations
 from mapctl.motion import Motion
-from mapctl.retarget.carry import Body
+from mapctl.retarget.carry import RiggedCharacter
 from mapctl.retarget.stance import Stance
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
 
@@ -73,9 +73,9 @@ class Performer:
             local[:, joint] = rotations.multiply(local[:, joint], _about_x(angle))
         return Motion(bones, Fraction(fps), root, local)
 
-    def body(self) -> Body:
+    def body(self) -> RiggedCharacter:
         """As the walk shows it."""
-        return Body.of(self.walks())[1]
+        return RiggedCharacter.of(self.walks())[1]
 
     def _bones(self) -> Skeleton:
         offsets = CANONICAL.offsets * self.size
@@ -111,7 +111,7 @@ class Performer:
 
 def stance_of(motion: Motion) -> Stance:
     """Of a canonical clip."""
-    return Stance.of(motion, retarget.map_rig(motion.skeleton))
+    return Stance.of(motion, retarget.identify_rig(motion.skeleton))
 
 
 def tip_toed(motion: Motion, radians: float) -> Motion:

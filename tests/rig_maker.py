@@ -12,7 +12,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.retarget import rigs
-from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 _SIDES = (("left", 1.0), ("right", -1.0))
 
@@ -76,21 +76,21 @@ class Made:
                 local.append(rotations.slerp(still.expand(frames, 4), noise[:, k], torch.full((frames,), 0.1).double()))
             turned.append(above * Rotation.from_quat(local[-1].numpy()))
         hips = torch.from_numpy(self.upright.inv().apply(canonical.root_position.numpy()))
-        motion = Motion(self.skeleton, canonical.fps, hips, rotations.sign_continuous(torch.stack(local, 1)))
+        motion = Motion(self.skeleton, canonical.fps, hips, rotations.make_sign_continuous(torch.stack(local, 1)))
         own = names.index(self.joint["hips"])
         return motion if own == 0 else replace(motion, root_position=hips - motion.joint_positions()[:, own] + hips)
 
 
 def names_of(preset: str, version: int = 0) -> dict[str, str]:
     """The names of a listed rig, in one of its versions."""
-    rig = next(rig for rig in rigs.known() if rig.name == preset)
+    rig = next(rig for rig in rigs.known_rigs() if rig.name == preset)
     listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
     return {c: names[min(version, len(names) - 1)] for c, names in listed.items()}
 
 
 def versions_of(preset: str) -> int:
     """In how many ways a listed rig is written."""
-    rig = next(rig for rig in rigs.known() if rig.name == preset)
+    rig = next(rig for rig in rigs.known_rigs() if rig.name == preset)
     return 1 + min(len(rig.aliases.get(c, ())) for c in ("hips", "leftFoot"))
 
 
@@ -98,7 +98,7 @@ def make(wanted: Make) -> Made:
     """The rig that is wanted, with the truth about its T-pose."""
     upright = Rotation.from_euler("x", -90, degrees=True) if wanted.zup else Rotation.identity()
     facing = Rotation.from_euler("y", wanted.turned_deg, degrees=True)
-    names = wanted.names if not wanted.swapped else {c: wanted.names[mirrored_name(c)] for c in wanted.names}
+    names = wanted.names if not wanted.swapped else {c: wanted.names[mirror_name(c)] for c in wanted.names}
     # With all rotations zero a joint's own axes are the file's, while its body part is turned as in the rest pose.
     tpose = {c: _along_x(c) if wanted.bones_along_x else _rest(c, wanted).inv() * facing.inv() * upright for c in names}
     frame = {names[c]: tpose[c] for c in names} | ({wanted.root: upright} if wanted.root else {})

@@ -6,15 +6,15 @@ import numpy as np
 from helpers import walk
 
 from mapctl.errors import RequestError
-from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import CANONICAL
 
 
-def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> Delivered:
+def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameChunk:
     """Some frames of a walk, due now."""
     motion = walk(90).slice(first, first + count)
     joints = motion.joint_positions().numpy()
-    return Delivered(
+    return FrameChunk(
         time.perf_counter(),
         first / 30,
         motion.root_position.numpy(),

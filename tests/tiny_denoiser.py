@@ -24,7 +24,9 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: DenoiserConfig = CONFI
 
 def card() -> checkpoints.Card:
     """Of the tiny denoiser."""
-    return checkpoints.Card("denoiser", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.of_layout())
+    return checkpoints.Card(
+        "denoiser", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
+    )
 
 
 def tiny_denoiser(*, drawn: float = 0.0, seed: int = 0) -> ConvDenoiser:

@@ -25,7 +25,9 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFI
 
 def card() -> checkpoints.Card:
     """Of the tiny infiller."""
-    return checkpoints.Card("infiller", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.of_layout())
+    return checkpoints.Card(
+        "infiller", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
+    )
 
 
 def tiny_infiller(*, drawn: float = 0.0, seed: int = 0) -> ConvInfiller:

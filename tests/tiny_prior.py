@@ -6,13 +6,13 @@ from pathlib import Path
 import torch
 
 from mapctl.features import LAYOUT
-from mapctl.protocols import Abilities
+from mapctl.protocols import DataLimits
 from priors import checkpoints
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 
 SPEED = 1.2
 CONFIG = LstmGmmConfig(width=16, components=2)
-ABILITIES = Abilities(slowest=0.2, fastest=2.0, turn_rate=1.5)
+ABILITIES = DataLimits(slowest=0.2, fastest=2.0, turn_rate=1.5)
 
 
 def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8, labels: tuple[str, ...] = ()) -> Path:
@@ -36,7 +36,7 @@ def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8, labels: tuple
         data={"starts": [f"start {number}" for number in range(starts)]},
         quality={"mocap": {"sway_cm": {"mean": 1.9, "p2": 1.2, "p98": 2.6}}},
         abilities=asdict(ABILITIES),
-        **checkpoints.Card.of_layout(),
+        **checkpoints.Card.layout_fields(),
     )
     checkpoints.save(tensors, card, path)
     return path

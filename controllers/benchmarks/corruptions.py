@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mapctl import retarget, rotations
-from mapctl.contacts import planted
+from mapctl.contacts import detect_contacts
 from mapctl.errors import RequestError
 from mapctl.kinematics import local_from_world
 from mapctl.motion import Motion
@@ -20,7 +20,7 @@ from mapctl.terms.foot_contact import TOES
 
 
 @dataclass(frozen=True)
-class Spoilt:
+class CorruptedClip:
     """A capture as it would come."""
 
     motion: Motion
@@ -29,24 +29,28 @@ class Spoilt:
     """What its user would say is lost."""
 
 
-Spoil = Callable[[Motion, torch.Generator], Spoilt]
+CorruptionFunction = Callable[[Motion, torch.Generator], CorruptedClip]
 """Spoils a clean motion."""
 
 
-def noisy(
+def add_noise(
     motion: Motion, generator: torch.Generator, *, degrees: float, centimetres: float, spikes: float = 0.01
-) -> Spoilt:
+) -> CorruptedClip:
     """Normal noise on every angle of the joints that move and on the root's place; spikes of 40 degrees."""
     moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
-    angles = math.radians(degrees) * _normal(motion, generator)
+    angles = math.radians(degrees) * _sample_angle_noise(motion, generator)
     hit = torch.rand(angles.shape, generator=generator, dtype=torch.float64) < spikes
-    angles = angles + hit * math.radians(40) * torch.sign(_normal(motion, generator))
+    angles = angles + hit * math.radians(40) * torch.sign(_sample_angle_noise(motion, generator))
     turns = rotations.from_rotation_vector(angles * moves[None, :, None])
     quats = rotations.multiply(motion.local_quat_xyzw, turns)
-    return Spoilt(_moved(replace(motion, local_quat_xyzw=quats), _steps(motion, generator) * centimetres / 100))
+    return CorruptedClip(
+        _translate_body(
+            replace(motion, local_quat_xyzw=quats), _sample_position_noise(motion, generator) * centimetres / 100
+        )
+    )
 
 
-def misplaced(motion: Motion, generator: torch.Generator, *, centimetres: float) -> Spoilt:
+def perturb_positions(motion: Motion, generator: torch.Generator, *, centimetres: float) -> CorruptedClip:
     """Noise on the places of the joints, as of markers: bones point from one wrong place to another, and keep their
     length. The hips are misplaced themselves.
     """
@@ -57,25 +61,25 @@ def misplaced(motion: Motion, generator: torch.Generator, *, centimetres: float)
     for joint in range(CANONICAL.num_joints):
         if below := CANONICAL.children(joint):
             child = below[0]
-            turn = _shortest(places[:, child] - places[:, joint], wrong[:, child] - wrong[:, joint])
+            turn = _shortest_arc(places[:, child] - places[:, joint], wrong[:, child] - wrong[:, joint])
             world[:, joint] = rotations.multiply(turn, world[:, joint])
-    local = rotations.sign_continuous(local_from_world(CANONICAL.parents, world))
+    local = rotations.make_sign_continuous(local_from_world(CANONICAL.parents, world))
     spoilt = replace(canonical, root_position=wrong[:, 0], local_quat_xyzw=local)
-    return Spoilt(from_canonical(spoilt, rigmap, motion))
+    return CorruptedClip(from_canonical(spoilt, rigmap, motion))
 
 
-def dropped(motion: Motion, generator: torch.Generator, *, share: float) -> Spoilt:
+def drop_joints(motion: Motion, generator: torch.Generator, *, share: float) -> CorruptedClip:
     """In each frame a share of the joints is lost: they are masked, and point anywhere."""
-    spoilt = noisy(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
+    spoilt = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
     lost = torch.rand(motion.num_frames, motion.num_joints, generator=generator) < share
     masks = [Mask(motion.skeleton.names[joint], frame, frame + 1) for frame, joint in lost.nonzero().tolist()]
-    return Spoilt(_garbled(spoilt, lost, generator), tuple(masks))
+    return CorruptedClip(_randomise_rotations(spoilt, lost, generator), tuple(masks))
 
 
-def without_arm(motion: Motion, generator: torch.Generator, *, seconds: float) -> Spoilt:
+def drop_arm(motion: Motion, generator: torch.Generator, *, seconds: float) -> CorruptedClip:
     """An arm is lost for a while, in the middle; slight noise on the rest."""
-    spoilt = noisy(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
-    rigmap = retarget.map_rig(motion.skeleton)
+    spoilt = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
+    rigmap = retarget.identify_rig(motion.skeleton)
     length = min(round(seconds * float(motion.fps)), motion.num_frames // 2)
     start = (motion.num_frames - length) // 2
     arm = [rigmap.joint_of[CANONICAL.index(name)] for name in ("leftUpperArm", "leftLowerArm", "leftHand")]
@@ -83,49 +87,49 @@ def without_arm(motion: Motion, generator: torch.Generator, *, seconds: float) -
     lost = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
     lost[start : start + length, joints] = True
     masks = tuple(Mask(motion.skeleton.names[joint], start, start + length) for joint in joints)
-    return Spoilt(_garbled(spoilt, lost, generator), masks)
+    return CorruptedClip(_randomise_rotations(spoilt, lost, generator), masks)
 
 
-def sliding(motion: Motion, generator: torch.Generator, *, speed: float) -> Spoilt:
+def add_drift(motion: Motion, generator: torch.Generator, *, speed: float) -> CorruptedClip:
     """The body drifts to and fro over the ground, m/s, and its planted feet with it; slight noise."""
-    spoilt = noisy(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
+    spoilt = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
     seconds = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
     swing = speed * 1.5 / math.pi * torch.sin(math.pi * seconds / 1.5)
-    return Spoilt(_moved(spoilt, torch.stack([swing, 0 * swing, 0 * swing], dim=-1)))
+    return CorruptedClip(_translate_body(spoilt, torch.stack([swing, 0 * swing, 0 * swing], dim=-1)))
 
 
-CONDITIONS: Mapping[str, Spoil] = {
+CONDITIONS: Mapping[str, CorruptionFunction] = {
     **{
-        f"{d:g} degrees, {0.4 * d:g} cm, 1 % spikes": partial(noisy, degrees=d, centimetres=0.4 * d)
+        f"{d:g} degrees, {0.4 * d:g} cm, 1 % spikes": partial(add_noise, degrees=d, centimetres=0.4 * d)
         for d in (1, 3, 5, 8)
     },
-    "5 cm on every joint's place": partial(misplaced, centimetres=5.0),
-    "10 % of joints lost": partial(dropped, share=0.1),
-    "30 % of joints lost": partial(dropped, share=0.3),
-    "an arm lost for 2 s": partial(without_arm, seconds=2.0),
-    "body drifts by 20 cm/s": partial(sliding, speed=0.2),
+    "5 cm on every joint's place": partial(perturb_positions, centimetres=5.0),
+    "10 % of joints lost": partial(drop_joints, share=0.1),
+    "30 % of joints lost": partial(drop_joints, share=0.3),
+    "an arm lost for 2 s": partial(drop_arm, seconds=2.0),
+    "body drifts by 20 cm/s": partial(add_drift, speed=0.2),
 }
 """By name, as the table lists them."""
 
 
-def true_contacts(motion: Motion) -> Tensor:
+def detect_true_contacts(motion: Motion) -> Tensor:
     """Left and right toe planted in a clean motion, at its own rate (frames, 2)."""
     canonical, _ = to_canonical(motion)
     toes = [canonical.skeleton.index(name) for name in TOES]
-    return planted(canonical.joint_positions()[:, toes], float(motion.fps))
+    return detect_contacts(canonical.joint_positions()[:, toes], float(motion.fps))
 
 
-def _normal(motion: Motion, generator: torch.Generator) -> Tensor:
+def _sample_angle_noise(motion: Motion, generator: torch.Generator) -> Tensor:
     return torch.randn(motion.num_frames, motion.num_joints, 3, generator=generator, dtype=torch.float64)
 
 
-def _steps(motion: Motion, generator: torch.Generator) -> Tensor:
+def _sample_position_noise(motion: Motion, generator: torch.Generator) -> Tensor:
     return torch.randn(motion.num_frames, 3, generator=generator, dtype=torch.float64)
 
 
-def _moved(motion: Motion, by: Tensor) -> Motion:
+def _translate_body(motion: Motion, by: Tensor) -> Motion:
     """The joint that travels, moved: the hips or the root."""
-    hips = retarget.map_rig(motion.skeleton).joint_of[0]
+    hips = retarget.identify_rig(motion.skeleton).joint_of[0]
     if hips is None:
         raise RequestError("a rig without hips cannot be moved")
     if hips == 0 or hips not in motion.moving_offsets:
@@ -134,13 +138,13 @@ def _moved(motion: Motion, by: Tensor) -> Motion:
     return replace(motion, moving_offsets=moving)
 
 
-def _garbled(motion: Motion, lost: Tensor, generator: torch.Generator) -> Motion:
+def _randomise_rotations(motion: Motion, lost: Tensor, generator: torch.Generator) -> Motion:
     """Lost joints turned at random, so that whoever looks at them sees it."""
-    wild = rotations.from_rotation_vector(_normal(motion, generator))
+    wild = rotations.from_rotation_vector(_sample_angle_noise(motion, generator))
     return replace(motion, local_quat_xyzw=torch.where(lost[..., None], wild, motion.local_quat_xyzw))
 
 
-def _shortest(start: Tensor, stop: Tensor) -> Tensor:
+def _shortest_arc(start: Tensor, stop: Tensor) -> Tensor:
     """Quaternions (frames, 4) of the smallest turns from one direction to another."""
     start, stop = (torch.nn.functional.normalize(vector, dim=-1) for vector in (start, stop))
     real = 1 + (start * stop).sum(dim=-1, keepdim=True)

@@ -11,19 +11,19 @@ import torch
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 from torch import Tensor
 
-from controllers.benchmarks.corruptions import CONDITIONS, Spoilt, true_contacts
+from controllers.benchmarks.corruptions import CONDITIONS, CorruptedClip, detect_true_contacts
 from controllers.denoising.denoise import denoise
-from controllers.denoising.result import Denoised
+from controllers.denoising.result import DenoiseResult
 from controllers.inbetweening.infill import infill
 from mapctl import metrics, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser, Inbetweener
-from mapctl.recording.inspection import Examined, examine
+from mapctl.recording.inspection import Inspection, inspect_recording
 
 Row = dict[str, Any]
 
-KINDS: Mapping[str, str] = {
+CLIP_KINDS: Mapping[str, str] = {
     "walks": r"bandai.*_walk_",
     "turning walks": r"bandai.*_walk-turn",
     "runs": r"bandai.*_(run|dash)_",
@@ -31,15 +31,15 @@ KINDS: Mapping[str, str] = {
     "CMU, 120 fps": r"cmu",
 }
 """Clips by the first pattern that their path holds."""
-STANDARD = "5 degrees, 2 cm, 1 % spikes"
+STANDARD_CONDITION = "5 degrees, 2 cm, 1 % spikes"
 """The condition of the table by kind."""
 _CUTOFFS = (1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12)  # Hz
 _SPANS = (0.1, 0.17, 0.23, 0.3, 0.4, 0.5, 0.7, 1.0)  # seconds of a Savitzky-Golay window
-_LONGEST = 20.0  # seconds of a clip that are used
+_MAX_CLIP_SECONDS = 20.0  # seconds of a clip that are used
 
 
 @dataclass(frozen=True, eq=False)
-class Clip:
+class CleanClip:
     """A clean clip."""
 
     kind: str
@@ -48,19 +48,19 @@ class Clip:
     """On its rig, without a T-pose in front."""
 
 
-def kind_of(name: str) -> str:
+def classify_clip(name: str) -> str:
     """By the first pattern that fits; `other` if none does."""
-    return next((kind for kind, pattern in KINDS.items() if re.search(pattern, name)), "other")
+    return next((kind for kind, pattern in CLIP_KINDS.items() if re.search(pattern, name)), "other")
 
 
-def shortened(motion: Motion, *, skip_first: bool) -> Motion:
+def trim_clip(motion: Motion, *, skip_first: bool) -> Motion:
     """The first seconds of a clip, without its frame 0 if that is a T-pose."""
     first = 1 if skip_first else 0
-    return motion.slice(first, min(motion.num_frames, first + round(_LONGEST * float(motion.fps))))
+    return motion.slice(first, min(motion.num_frames, first + round(_MAX_CLIP_SECONDS * float(motion.fps))))
 
 
-def table(
-    clips: Sequence[Clip],
+def benchmark_denoising(
+    clips: Sequence[CleanClip],
     denoiser: Denoiser,
     *,
     infiller: Inbetweener | None = None,
@@ -74,26 +74,31 @@ def table(
         found = []
         for number, clip in enumerate(clips):
             spoilt = CONDITIONS[name](clip.motion, torch.Generator().manual_seed(number))
-            found.append(judged(clip.motion, spoilt, denoiser, densities, infiller))
-            if name == STANDARD:
+            found.append(evaluate_clip(clip.motion, spoilt, denoiser, densities, infiller))
+            if name == STANDARD_CONDITION:
                 by_kind.setdefault(clip.kind, []).append(found[-1])
             done += 1
             if progress is not None:
                 progress(done, len(clips) * (len(conditions) + 1))
-        rows.append({"what": name, "clips": len(clips), **_mean(found)})
-    rows += [{"what": f"{kind}, {STANDARD}", "clips": len(found), **_mean(found)} for kind, found in by_kind.items()]
+        rows.append({"what": name, "clips": len(clips), **_average_rows(found)})
+    rows += [
+        {"what": f"{kind}, {STANDARD_CONDITION}", "clips": len(found), **_average_rows(found)}
+        for kind, found in by_kind.items()
+    ]
     clean = []
     for clip in clips:
-        clean.append({"out_cm": _error(clip.motion, denoise(clip.motion, denoiser, densities=densities).motion)})
+        clean.append(
+            {"out_cm": _mean_joint_error_cm(clip.motion, denoise(clip.motion, denoiser, densities=densities).motion)}
+        )
         done += 1
         if progress is not None:
             progress(done, len(clips) * (len(conditions) + 1))
-    return [*rows, {"what": "clean, change", "clips": len(clips), **_mean(clean)}]
+    return [*rows, {"what": "clean, change", "clips": len(clips), **_average_rows(clean)}]
 
 
-def judged(
+def evaluate_clip(
     truth: Motion,
-    spoilt: Spoilt,
+    spoilt: CorruptedClip,
     denoiser: Denoiser,
     densities: Sequence[Any] = (),
     infiller: Inbetweener | None = None,
@@ -103,15 +108,15 @@ def judged(
     """
     filled = float("nan")
     if infiller is not None and spoilt.masks:
-        filled = _error(truth, infill(spoilt.motion, infiller, spoilt.masks).motion)
+        filled = _mean_joint_error_cm(truth, infill(spoilt.motion, infiller, spoilt.masks).motion)
     began = time.perf_counter()
     done = denoise(spoilt.motion, denoiser, masks=spoilt.masks, densities=densities)
     seconds = time.perf_counter() - began
-    butterworth, savgol = best_filters(truth, examine(spoilt.motion, spoilt.masks))
+    butterworth, savgol = tune_filters(truth, inspect_recording(spoilt.motion, spoilt.masks))
     ours, mocap = metrics.measure(done.motion), metrics.measure(truth)
-    out = _error(truth, done.motion)
+    out = _mean_joint_error_cm(truth, done.motion)
     return {
-        "in_cm": _error(truth, spoilt.motion),
+        "in_cm": _mean_joint_error_cm(truth, spoilt.motion),
         "out_cm": out,
         "butterworth_cm": butterworth,
         "savgol_cm": savgol,
@@ -121,12 +126,12 @@ def judged(
         "skate_cm_s": ours["skate_cm_s"],
         "mocap_skate": mocap["skate_cm_s"],
         "jitter_ratio": ours["jitter_m_s3"] / mocap["jitter_m_s3"],
-        "believed": float(done.believed.mean()),
+        "believed": float(done.proposal_share.mean()),
         "ms_30fps_frame": 1000 * seconds / (truth.seconds * PRIOR_FPS),
     }
 
 
-def best_filters(truth: Motion, examined: Examined) -> tuple[float, float]:
+def tune_filters(truth: Motion, examined: Inspection) -> tuple[float, float]:
     """Lowest joint error (cm) of a Butterworth and of a Savitzky-Golay filter over the root's place and the joints'
     quaternions, tuned on the truth; what is masked is filled in first, spikes are not told to them.
     """
@@ -138,17 +143,21 @@ def best_filters(truth: Motion, examined: Examined) -> tuple[float, float]:
     for cutoff in _CUTOFFS:
         if cutoff < fps / 2:
             sections = butter(2, cutoff / (fps / 2), output="sos")  # forth and back: fourth order
-            butterworth.append(_error(truth, _filtered(motion, lambda v, s=sections: sosfiltfilt(s, v, axis=0))))
+            butterworth.append(
+                _mean_joint_error_cm(truth, _apply_filter(motion, lambda v, s=sections: sosfiltfilt(s, v, axis=0)))
+            )
     for span in _SPANS:
         width = 2 * round(span * fps / 2) + 1
         if 5 <= width <= motion.num_frames:
-            savgol.append(_error(truth, _filtered(motion, lambda v, w=width: savgol_filter(v, w, 3, axis=0))))
+            savgol.append(
+                _mean_joint_error_cm(truth, _apply_filter(motion, lambda v, w=width: savgol_filter(v, w, 3, axis=0)))
+            )
     return min(butterworth), min(savgol)
 
 
-def contact_f1(truth: Motion, done: Denoised) -> float:
+def contact_f1(truth: Motion, done: DenoiseResult) -> float:
     """Of planted toes in frames, against the thresholds' own answer on the clean clip; NaN where none is planted."""
-    wanted, found = true_contacts(truth), done.contacts
+    wanted, found = detect_true_contacts(truth), done.contacts
     at = (torch.arange(len(found)) * float(truth.fps) / PRIOR_FPS).round().long().clamp(max=len(wanted) - 1)
     wanted = wanted[at]
     both = float((wanted & found).sum())
@@ -156,11 +165,11 @@ def contact_f1(truth: Motion, done: Denoised) -> float:
     return 2 * both / total if wanted.any() else float("nan")
 
 
-def _filtered(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion:
+def _apply_filter(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion:
     def over(values: Tensor) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(np.asarray(smooth(values.numpy()))))
 
-    quats = over(rotations.sign_continuous(motion.local_quat_xyzw))
+    quats = over(rotations.make_sign_continuous(motion.local_quat_xyzw))
     moving = {joint: over(values) for joint, values in motion.moving_offsets.items()}
     return replace(
         motion,
@@ -170,12 +179,12 @@ def _filtered(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion:
     )
 
 
-def _error(truth: Motion, other: Motion) -> float:
+def _mean_joint_error_cm(truth: Motion, other: Motion) -> float:
     """Mean distance of the joints, cm."""
     return 100 * float((truth.joint_positions() - other.joint_positions()).norm(dim=-1).mean())
 
 
-def _mean(rows: Sequence[Row]) -> Row:
+def _average_rows(rows: Sequence[Row]) -> Row:
     """NaN, where a clip cannot give a figure, is left out; of none it stays."""
     means = {}
     for name in rows[0]:

@@ -6,24 +6,24 @@ from typing import Any
 
 import torch
 
-from controllers.inbetweening.error_estimates import going_between
-from controllers.inbetweening.pipeline import Infilled, fill
+from controllers.inbetweening.error_estimates import is_travelling
+from controllers.inbetweening.pipeline import InfillResult, fill
 from controllers.inbetweening.proposers.selection import choose_proposals
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.missing import Lost
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.foot_contact import TOES
 
-LENGTHS = (15, 30, 60, 90, 120, 180)
+GAP_LENGTHS = (15, 30, 60, 90, 120, 180)
 """Frames of the gaps."""
-_BESIDE = (1, 10)  # known frames on either side
+_CONTEXT_LENGTHS = (1, 10)  # known frames on either side
 Row = dict[str, Any]
 
 
-def table(
+def benchmark_gaps(
     kinds: Mapping[str, Sequence[Motion]],
     infiller: Inbetweener,
     densities: Sequence[Any],
@@ -37,21 +37,23 @@ def table(
     found: dict[tuple[str, str, int, int], list[Row]] = {}
     clips = [clip for each in kinds.values() for clip in each]
     for number, clip in enumerate(clips):
-        for length in LENGTHS:
-            for beside in _BESIDE:
-                row = _measured(clip, length, beside, infiller, densities)
+        for length in GAP_LENGTHS:
+            for beside in _CONTEXT_LENGTHS:
+                row = _evaluate_gap(clip, length, beside, infiller, densities)
                 if row is not None:
                     by = row.pop("by").split(" ")[0]
                     found.setdefault((by, row.pop("what"), beside, length), []).append(row)
         if progress is not None:
             progress(number + 1, len(clips))
     return [
-        {"by": by, "what": what, "beside": beside, "frames": length, "gaps": len(rows), **_quantiles(rows)}
+        {"by": by, "what": what, "beside": beside, "frames": length, "gaps": len(rows), **_summarise_gaps(rows)}
         for (by, what, beside, length), rows in sorted(found.items())
     ]
 
 
-def _measured(clip: Motion, length: int, beside: int, infiller: Inbetweener, densities: Sequence[Any]) -> Row | None:
+def _evaluate_gap(
+    clip: Motion, length: int, beside: int, infiller: Inbetweener, densities: Sequence[Any]
+) -> Row | None:
     """None for a clip that is too short."""
     if clip.num_frames < length + 2 * beside:
         return None
@@ -59,19 +61,19 @@ def _measured(clip: Motion, length: int, beside: int, infiller: Inbetweener, den
     part = clip.slice(first, first + length + 2 * beside)
     free = torch.zeros(part.num_frames, dtype=torch.bool)
     free[beside : beside + length] = True
-    lost = Lost(free[:, None].expand(-1, part.num_joints).clone(), free)
-    done: Infilled = fill(part, lost, infiller, another=partial(choose_proposals, densities=densities))
+    lost = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
+    done: InfillResult = fill(part, lost, infiller, another=partial(choose_proposals, densities=densities))
     off = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = [CANONICAL.index(name) for name in TOES]
     slid, mocap = (
-        worst_frame.longest_unsupported(each.joint_positions()[:, toes], each.root_position, PRIOR_FPS)
+        worst_frame.measure_longest_unsupported(each.joint_positions()[:, toes], each.root_position, PRIOR_FPS)
         for each in (done.motion, part)
     )
-    what = "going" if going_between(part, beside - 1, beside + length) else "in place"
+    what = "going" if is_travelling(part, beside - 1, beside + length) else "in place"
     return {"by": done.sources[0].by, "what": what, "error": 100 * float(off.mean()), "slid": slid, "mocap": mocap}
 
 
-def _quantiles(rows: Sequence[Row]) -> Row:
+def _summarise_gaps(rows: Sequence[Row]) -> Row:
     error = torch.tensor([row["error"] for row in rows], dtype=torch.float64)
     slid, mocap = (torch.tensor([row[name] for row in rows]) for name in ("slid", "mocap"))
     return {

@@ -7,11 +7,18 @@ from typing import Any
 
 import torch
 
-from controllers.generation.foot_cleanup import FinishSettings
-from controllers.generation.generate import GenerateSettings, generate, spread_starts
+from controllers.generation.foot_cleanup import FootCleanupSettings
+from controllers.generation.generate import GenerateSettings, generate, sample_stratified_starts
 from mapctl.errors import RequestError
 from mapctl.metrics import measure
-from mapctl.metrics.realism import GaitSpread, RealismSettings, gait_spread, realism, sample_diversity, spread_ratios
+from mapctl.metrics.realism import (
+    GaitSpread,
+    RealismSettings,
+    measure_diversity,
+    measure_gait_spread,
+    measure_realism,
+    spread_ratios,
+)
 from mapctl.motion import Motion
 from mapctl.protocols import Refiner
 
@@ -21,16 +28,16 @@ _MEASURES = ("contact_speed_cm_s", "skate_cm_s", "jitter_m_s3", "penetration_cm"
 
 
 @dataclass(frozen=True)
-class GenerationSettings:
+class GenerationBenchmarkSettings:
     """How much is drawn."""
 
     count: int = 48
     """Clips of each variant."""
     seconds: float = 10.0
     """Of each clip."""
-    siblings: int = 8
+    samples_per_start: int = 8
     """Samples from one start, whose distance is the diversity."""
-    sibling_seconds: float = 4.0
+    sample_seconds: float = 4.0
     """Of each of them."""
     running: float = 1.9
     """Mean speed from which a clip counts as a run, m/s."""
@@ -44,89 +51,93 @@ class GenerationSettings:
 class _Variant:
     name: str
     refiner: Refiner | None
-    finishing: FinishSettings | None
+    foot_cleanup: FootCleanupSettings | None
 
 
-def generation(
-    prior: Any, refiner: Refiner | None, mocap: Sequence[Motion], settings: GenerationSettings | None = None
+def benchmark_generation(
+    prior: Any, refiner: Refiner | None, mocap: Sequence[Motion], settings: GenerationBenchmarkSettings | None = None
 ) -> list[Row]:
     """A row for mocap and one for each variant, walking and running apart, then all together.
 
     `mocap` is canonical motion that no training saw. RequestError where it holds no walk or no run.
     """
-    settings = settings or GenerationSettings()
-    kinds = _by_kind(mocap, settings)
+    settings = settings or GenerationBenchmarkSettings()
+    kinds = _split_by_kind(mocap, settings)
     if not all(kinds.values()):
         raise RequestError("the table needs mocap of walking and of running")
-    rows = [{"motion": kind, "variant": "mocap", "clips": len(clips), **_means(clips)} for kind, clips in kinds.items()]
-    spread = gait_spread(mocap)
-    for variant in _variants(refiner):
-        clips, cost = _drawn(prior, variant, settings)
-        for kind, some in _by_kind(clips, settings).items():
-            rows.append({"motion": kind, "variant": variant.name, "clips": len(some), **_means(some)})
+    rows = [
+        {"motion": kind, "variant": "mocap", "clips": len(clips), **_mean_measures(clips)}
+        for kind, clips in kinds.items()
+    ]
+    spread = measure_gait_spread(mocap)
+    for variant in _list_variants(refiner):
+        clips, cost = _generate_clips(prior, variant, settings)
+        for kind, some in _split_by_kind(clips, settings).items():
+            rows.append({"motion": kind, "variant": variant.name, "clips": len(some), **_mean_measures(some)})
         rows.append(
             {
                 "motion": "both",
                 "variant": variant.name,
                 "clips": len(clips),
                 "ms_per_frame": cost,
-                **_realism(clips, mocap, settings),
-                **_diversity(prior, variant, settings),
-                **_spreads(clips, spread),
+                **_measure_realism(clips, mocap, settings),
+                **_measure_diversity(prior, variant, settings),
+                **_compare_gait_spreads(clips, spread),
             }
         )
     return rows
 
 
-def _variants(refiner: Refiner | None) -> list[_Variant]:
+def _list_variants(refiner: Refiner | None) -> list[_Variant]:
     refined = (
         []
         if refiner is None
         else [
             _Variant("density, refiner", refiner, None),
-            _Variant("density, refiner, footing", refiner, FinishSettings()),
+            _Variant("density, refiner, footing", refiner, FootCleanupSettings()),
         ]
     )
-    return [_Variant("density", None, None), _Variant("density, footing", None, FinishSettings()), *refined]
+    return [_Variant("density", None, None), _Variant("density, footing", None, FootCleanupSettings()), *refined]
 
 
-def _drawn(prior: Any, variant: _Variant, settings: GenerationSettings) -> tuple[list[Motion], float]:
+def _generate_clips(prior: Any, variant: _Variant, settings: GenerationBenchmarkSettings) -> tuple[list[Motion], float]:
     """Clips, and milliseconds of processor time a frame."""
-    wishes, clips = GenerateSettings(finishing=variant.finishing), []
-    starts = spread_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
+    wishes, clips = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
+    starts = sample_stratified_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
     began = time.process_time()
     for number, start in enumerate(starts):
         own = replace(wishes, start=start)
-        clips.append(_clip(prior, variant, own, settings.seconds, settings.seed + number))
+        clips.append(_generate_clip(prior, variant, own, settings.seconds, settings.seed + number))
     spent = time.process_time() - began
     return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
 
 
-def _clip(prior: Any, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
+def _generate_clip(prior: Any, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
     generator = torch.Generator().manual_seed(seed)
     return generate(prior, seconds=seconds, generator=generator, settings=wishes, refiner=variant.refiner)
 
 
-def _spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread]) -> Row:
+def _compare_gait_spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread]) -> Row:
     """How widely step length, speed and turning spread, as shares of the data's spread."""
-    return {f"{name}_spread": ratio for name, ratio in spread_ratios(gait_spread(clips), data).items()}
+    return {f"{name}_spread": ratio for name, ratio in spread_ratios(measure_gait_spread(clips), data).items()}
 
 
-def _diversity(prior: Any, variant: _Variant, settings: GenerationSettings) -> Row:
+def _measure_diversity(prior: Any, variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
     """Average pairwise distance of samples from one start, mean over a few starts."""
     found = []
     for start in range(0, len(prior.starts.speed), max(1, len(prior.starts.speed) // 4)):
-        wishes = replace(GenerateSettings(finishing=variant.finishing), start=start)
+        wishes = replace(GenerateSettings(foot_cleanup=variant.foot_cleanup), start=start)
         samples = [
-            _clip(prior, variant, wishes, settings.sibling_seconds, settings.seed + k) for k in range(settings.siblings)
+            _generate_clip(prior, variant, wishes, settings.sample_seconds, settings.seed + k)
+            for k in range(settings.samples_per_start)
         ]
-        found.append(sample_diversity(samples).root_aligned_cm)
+        found.append(measure_diversity(samples).root_aligned_cm)
     return {"diversity_cm": sum(found) / len(found)}
 
 
-def _realism(clips: Sequence[Motion], mocap: Sequence[Motion], settings: GenerationSettings) -> Row:
+def _measure_realism(clips: Sequence[Motion], mocap: Sequence[Motion], settings: GenerationBenchmarkSettings) -> Row:
     generator = torch.Generator().manual_seed(settings.seed)
-    found = realism(clips, mocap, generator=generator, settings=settings.realism)
+    found = measure_realism(clips, mocap, generator=generator, settings=settings.realism)
     return {
         "told_apart": found.accuracy,
         "told_apart_floor": found.floor_accuracy,
@@ -135,7 +146,7 @@ def _realism(clips: Sequence[Motion], mocap: Sequence[Motion], settings: Generat
     }
 
 
-def _by_kind(clips: Sequence[Motion], settings: GenerationSettings) -> dict[str, list[Motion]]:
+def _split_by_kind(clips: Sequence[Motion], settings: GenerationBenchmarkSettings) -> dict[str, list[Motion]]:
     runs = [measure(clip)["speed_m_s"] > settings.running for clip in clips]
     return {
         kind: [clip for clip, ran in zip(clips, runs, strict=True) if ran == (kind == "run")]
@@ -143,7 +154,7 @@ def _by_kind(clips: Sequence[Motion], settings: GenerationSettings) -> dict[str,
     }
 
 
-def _means(clips: Sequence[Motion]) -> Row:
+def _mean_measures(clips: Sequence[Motion]) -> Row:
     if not clips:
         return {}
     rows = [measure(clip) for clip in clips]

@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.pipeline import InfillSettings, Method
+from controllers.inbetweening.pipeline import InfillMethod, InfillSettings
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.interpolation import led, slerped
+from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -25,12 +25,14 @@ from mapctl.terms.foot_contact import TOES
 
 Row = dict[str, Any]
 
-WINDOW = 120
+WINDOW_FRAMES = 120
 """Frames of a clip that are looked at: the paper's 4 s."""
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
-_CONTEXT = 40  # frames on either side while the gap's length is varied
-_COMPARED: tuple[Method, Method] = ("linear", "map")
-_BONES = tuple(CANONICAL.index(side + part) for side in ("left", "right") for part in ("LowerArm", "Hand", "Foot"))
+_GAP_CONTEXT_FRAMES = 40  # frames on either side while the gap's length is varied
+_COMPARED_METHODS: tuple[InfillMethod, InfillMethod] = ("linear", "map")
+_MEASURED_BONES = tuple(
+    CANONICAL.index(side + part) for side in ("left", "right") for part in ("LowerArm", "Hand", "Foot")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,21 +52,24 @@ class Task:
 
 
 TASKS: tuple[Task, ...] = (
-    Task("nothing missing", WINDOW),
-    Task("gap of 0.5 s", WINDOW, 15),
-    Task("gap of 1 s", WINDOW, 30),
-    Task("gap of 2 s", WINDOW, 60),
-    Task("noise of 3 cm", WINDOW, noise=0.03),
-    Task("noise of 5 cm", WINDOW, noise=0.05),
-    Task("30 % of joints dropped", WINDOW, dropout=0.3),
-    Task("50 % of joints dropped", WINDOW, dropout=0.5),
-    *(Task(f"gap of {gap} frames, {_CONTEXT} around it", gap + 2 * _CONTEXT, gap) for gap in (3, 10, 40, 125)),
+    Task("nothing missing", WINDOW_FRAMES),
+    Task("gap of 0.5 s", WINDOW_FRAMES, 15),
+    Task("gap of 1 s", WINDOW_FRAMES, 30),
+    Task("gap of 2 s", WINDOW_FRAMES, 60),
+    Task("noise of 3 cm", WINDOW_FRAMES, noise=0.03),
+    Task("noise of 5 cm", WINDOW_FRAMES, noise=0.05),
+    Task("30 % of joints dropped", WINDOW_FRAMES, dropout=0.3),
+    Task("50 % of joints dropped", WINDOW_FRAMES, dropout=0.5),
+    *(
+        Task(f"gap of {gap} frames, {_GAP_CONTEXT_FRAMES} around it", gap + 2 * _GAP_CONTEXT_FRAMES, gap)
+        for gap in (3, 10, 40, 125)
+    ),
     *(Task(f"gap of 40 frames, {context} around it", 40 + 2 * context, 40) for context in (1, 3, 5, 13, 25)),
 )
 """The paper's, at 30 frames a second in place of its 60; its noise is said in no unit, ours is."""
 
 
-def table(
+def benchmark_infilling(
     clips: Sequence[Motion],
     networks: Mapping[str, Inbetweener],
     *,
@@ -78,29 +83,33 @@ def table(
     over joints and frames; deviation of six bones' lengths, mm. Clips are on canonical joints.
     """
     rows = []
-    clips = [on_canonical_bones(clip) for clip in clips]
+    clips = [scale_to_canonical_bones(clip) for clip in clips]
     for number, task in enumerate(TASKS):
-        shown = [middle(clip, task.frames) for clip in clips if clip.num_frames >= task.frames]
-        done = _of_task(task, shown, networks, ours) if shown else []
+        shown = [slice_middle(clip, task.frames) for clip in clips if clip.num_frames >= task.frames]
+        done = _evaluate_task(task, shown, networks, ours) if shown else []
         rows += [{"task": task.name, "clips": len(shown), **row} for row in done]
         if progress is not None:
             progress(number + 1, len(TASKS))
     return rows
 
 
-def by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
+def benchmark_infilling_by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
     """Gaps of 0.5, 1 and 2 s by kind of clip: error of slerp and of MAP, cm, and their ratio. A longer and more lively
     clip counts no more than another: the ratio is the mean of the clips' own.
     """
     rows = []
     for kind, clips in kinds.items():
         for task in TASKS[1:4]:
-            shown = [middle(on_canonical_bones(clip), WINDOW) for clip in clips if clip.seconds * PRIOR_FPS > WINDOW]
-            masks = [Mask(ALL, (WINDOW - task.gap) // 2, (WINDOW + task.gap) // 2)]
+            shown = [
+                slice_middle(scale_to_canonical_bones(clip), WINDOW_FRAMES)
+                for clip in clips
+                if clip.seconds * PRIOR_FPS > WINDOW_FRAMES
+            ]
+            masks = [Mask(ALL, (WINDOW_FRAMES - task.gap) // 2, (WINDOW_FRAMES + task.gap) // 2)]
             pairs = [
                 [
-                    float(_filled(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
-                    for method in _COMPARED
+                    float(_evaluate_infill(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
+                    for method in _COMPARED_METHODS
                 ]
                 for clip in shown
             ]
@@ -120,29 +129,31 @@ def by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> lis
     return rows
 
 
-def _of_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, Inbetweener], ours: str) -> list[Row]:
+def _evaluate_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, Inbetweener], ours: str) -> list[Row]:
     """One row a method."""
     rows = []
     for name, network in networks.items():
-        done = [_raw(clip, task, network, torch.Generator().manual_seed(n)) for n, clip in enumerate(clips)]
-        rows.append({"method": f"{name}, raw", **_summary(done)})
+        done = [
+            _evaluate_network(clip, task, network, torch.Generator().manual_seed(n)) for n, clip in enumerate(clips)
+        ]
+        rows.append({"method": f"{name}, raw", **_summarise_clip_errors(done)})
     if task.gap:
         masks = [Mask(ALL, (task.frames - task.gap) // 2, (task.frames + task.gap) // 2)]
-        methods: tuple[tuple[str, Method], ...] = (
+        methods: tuple[tuple[str, InfillMethod], ...] = (
             ("on rigid bones", "infiller"),
             ("and MAP", "map"),
             ("interpolation", "linear"),
         )
         for name, method in methods:
             settings = InfillSettings(method=method)
-            done = [_filled(clip, masks, networks[ours], settings) for clip in clips]
+            done = [_evaluate_infill(clip, masks, networks[ours], settings) for clip in clips]
             label = name if method == "linear" else f"{ours}, {name}"
-            rows.append({"method": label, **_summary(done)})
+            rows.append({"method": label, **_summarise_clip_errors(done)})
     return rows
 
 
 @dataclass(frozen=True, eq=False)
-class _Result:
+class _ClipErrors:
     """Of one clip."""
 
     errors: Float[Tensor, " missing"]
@@ -151,50 +162,52 @@ class _Result:
     """Deviations of bones from their lengths, metres."""
 
 
-def _raw(clip: Motion, task: Task, network: Inbetweener, generator: torch.Generator) -> _Result:
+def _evaluate_network(clip: Motion, task: Task, network: Inbetweener, generator: torch.Generator) -> _ClipErrors:
     """A network's places as they are."""
     truth = clip.joint_positions().float()
-    known = _known(task, generator)
+    known = _sample_observation_mask(task, generator)
     seen = truth + task.noise * torch.randn(truth.shape, generator=generator)
     facing = heading(clip.local_quat_xyzw[:, 0]).float()
-    stands = contacts.planted(truth[:, list(_TOES)], PRIOR_FPS).float()
-    guess = slerped(seen[None], clip.local_quat_xyzw.float()[None], known[None])
+    stands = contacts.detect_contacts(truth[:, list(_TOES)], PRIOR_FPS).float()
+    guess = interpolate_positions(seen[None], clip.local_quat_xyzw.float()[None], known[None])
     image = PositionImage.of_world(
         guess,
-        led(facing[None], known[None]),
+        interpolate_heading(facing[None], known[None]),
         stands[None],
         known=known[None],
         present=torch.ones(1, len(truth), dtype=torch.bool),
         toes=_TOES,
     )
     places = image.to_world(network.propose(image).places)[0]
-    return _result(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))
+    return _measure_errors(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))
 
 
-def _filled(clip: Motion, masks: Sequence[Mask], network: Inbetweener, settings: InfillSettings) -> _Result:
+def _evaluate_infill(
+    clip: Motion, masks: Sequence[Mask], network: Inbetweener, settings: InfillSettings
+) -> _ClipErrors:
     """A whole motion of rigid bones."""
     places = infill(clip, network, masks, settings=settings).motion.joint_positions()
     missing = torch.zeros(places.shape[:2], dtype=torch.bool)
     missing[masks[0].start : masks[0].stop] = True
-    return _result(places, clip.joint_positions(), missing)
+    return _measure_errors(places, clip.joint_positions(), missing)
 
 
-def _result(places: Tensor, truth: Tensor, missing: Bool[Tensor, "frames joints"]) -> _Result:
+def _measure_errors(places: Tensor, truth: Tensor, missing: Bool[Tensor, "frames joints"]) -> _ClipErrors:
     wrong = (places - places[:, :1]) - (truth - truth[:, :1])
-    above = [CANONICAL.parents[bone] for bone in _BONES]
-    lengths = (places[:, list(_BONES)] - places[:, above]).norm(dim=-1)
-    away = lengths - CANONICAL.offsets[list(_BONES)].norm(dim=-1).to(lengths)
-    return _Result(wrong.norm(dim=-1)[missing], away[missing.any(dim=1)].flatten().abs())
+    above = [CANONICAL.parents[bone] for bone in _MEASURED_BONES]
+    lengths = (places[:, list(_MEASURED_BONES)] - places[:, above]).norm(dim=-1)
+    away = lengths - CANONICAL.offsets[list(_MEASURED_BONES)].norm(dim=-1).to(lengths)
+    return _ClipErrors(wrong.norm(dim=-1)[missing], away[missing.any(dim=1)].flatten().abs())
 
 
-def _known(task: Task, generator: torch.Generator) -> Bool[Tensor, "frames joints"]:
+def _sample_observation_mask(task: Task, generator: torch.Generator) -> Bool[Tensor, "frames joints"]:
     known = torch.rand(task.frames, CANONICAL.num_joints, generator=generator) >= task.dropout
     start = (task.frames - task.gap) // 2
     known[start : start + task.gap] = False
     return known
 
 
-def _summary(results: Sequence[_Result]) -> Row:
+def _summarise_clip_errors(results: Sequence[_ClipErrors]) -> Row:
     errors, bones = (torch.cat([getattr(result, name) for result in results]) for name in ("errors", "bones"))
     return {
         "error_cm": 100 * float(errors.mean()),
@@ -203,14 +216,14 @@ def _summary(results: Sequence[_Result]) -> Row:
     }
 
 
-def on_canonical_bones(motion: Motion) -> Motion:
+def scale_to_canonical_bones(motion: Motion) -> Motion:
     """A canonical motion at the prior's rate, on the canonical skeleton, in scale."""
     motion = motion.resample(PRIOR_FPS)
     scale = leg_length(motion.skeleton) / leg_length(CANONICAL)
     return Motion(CANONICAL, motion.fps, motion.root_position / scale, motion.local_quat_xyzw)
 
 
-def middle(motion: Motion, frames: int) -> Motion:
+def slice_middle(motion: Motion, frames: int) -> Motion:
     """So many frames from the middle of a motion that has them."""
     start = (motion.num_frames - frames) // 2
     return motion.slice(start, start + frames)

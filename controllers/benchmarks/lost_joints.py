@@ -7,36 +7,39 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.benchmarks.infilling import WINDOW, Row, middle, on_canonical_bones
+from controllers.benchmarks.infilling import WINDOW_FRAMES, Row, scale_to_canonical_bones, slice_middle
 from controllers.inbetweening.infill import infill
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import Mask
 from mapctl.skeleton import CANONICAL
 
-LIMBS_LOST = {
+MISSING_LIMBS = {
     "elbow and hand": ("leftLowerArm", "leftHand"),
     "knee, foot and toes": ("rightLowerLeg", "rightFoot", "rightToes"),
 }
 """As in figure 8 of the paper."""
 
 
-def lost_joints(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
+def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
     """Joints that are lost throughout up to 240 frames, by kind of clip: their mean error in the world, cm, by MAP and
     by two mean poses in the joints above them: that of all these clips, and the clip's own, which no user knows.
     """
-    shown = {kind: _pieces(clips) for kind, clips in kinds.items()}
+    shown = {kind: _select_clips(clips) for kind, clips in kinds.items()}
     every = [clip for clips in shown.values() for clip in clips]
     if not every:
         return []
     usual_pose, rows = mean_rotations(every), []
     for kind, clips in shown.items():
-        for name, joints in LIMBS_LOST.items():
+        for name, joints in MISSING_LIMBS.items():
             found = []
             for clip in clips:
                 made = infill(clip, infiller, [Mask(joint, 0, clip.num_frames) for joint in joints]).motion
-                tried = [*(at_pose(clip, joints, pose) for pose in (usual_pose, mean_rotations([clip]))), made]
-                found.append([_away(motion, clip, joints) for motion in tried])
+                tried = [
+                    *(replace_joint_rotations(clip, joints, pose) for pose in (usual_pose, mean_rotations([clip]))),
+                    made,
+                ]
+                found.append([_mean_joint_distance(motion, clip, joints) for motion in tried])
             if found:
                 usual, own, ours = (100 * torch.tensor(found)).mean(dim=0).tolist()
                 rows.append(
@@ -66,7 +69,7 @@ def mean_rotations(motions: Sequence[Motion]) -> Float[Tensor, "joints 4"]:
     return torch.linalg.eigh(outer)[1][..., -1]
 
 
-def at_pose(motion: Motion, joints: Sequence[str], pose: Float[Tensor, "joints 4"]) -> Motion:
+def replace_joint_rotations(motion: Motion, joints: Sequence[str], pose: Float[Tensor, "joints 4"]) -> Motion:
     """With the joints, and the one above the first of them, at rest in a pose."""
     indices = [CANONICAL.index(name) for name in joints]
     quats = motion.local_quat_xyzw.clone()
@@ -75,13 +78,13 @@ def at_pose(motion: Motion, joints: Sequence[str], pose: Float[Tensor, "joints 4
     return replace(motion, local_quat_xyzw=quats)
 
 
-def _pieces(clips: Sequence[Motion]) -> list[Motion]:
+def _select_clips(clips: Sequence[Motion]) -> list[Motion]:
     """Up to 240 frames of those that have 120."""
-    long = [clip for clip in map(on_canonical_bones, clips) if clip.num_frames >= WINDOW]
-    return [middle(clip, min(clip.num_frames, 2 * WINDOW)) for clip in long]
+    long = [clip for clip in map(scale_to_canonical_bones, clips) if clip.num_frames >= WINDOW_FRAMES]
+    return [slice_middle(clip, min(clip.num_frames, 2 * WINDOW_FRAMES)) for clip in long]
 
 
-def _away(motion: Motion, truth: Motion, joints: Sequence[str]) -> float:
+def _mean_joint_distance(motion: Motion, truth: Motion, joints: Sequence[str]) -> float:
     """Mean distance of the joints, metres."""
     indices = [CANONICAL.index(name) for name in joints]
     return float((motion.joint_positions() - truth.joint_positions())[:, indices].norm(dim=-1).mean())

@@ -8,29 +8,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from controllers.common.initial_state import choose_start
-from controllers.following.follow import FollowSettings, follow, follow_terms
-from controllers.generation.generate import GenerateSettings, begin
+from controllers.common.initial_state import select_initial_state
+from controllers.following.follow import FollowSettings, build_follow_terms, follow
+from controllers.generation.generate import GenerateSettings, initialise_generation
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import LAYOUT, PRIOR_FPS, ground_speed
 from mapctl.metrics import measure
-from mapctl.metrics.states import state_summary
-from mapctl.problem.context import Context
-from mapctl.problem.latent_noise import Latents
+from mapctl.metrics.states import summarise_states
+from mapctl.problem.context import WindowContext
+from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome, Solution
-from mapctl.problem.warm_start import BestOf, Swarm
-from mapctl.problem.window_solvers import LatentMethod, StateMethod
+from mapctl.problem.warm_start import BestOfSamples, SwarmProposal
+from mapctl.problem.window_solvers import FeatureStateSolver, LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
-from mapctl.terms import Likelihood, Noise
+from mapctl.terms import LatentPrior, Likelihood
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class BenchSettings:
+class SolverBenchmarkSettings:
     """How long to measure."""
 
     seconds: float = 5.0
@@ -45,14 +45,14 @@ class BenchSettings:
     """Of starts and draws."""
 
 
-def speed(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
+def benchmark_speed(prior: Any, settings: SolverBenchmarkSettings = SolverBenchmarkSettings()) -> list[Row]:
     """Energy and gradient of one window on the fast path and on the torch reference, then whole solves."""
     reference = replace(prior, use_fast=False)
-    rows = [_evaluation(prior, reference, count, settings) for count in settings.particles]
-    return rows + [_solve(prior, seconds, settings) for seconds in settings.lengths]
+    rows = [_benchmark_evaluation(prior, reference, count, settings) for count in settings.particles]
+    return rows + [_benchmark_follow(prior, seconds, settings) for seconds in settings.lengths]
 
 
-def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) -> list[Row]:
+def benchmark_free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) -> list[Row]:
     """Long free runs at temperature 1: a row each, and one of their means beside the training data's own values.
 
     A character that had stopped would show in its slowest second; one that came apart in its largest feature, in
@@ -60,35 +60,35 @@ def free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) 
     """
     rows, everything = [], []
     for run in range(runs):
-        features = _free_run(prior, frames, seed + run)
+        features = _sample_free_run(prior, frames, seed + run)
         everything.append(features)
         pace = ground_speed(features)
         seconds = pace[: len(pace) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
         rows.append(
             {
                 "run": str(run),
-                **state_summary(features),
+                **summarise_states(features),
                 "slowest_second_m_s": float(seconds.min()),
                 "fastest_second_m_s": float(seconds.max()),
-                "largest_feature_sigma": float(_in_sigmas(prior, features).abs().max()),
+                "largest_feature_sigma": float(_standardise_features(prior, features).abs().max()),
             }
         )
     data = prior.card.quality["data"]
-    return [*rows, {"run": "all", **state_summary(torch.cat(everything))}, {"run": "training data", **data}]
+    return [*rows, {"run": "all", **summarise_states(torch.cat(everything))}, {"run": "training data", **data}]
 
 
-def _free_run(prior: Any, frames: int, seed: int) -> Tensor:
+def _sample_free_run(prior: Any, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    told, state, _ = begin(prior, GenerateSettings(), None, generator)
+    told, state, _ = initialise_generation(prior, GenerateSettings(), None, generator)
     return told.sample(state, frames, generator)[0][0]
 
 
-def _in_sigmas(prior: Any, features: Tensor) -> Tensor:
+def _standardise_features(prior: Any, features: Tensor) -> Tensor:
     size = LAYOUT.continuous
     return ((features - prior.feature_mean) / prior.feature_std)[..., :size]
 
 
-def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]:
+def benchmark_ablation(prior: Any, settings: SolverBenchmarkSettings = SolverBenchmarkSettings()) -> list[Row]:
     """Starts and unknowns compared: energy, path error and time on three smooth curves and a corner."""
     shapes = {
         "circle:4": curves.circle(radius=4.0),
@@ -97,35 +97,37 @@ def ablation(prior: Any, settings: BenchSettings = BenchSettings()) -> list[Row]
         "corner": curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0]], dtype=torch.float64)),
     }
     return [
-        {"curve": name, **_ablated(prior, curve, wishes, label, settings)}
+        {"curve": name, **_evaluate_variant(prior, curve, wishes, label, settings)}
         for name, curve in shapes.items()
-        for label, wishes in variants(prior).items()
+        for label, wishes in list_ablation_variants(prior).items()
     ]
 
 
-def variants(prior: Any) -> dict[str, FollowSettings]:
+def list_ablation_variants(prior: Any) -> dict[str, FollowSettings]:
     """The variants of the ablation by name."""
-    plain, size = LatentMethod(), LAYOUT.continuous
-    best = replace(plain, proposal=BestOf(count=32), budget=Budget(evaluations=152))
-    flown = replace(plain, proposal=Swarm(), budget=Budget(evaluations=216))
-    states = StateMethod(prior.feature_std[:size], prior.feature_mean[:size])
+    plain, size = LatentNoiseSolver(), LAYOUT.continuous
+    best = replace(plain, proposal=BestOfSamples(count=32), budget=Budget(evaluations=152))
+    flown = replace(plain, proposal=SwarmProposal(), budget=Budget(evaluations=216))
+    states = FeatureStateSolver(prior.feature_std[:size], prior.feature_mean[:size])
     return {
         "latents, zero start": FollowSettings(method=plain),
         "latents, best of 32": FollowSettings(method=best),
         "latents, swarm 16 x 6": FollowSettings(method=flown),
         # Here the noise is that of the network's input, in units of its sigma, and the states need a density.
-        "states, 160 evaluations": FollowSettings(method=states, noise=Noise(sigma=1.0), extra=(Likelihood(),)),
+        "states, 160 evaluations": FollowSettings(method=states, noise=LatentPrior(sigma=1.0), extra=(Likelihood(),)),
     }
 
 
-def _ablated(prior: Any, curve: Curve, wishes: FollowSettings, label: str, settings: BenchSettings) -> Row:
+def _evaluate_variant(
+    prior: Any, curve: Curve, wishes: FollowSettings, label: str, settings: SolverBenchmarkSettings
+) -> Row:
     began = time.process_time()
-    solution = _followed(prior, curve, settings.seconds, settings.seed, wishes)
+    solution = _follow_to_end(prior, curve, settings.seconds, settings.seed, wishes)
     spent = time.process_time() - began
     found = measure(solution.motion, curve)
     return {
         "method": label,
-        "energy_nats": _wish_energy(solution),
+        "energy_nats": _target_energy(solution),
         "path_error_mean_cm": found["path_error_mean_cm"],
         "path_error_max_cm": found["path_error_max_cm"],
         "contact_speed_cm_s": found["contact_speed_cm_s"],
@@ -134,13 +136,13 @@ def _ablated(prior: Any, curve: Curve, wishes: FollowSettings, label: str, setti
     }
 
 
-def _wish_energy(solution: Solution) -> float:
+def _target_energy(solution: Solution) -> float:
     """Nats of the wishes, which all variants share (the prior's part is measured in different spaces)."""
     return float(sum(e.energy.sum() for e in solution.ledger.entries if e.name in ("path", "footing")))
 
 
-def _evaluation(prior: Any, reference: Any, count: int, settings: BenchSettings) -> Row:
-    fast, slow = (_timed_evaluation(p, count, settings) for p in (prior, reference))
+def _benchmark_evaluation(prior: Any, reference: Any, count: int, settings: SolverBenchmarkSettings) -> Row:
+    fast, slow = (_time_evaluation(p, count, settings) for p in (prior, reference))
     return {
         "what": f"energy and gradient, 34 frames, {count} candidates",
         "fast_ms": fast,
@@ -150,22 +152,24 @@ def _evaluation(prior: Any, reference: Any, count: int, settings: BenchSettings)
     }
 
 
-def _timed_evaluation(prior: Any, count: int, settings: BenchSettings) -> float:
+def _time_evaluation(prior: Any, count: int, settings: SolverBenchmarkSettings) -> float:
     curve, wishes = curves.circle(radius=4.0), FollowSettings()
     frames = wishes.window.frames
     arcs = torch.arange(2 * frames, dtype=torch.float64) * 1.2 / PRIOR_FPS
-    terms_of = follow_terms(curve, arcs, wishes)
+    terms_of = build_follow_terms(curve, arcs, wishes)
     generator = torch.Generator().manual_seed(settings.seed)
-    start = choose_start(prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator).committed
-    context = Context(prior, start.state, start.place, start.joints_world, frames)
+    start = select_initial_state(
+        prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator
+    ).committed
+    context = WindowContext(prior, start.state, start.place, start.joints_world, frames)
     unknowns = 0.1 * torch.randn(count, frames * LAYOUT.continuous, generator=generator)
-    objective = Objective(Latents.planned(context, unknowns).build, terms_of(1, frames))
-    return 1000 * _fastest(lambda: objective.energy_and_gradient(unknowns), settings.repeats)
+    objective = Objective(LatentNoise.from_unknowns(context, unknowns).build, terms_of(1, frames))
+    return 1000 * _time_fastest(lambda: objective.energy_and_gradient(unknowns), settings.repeats)
 
 
-def _solve(prior: Any, seconds: float, settings: BenchSettings) -> Row:
+def _benchmark_follow(prior: Any, seconds: float, settings: SolverBenchmarkSettings) -> Row:
     began = time.process_time()
-    solution = _followed(prior, curves.circle(radius=4.0), seconds, settings.seed, FollowSettings())
+    solution = _follow_to_end(prior, curves.circle(radius=4.0), seconds, settings.seed, FollowSettings())
     frames = solution.motion.num_frames
     windows = solution.windows
     return {
@@ -175,7 +179,7 @@ def _solve(prior: Any, seconds: float, settings: BenchSettings) -> Row:
     }
 
 
-def _followed(prior: Any, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:
+def _follow_to_end(prior: Any, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:
     """A walk to its end: half a one has no place in a table, so Ctrl-C ends the bench."""
     generator = torch.Generator().manual_seed(seed)
     solution = follow(prior, curve, seconds=seconds, settings=wishes, generator=generator)
@@ -184,7 +188,7 @@ def _followed(prior: Any, curve: Curve, seconds: float, seed: int, wishes: Follo
     return solution
 
 
-def _fastest(run: Callable[[], object], repeats: int) -> float:
+def _time_fastest(run: Callable[[], object], repeats: int) -> float:
     run()
     times = []
     for _ in range(repeats):

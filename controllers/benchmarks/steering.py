@@ -9,13 +9,13 @@ from typing import Any
 import torch
 
 from controllers.steering import steer
-from controllers.steering.loop import Recorder, drive, timing
-from controllers.steering.pure_pursuit import Pursuit
+from controllers.steering.loop import Recorder, drive, summarise_step_timing
+from controllers.steering.pure_pursuit import PurePursuit
 from mapctl import curves
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics import measure
-from mapctl.metrics.travel import by_command
+from mapctl.metrics.travel import measure_commands
 
 Row = dict[str, Any]
 
@@ -23,7 +23,7 @@ _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
 
 
 @dataclass(frozen=True)
-class SteeringSettings:
+class SteeringBenchmarkSettings:
     """How much is asked."""
 
     commands: int = 48
@@ -36,22 +36,22 @@ class SteeringSettings:
     """Of the commands and the first pose."""
 
 
-def steering(prior: Any, settings: SteeringSettings | None = None) -> list[Row]:
+def benchmark_steering(prior: Any, settings: SteeringBenchmarkSettings | None = None) -> list[Row]:
     """A row for each kind of change, and one for all with cost and feet."""
-    settings = settings or SteeringSettings()
+    settings = settings or SteeringBenchmarkSettings()
     generator = torch.Generator().manual_seed(settings.seed)
-    track = _random_track(settings, generator)
+    track = _sample_command_track(settings, generator)
     state, first = steer.begin(prior, track.commands[0], generator=generator)
     recorder = Recorder()
     recorder.show(first, 0.0)
     frames = round(track.times[-1] * PRIOR_FPS)
     _, records = drive(state, track, [recorder], frames=frames)
     motion = recorder.motion(frames)
-    rows = by_command(motion, track)[:-1]
+    rows = measure_commands(motion, track)[:-1]
     kinds: dict[str, list[Row]] = {}
     for (before, after), row in zip(pairwise(track.commands), rows[1:], strict=False):
-        kinds.setdefault(_kind(before, after), []).append(row)
-    cost, feet = timing(records), measure(motion)
+        kinds.setdefault(_classify_change(before, after), []).append(row)
+    cost, feet = summarise_step_timing(records), measure(motion)
     whole = {
         "frame_ms_p50": cost["frame_ms_p50"],
         "frame_ms_p99": cost["frame_ms_p99"],
@@ -59,17 +59,17 @@ def steering(prior: Any, settings: SteeringSettings | None = None) -> list[Row]:
         "jitter_m_s3": feet["jitter_m_s3"],
     }
     return [
-        *({"change": kind, **_summary(some)} for kind, some in sorted(kinds.items())),
-        {"change": "all", **_summary(rows[1:]), **whole},
+        *({"change": kind, **_summarise_commands(some)} for kind, some in sorted(kinds.items())),
+        {"change": "all", **_summarise_commands(rows[1:]), **whole},
     ]
 
 
-def pursued(prior: Any, seed: int = 0) -> list[Row]:
+def benchmark_pursuit(prior: Any, seed: int = 0) -> list[Row]:
     """Curves walked live at 1 m/s by looking half a metre ahead."""
     rows = []
     for name, seconds in (("circle:2", 13.0), ("wave:1x8", 8.5)):
         curve = curves.read(name)
-        pursuit, recorder = Pursuit(curve, speed=1.0), Recorder()
+        pursuit, recorder = PurePursuit(curve, speed=1.0), Recorder()
         x, z = curve.point(0.0)[[0, -1]].tolist()
         state, first = steer.begin(prior, pursuit.first, generator=torch.Generator().manual_seed(seed), at=(x, z))
         recorder.show(first, 0.0)
@@ -87,7 +87,7 @@ def pursued(prior: Any, seed: int = 0) -> list[Row]:
     return rows
 
 
-def _random_track(settings: SteeringSettings, generator: torch.Generator) -> CommandTrack:
+def _sample_command_track(settings: SteeringBenchmarkSettings, generator: torch.Generator) -> CommandTrack:
     def uniform(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
@@ -100,7 +100,7 @@ def _random_track(settings: SteeringSettings, generator: torch.Generator) -> Com
     return CommandTrack(tuple(times), (*commands, commands[-1]))
 
 
-def _kind(before: Command, after: Command) -> str:
+def _classify_change(before: Command, after: Command) -> str:
     if after.speed == 0:
         return "to a stand"
     side = abs(math.remainder(after.heading - before.heading, 2 * math.pi)) > math.pi / 2
@@ -108,7 +108,7 @@ def _kind(before: Command, after: Command) -> str:
     return f"{came}, turning by more than 90 degrees" if side else f"{came}, turning by less"
 
 
-def _summary(rows: list[Row]) -> Row:
+def _summarise_commands(rows: list[Row]) -> Row:
     reached = [row["reached_s"] for row in rows if row["reached_s"] is not None]
     off = [abs(row["steady_heading_error_deg"]) for row in rows if row["steady_heading_error_deg"] is not None]
     return {

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.proposers.rollout import likeliest, rolled
+from controllers.inbetweening.proposers.rollout import roll_through_gaps, select_likeliest_density
 from controllers.inbetweening.tween import tween
-from controllers.inbetweening.variations import best_of
+from controllers.inbetweening.variations import lowest_energy
 from mapctl import metrics
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.keyframes import Keys
@@ -22,15 +22,15 @@ from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.terms.foot_contact import TOES
 
-FRAMES = 6 * PRIOR_FPS
+TWEEN_FRAMES = 6 * PRIOR_FPS
 """Of a clip that are looked at."""
-_BETWEEN = 5  # keys, beside the first and the last
-_ENDS = (30, 60)  # frames
-_BEST_OF = 4  # answers
+_INNER_KEYS = 5  # keys, beside the first and the last
+_END_LENGTHS = (30, 60)  # frames
+_NUM_ALTERNATIVES = 4  # answers
 Row = dict[str, Any]
 
 
-def table(
+def benchmark_tweening(
     kinds: Mapping[str, Sequence[Motion]],
     infiller: Inbetweener,
     densities: Sequence[Any],
@@ -42,30 +42,38 @@ def table(
     """
     rows, draws = [], torch.Generator().manual_seed(0)
     for number, (kind, clips) in enumerate(kinds.items()):
-        shown = [clip.slice(0, FRAMES) for clip in clips if clip.num_frames >= FRAMES]
-        told: dict[str, list[Row]] = {"chosen": [], "rolled": [], f"best of {_BEST_OF}": []}
+        shown = [clip.slice(0, TWEEN_FRAMES) for clip in clips if clip.num_frames >= TWEEN_FRAMES]
+        told: dict[str, list[Row]] = {"chosen": [], "rolled": [], f"best of {_NUM_ALTERNATIVES}": []}
         for clip in shown:
-            inner = (1 + torch.randperm(FRAMES - 2, generator=draws)[:_BETWEEN]).tolist()
-            keys = Keys((0, *inner, FRAMES - 1))
-            density = likeliest(densities, to_canonical(clip)[0])
-            roll = partial(rolled, densities=[density], generator=draws)
-            best = partial(best_of, count=_BEST_OF, rollable=densities, generator=draws)
+            inner = (1 + torch.randperm(TWEEN_FRAMES - 2, generator=draws)[:_INNER_KEYS]).tolist()
+            keys = Keys((0, *inner, TWEEN_FRAMES - 1))
+            density = select_likeliest_density(densities, to_canonical(clip)[0])
+            roll = partial(roll_through_gaps, densities=[density], generator=draws)
+            best = partial(lowest_energy, count=_NUM_ALTERNATIVES, rollable=densities, generator=draws)
             ways = (partial(tween, rollable=densities), partial(tween, another=roll), best)
             for method, way in zip(told, ways, strict=True):
                 began = time.perf_counter()
                 made = way(clip, keys, infiller).motion
-                told[method].append(_of_keys(made, clip, keys.frames, time.perf_counter() - began))
+                told[method].append(_evaluate_tween(made, clip, keys.frames, time.perf_counter() - began))
         rows += [
-            {"kind": kind, "what": "keys", "by": method, "clips": len(each), **_mean(each)}
+            {"kind": kind, "what": "keys", "by": method, "clips": len(each), **_average_columns(each)}
             for method, each in told.items()
             if each
         ]
         shown = [clip.slice(0, 4 * PRIOR_FPS) for clip in clips if clip.num_frames >= 4 * PRIOR_FPS]
-        for count in _ENDS:
+        for count in _END_LENGTHS:
             for by, extending in (("infiller", ()), ("density", densities)):
-                each = [_of_end(clip, count, infiller, extending) for clip in shown]
+                each = [_evaluate_end(clip, count, infiller, extending) for clip in shown]
                 rows += (
-                    [{"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each), **_mean(each)}]
+                    [
+                        {
+                            "kind": kind,
+                            "what": f"end of {count} frames",
+                            "by": by,
+                            "clips": len(each),
+                            **_average_columns(each),
+                        }
+                    ]
                     if each
                     else []
                 )
@@ -74,46 +82,46 @@ def table(
     return rows
 
 
-def _of_keys(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:
+def _evaluate_tween(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:
     """Errors at keys and between them; jerk over the keys as a share of the clip's own 95th percentile."""
     places, truth = made.joint_positions(), clip.joint_positions()
     jerk, usual = (torch.diff(each, n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (places, truth))
     at_keys = max(float(jerk[max(0, key - 3) : key + 1].max()) for key in keys)
     away = (places - truth).norm(dim=-1)
     ends, toes = ([made.skeleton.index(name) for name in names] for names in (("leftHand", "rightHand", *TOES), TOES))
-    worst_ours, worst_mocap = (_worst(each.joint_positions(), ends, toes) for each in (made, clip))
+    worst_ours, worst_mocap = (_measure_worst_frames(each.joint_positions(), ends, toes) for each in (made, clip))
     return {
         "key_mm": 1000 * float(away[list(keys)].max()),
         "error_cm": 100 * float(away.mean()),
         "jerk_at_keys": at_keys / float(usual.quantile(0.95)),
-        **_feet(made, clip),
+        **_compare_feet(made, clip),
         **worst_ours,
         **{f"mocap_{name}": value for name, value in worst_mocap.items()},
         "ms_frame": 1000 * seconds / made.num_frames,
     }
 
 
-def _worst(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
+def _measure_worst_frames(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
     """Largest step (cm in a thirtieth of a second) and acceleration of hands and toes; longest time on no foot."""
-    peaks = worst_frame.peaks(places[:, ends], places[:, 0], PRIOR_FPS)
+    peaks = worst_frame.measure_peaks(places[:, ends], places[:, 0], PRIOR_FPS)
     return {
         "step_cm": 100 * peaks.step,
         "acceleration_m_s2": peaks.acceleration,
-        "unsupported_s": worst_frame.longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS),
+        "unsupported_s": worst_frame.measure_longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS),
     }
 
 
-def _of_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence[Any]) -> Row:
+def _evaluate_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence[Any]) -> Row:
     first = clip.num_frames - count
     began = time.perf_counter()
     made = infill(clip, infiller, [Mask(ALL, first, clip.num_frames)], extending=extending).motion
     seconds = time.perf_counter() - began
     away = (made.joint_positions() - clip.joint_positions())[first:].norm(dim=-1)
     ends = [each.slice(first, clip.num_frames) for each in (made, clip)]
-    return {"error_cm": 100 * float(away.mean()), **_feet(*ends), "ms_frame": 1000 * seconds / count}
+    return {"error_cm": 100 * float(away.mean()), **_compare_feet(*ends), "ms_frame": 1000 * seconds / count}
 
 
-def _feet(made: Motion, clip: Motion) -> Row:
+def _compare_feet(made: Motion, clip: Motion) -> Row:
     ours, theirs = metrics.measure(made), metrics.measure(clip)
     return {
         "skate_cm_s": ours["skate_cm_s"],
@@ -124,6 +132,6 @@ def _feet(made: Motion, clip: Motion) -> Row:
     }
 
 
-def _mean(rows: Sequence[Row]) -> Row:
+def _average_columns(rows: Sequence[Row]) -> Row:
     """Of each column; clips in which no toe stands have no planted ones."""
     return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}

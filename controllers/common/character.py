@@ -9,18 +9,18 @@ from functools import cached_property
 
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
-from mapctl.intent.steering import Command, Limits
+from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
-from mapctl.protocols import Abilities
+from mapctl.protocols import DataLimits
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
-from mapctl.terms import Footing
+from mapctl.terms import FootContact
 
-_LEAST, _MOST = 0.1, 10.0
+_MIN_SCALE, _MAX_SCALE = 0.1, 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Stature:
+class Character:
     """Whose bones move."""
 
     skeleton: Skeleton = CANONICAL
@@ -29,7 +29,7 @@ class Stature:
     """Height of the person's toe joints while the foot stands flat, metres."""
 
     def __post_init__(self):
-        if self.skeleton.names != CANONICAL.names or not _LEAST < self.scale < _MOST:
+        if self.skeleton.names != CANONICAL.names or not _MIN_SCALE < self.scale < _MAX_SCALE:
             raise RequestError("a person needs the canonical joints, and legs of a human's length that hang down")
 
     @cached_property
@@ -37,7 +37,9 @@ class Stature:
         """How much longer the legs are than the canonical ones; 1 for the canonical body, exactly."""
         if self.skeleton is CANONICAL and self.toe_rest_height == TOE_REST_HEIGHT:
             return 1.0
-        return (_drop(self.skeleton) + self.toe_rest_height) / (_drop(CANONICAL) + TOE_REST_HEIGHT)
+        return (_hip_to_toe_height(self.skeleton) + self.toe_rest_height) / (
+            _hip_to_toe_height(CANONICAL) + TOE_REST_HEIGHT
+        )
 
     @cached_property
     def small(self) -> Skeleton:
@@ -54,11 +56,11 @@ class Stature:
         """A curve as the prior's size sees it."""
         return curve if self.scale == 1.0 else Curve(curve.points / self.scale, curve.closed)
 
-    def abilities(self, abilities: Abilities) -> Abilities:
+    def abilities(self, abilities: DataLimits) -> DataLimits:
         """What the prior's data show, at the person's size."""
         if self.scale == 1.0:
             return abilities
-        return Abilities(abilities.slowest * self.scale, abilities.fastest * self.scale, abilities.turn_rate)
+        return DataLimits(abilities.slowest * self.scale, abilities.fastest * self.scale, abilities.turn_rate)
 
     def command(self, command: Command) -> Command:
         """A command as the prior's size sees it."""
@@ -67,11 +69,11 @@ class Stature:
         step = None if command.step_length is None else command.step_length / self.scale
         return replace(command, speed=command.speed / self.scale, step_length=step)
 
-    def limits(self, limits: Limits) -> Limits:
+    def limits(self, limits: SteeringLimits) -> SteeringLimits:
         """How fast wishes change, as the prior's size sees it."""
         return replace(limits, acceleration=limits.acceleration / self.scale, braking=limits.braking / self.scale)
 
-    def footing(self, footing: Footing) -> Footing:
+    def footing(self, footing: FootContact) -> FootContact:
         """A footing term, whose rest height is the person's own, for the prior's size."""
         return replace(
             footing,
@@ -98,7 +100,7 @@ class Stature:
         return Ledger(tuple(scaled))
 
 
-def _drop(skeleton: Skeleton) -> float:
+def _hip_to_toe_height(skeleton: Skeleton) -> float:
     """How far below the hips the toe joints are in the rest pose, metres, mean of both."""
     bones = [side + part for side in ("left", "right") for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")]
     return -float(skeleton.offsets[[skeleton.index(name) for name in bones], 1].sum()) / 2

@@ -6,16 +6,16 @@ from torch import Tensor
 
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import Follow
+from mapctl.intent.path import PathRequest
 from mapctl.motion import Motion
-from mapctl.protocols import Abilities
+from mapctl.protocols import DataLimits
 
-_TOLERATED_CM = 15.0
+_PATH_TOLERANCE_CM = 15.0
 _OVERSHOOT = 0.15  # metres: the last frame of a walk may lie a step of one frame beyond the end
 _CORNER_SECONDS = 1.0
 
 
-def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abilities) -> list[str]:
+def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], abilities: DataLimits) -> list[str]:
     """Sentences about speeds and corners beyond the prior's data, and about a curve that ends too soon."""
     notes = []
     speeds = torch.diff(arcs) * PRIOR_FPS
@@ -24,7 +24,7 @@ def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abili
         notes.append(f"{fastest:.2f} m/s is faster than the prior's data, which reach {abilities.fastest:.2f} m/s")
     if slowest < abilities.slowest:
         notes.append(f"{slowest:.2f} m/s is slower than the prior's data, which begin at {abilities.slowest:.2f} m/s")
-    notes += _corners(request, arcs, abilities)
+    notes += _check_corners(request, arcs, abilities)
     if not request.curve.closed and float(arcs[-1]) > request.curve.length + _OVERSHOOT:
         over = float(arcs[-1]) - request.curve.length
         notes.append(
@@ -33,25 +33,28 @@ def in_advance(request: Follow, arcs: Float[Tensor, " frames"], abilities: Abili
     return notes
 
 
-def after_the_fact(motion: Motion, curve: Curve, joint: str) -> list[str]:
+def check_tracking(motion: Motion, curve: Curve, joint: str) -> list[str]:
     """The stretch around the worst frame that leaves the curve by more than 15 cm, if there is one."""
     walked = motion.joint_positions()[:, motion.skeleton.index(joint)]
     places = walked[:, ::2] if curve.dims == 2 else walked
     error = (places - curve.point(curve.track(walked, start=0.0))).norm(dim=-1)
-    if float(error.max()) * 100 <= _TOLERATED_CM:
+    if float(error.max()) * 100 <= _PATH_TOLERANCE_CM:
         return []
-    first, last = (float(frame / motion.fps) for frame in _stretch(error * 100 > _TOLERATED_CM, int(error.argmax())))
+    first, last = (
+        float(frame / motion.fps)
+        for frame in _find_interval_around(error * 100 > _PATH_TOLERANCE_CM, int(error.argmax()))
+    )
     return [f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first:.1f} and {last:.1f} s"]
 
 
-def _stretch(off: Bool[Tensor, " frames"], worst: int) -> tuple[int, int]:
+def _find_interval_around(off: Bool[Tensor, " frames"], worst: int) -> tuple[int, int]:
     """First and last frame of the unbroken stretch around the worst one."""
     inside = (~off).nonzero()[:, 0]
     before, after = inside[inside < worst], inside[inside > worst]
     return int(before[-1]) + 1 if len(before) else 0, int(after[0]) - 1 if len(after) else len(off) - 1
 
 
-def _corners(request: Follow, arcs: Tensor, abilities: Abilities) -> list[str]:
+def _check_corners(request: PathRequest, arcs: Tensor, abilities: DataLimits) -> list[str]:
     """The sharpest turn over one second of the walk (or all of a shorter one), if it is beyond the data."""
     step = min(round(_CORNER_SECONDS * PRIOR_FPS), len(arcs) - 1)
     samples = request.curve.curvature(arcs) * torch.gradient(arcs)[0]

@@ -7,22 +7,22 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from controllers.common.map_refinement import StandingSettings, rest_height
-from mapctl.features import LAYOUT, PRIOR_FPS, Place, encode, root_places
+from controllers.common.map_refinement import RefinementSettings, estimate_rest_height
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.motion import Motion
 from mapctl.problem import density_selection
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.terms import Clearance, Likelihood, Seam, Support, Term
+from mapctl.terms import Clearance, Jerk, Likelihood, Support, Term
 from mapctl.terms.trial import Trial
 
-_PAST = 3  # frames that the others are seen after
+_PRECEDING_FRAMES = 3  # frames that the others are seen after
 
 
-def energy_of(
-    motion: Motion, stands: Bool[Tensor, "frames 2"], density: Any, settings: StandingSettings, rig: Rig | None = None
+def score(
+    motion: Motion, stands: Bool[Tensor, "frames 2"], density: Any, settings: RefinementSettings, rig: Rig | None = None
 ) -> Ledger:
     """By term: the likelihood under a density, footing, clearance, what the body stands on, and jerk, of a motion on
     any rig of more than three frames at the prior's rate; `stands` are its contacts at that rate.
@@ -32,28 +32,28 @@ def energy_of(
     features, before = encode(canonical)
     features[: len(bits), LAYOUT.slices["contacts"]] = bits.to(features)
     features = features.float()
-    ground, heading = root_places(features.double(), before)
-    place = Place(ground[_PAST - 1].float(), heading[_PAST - 1].float())
-    shown = features[None, _PAST:]
-    judge = density.blurred(density_selection.spread())
-    state = judge.advance(judge.likely_state(features), features[None, :_PAST])
+    ground, heading = integrate_root(features.double(), before)
+    place = GroundPose(ground[_PRECEDING_FRAMES - 1].float(), heading[_PRECEDING_FRAMES - 1].float())
+    shown = features[None, _PRECEDING_FRAMES:]
+    judge = density.with_observation_noise(density_selection.proposal_sigma())
+    state = judge.advance(judge.infer_state(features), features[None, :_PRECEDING_FRAMES])
     with torch.no_grad():
         nats = judge.log_prob(shown, state)
-    height = rest_height(canonical, bits)
+    height = estimate_rest_height(canonical, bits)
     terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, rest_height=height)]
     terms.append(replace(settings.clearance or Clearance(), rest_height=height))
     terms.append(Support(rest_height=height))
-    terms.append(settings.seam or Seam(sigma=50.0, frames=len(features)))
+    terms.append(settings.jerk or Jerk(sigma=50.0, frames=len(features)))
     contacts = features[:, LAYOUT.slices["contacts"]] > 0.5
     trial = Trial(
         shown,
         place,
         torch.zeros_like(shown),
         nats,
-        contacts[None, _PAST:],
-        canonical.joint_positions()[:_PAST].float(),
+        contacts[None, _PRECEDING_FRAMES:],
+        canonical.joint_positions()[:_PRECEDING_FRAMES].float(),
         canonical.skeleton,
         PRIOR_FPS,
-        contacts[_PAST - 1],
+        contacts[_PRECEDING_FRAMES - 1],
     )
-    return Objective(lambda unknowns: trial, terms).ledger_of(trial)
+    return Objective(lambda unknowns: trial, terms).build_ledger(trial)

@@ -10,17 +10,17 @@ from typing import Any
 import torch
 
 from controllers.denoising.denoise import denoise
-from controllers.denoising.result import Denoised
+from controllers.denoising.result import DenoiseResult
 from controllers.denoising.segment import DenoiseSettings
 from mapctl import formats
 from mapctl.errors import DiskFullError, MapctlError, RequestError
 from mapctl.protocols import Denoiser
-from mapctl.recording.masks import of_missing
+from mapctl.recording.masks import masks_from_missing
 from mapctl.retarget.rigs import Rig
 
 
 @dataclass(frozen=True)
-class Job:
+class FileJob:
     """One file."""
 
     source: Path
@@ -30,10 +30,10 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Done:
+class FileResult:
     """What became of a job."""
 
-    job: Job
+    job: FileJob
     """It."""
     error: str = ""
     """Why there is no result; empty where there is one."""
@@ -44,7 +44,7 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Cleaner:
+class FileDenoiser:
     """Loads the denoiser on first use, in the process that uses it; what is sent to a process is small."""
 
     load: Callable[[], Denoiser]
@@ -53,19 +53,19 @@ class Cleaner:
     """What is known of the captures."""
     rig: Rig | None = None
     """Of all files, where it is not the one that would be recognised."""
-    after: Callable[[Job, Denoised], None] | None = None
+    after: Callable[[FileJob, DenoiseResult], None] | None = None
     """Called with each result, in that process: to write a report."""
 
-    def __call__(self, job: Job) -> Done:
+    def __call__(self, job: FileJob) -> FileResult:
         """Denoise one file and write the result; what goes wrong with it is said in what is returned, but for a full
         disk, which is a DiskFullError.
         """
         torch.set_num_threads(1)
         try:
             unit = None if self.rig is None else self.rig.metres_per_unit
-            motion, missing = formats.load_lossy(job.source, metres_per_unit=unit)
-            masks = of_missing(motion, missing)
-            done = denoise(motion, _loaded(self.load), masks=masks, settings=self.settings, rig=self.rig)
+            motion, missing = formats.load_with_missing(job.source, metres_per_unit=unit)
+            masks = masks_from_missing(motion, missing)
+            done = denoise(motion, _load_once(self.load), masks=masks, settings=self.settings, rig=self.rig)
             job.out.parent.mkdir(parents=True, exist_ok=True)
             if self.after is not None:
                 self.after(job, done)
@@ -74,24 +74,24 @@ class Cleaner:
         except DiskFullError:
             raise  # no other file would find room
         except (MapctlError, OSError) as error:
-            return Done(job, error=" ".join(str(error).split()))
+            return FileResult(job, error=" ".join(str(error).split()))
         except Exception as error:
-            return Done(job, error=f"{type(error).__name__}: {' '.join(str(error).split())}")
-        return Done(job, "", done.motion.num_frames, done.seconds)
+            return FileResult(job, error=f"{type(error).__name__}: {' '.join(str(error).split())}")
+        return FileResult(job, "", done.motion.num_frames, done.seconds)
 
 
-_KEPT: dict[str, Any] = {}  # by process: what was loaded last
+_LOADED_DENOISERS: dict[str, Any] = {}  # by process: what was loaded last
 
 
-def _loaded(load: Callable[[], Denoiser]) -> Denoiser:
+def _load_once(load: Callable[[], Denoiser]) -> Denoiser:
     key = repr(load)
-    if key not in _KEPT:
-        _KEPT.clear()
-        _KEPT[key] = load()
-    return _KEPT[key]
+    if key not in _LOADED_DENOISERS:
+        _LOADED_DENOISERS.clear()
+        _LOADED_DENOISERS[key] = load()
+    return _LOADED_DENOISERS[key]
 
 
-def over_processes(jobs: Sequence[Job], cleaner: Cleaner, *, processes: int) -> Iterator[Done]:
+def run_over_processes(jobs: Sequence[FileJob], cleaner: FileDenoiser, *, processes: int) -> Iterator[FileResult]:
     """As they end, over so many processes of this machine; one works in this process."""
     if processes == 1:
         yield from map(cleaner, jobs)
@@ -102,7 +102,9 @@ def over_processes(jobs: Sequence[Job], cleaner: Cleaner, *, processes: int) -> 
     yield from ended
 
 
-def over_cluster(jobs: Sequence[Job], cleaner: Cleaner, *, address: str, workers: int) -> Iterator[Done]:
+def run_over_cluster(
+    jobs: Sequence[FileJob], cleaner: FileDenoiser, *, address: str, workers: int
+) -> Iterator[FileResult]:
     """As they end, over a ray cluster; `local` starts one of so many workers on this machine. All machines must see the
     files under the same paths. RequestError where ray is not installed or the cluster does not answer.
     """
@@ -119,7 +121,7 @@ def over_cluster(jobs: Sequence[Job], cleaner: Cleaner, *, address: str, workers
         raise RequestError(f"no ray cluster at {address} ({' '.join(str(error).split())})") from error
     try:
 
-        def clean(job: Job) -> Done:
+        def clean(job: FileJob) -> FileResult:
             return cleaner(job)
 
         task = ray.remote(num_cpus=1, max_retries=2)(clean)
@@ -130,6 +132,6 @@ def over_cluster(jobs: Sequence[Job], cleaner: Cleaner, *, address: str, workers
             try:
                 yield ray.get(ready[0])
             except ray.exceptions.RayError as error:
-                yield Done(job, error=" ".join(str(error).split())[:200])
+                yield FileResult(job, error=" ".join(str(error).split())[:200])
     finally:
         ray.shutdown()

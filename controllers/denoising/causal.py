@@ -9,18 +9,18 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from controllers.denoising.denoise import SHORTEST, denoise
-from controllers.denoising.result import Denoised, faded, joined
+from controllers.denoising.denoise import MIN_DENOISE_FRAMES, denoise
+from controllers.denoising.result import DenoiseResult, crossfade, join_segments
 from controllers.denoising.segment import DenoiseSettings
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
-from mapctl.recording.masks import Mask, after, part_of, written_back
+from mapctl.recording.masks import Mask, slice_masks, trim_masks_before, write_back_masked
 from mapctl.retarget.rigs import Rig
 
-_LONGEST_DELAY = 5.0
-_TELLING = 1.0  # seconds that show what rig a capture is on
+_MAX_DELAY = 5.0
+_RIG_SECONDS = 1.0  # seconds that show what rig a capture is on
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class CausalSettings:
     """That a pass looks back on."""
 
     def __post_init__(self):
-        if not 1 / PRIOR_FPS <= self.delay <= _LONGEST_DELAY:
-            raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_LONGEST_DELAY:g} s, got {self.delay:g}")
+        if not 1 / PRIOR_FPS <= self.delay <= _MAX_DELAY:
+            raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_MAX_DELAY:g} s, got {self.delay:g}")
 
-    def waiting(self, fps: float) -> tuple[int, int]:
+    def compute_delay_frames(self, fps: float) -> tuple[int, int]:
         """How many frames a frame waits for at most, and how many fewer it has waited for that a pass decides last.
 
         Whole frames within the delay: at 24 a second and 0.2 s four, which take 0.17 s.
@@ -74,29 +74,31 @@ class CausalDenoiser:
         """Seconds between a frame and its clean one, at most, but for the compute; at any rate of frames."""
         return self._causal.delay
 
-    def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> Denoised | None:
+    def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> DenoiseResult | None:
         """The next frames of the capture; returns those that are due by now, None if none are. Masks count from the
         first frame of all.
         """
-        most, step = self._causal.waiting(float(frames.fps))
+        most, step = self._causal.compute_delay_frames(float(frames.fps))
         self._masks = (*self._masks, *masks)
         self._past = frames if self._past is None else self._past.join(frames)
         come = self._first + self._past.num_frames
         if come - 1 - self._given < most:  # the oldest may wait for another frame
             return None
-        return self._pass(come - max(0, most + 1 - step))
+        return self._denoise_recent(come - max(0, most + 1 - step))
 
-    def finish(self) -> Denoised | None:
+    def finish(self) -> DenoiseResult | None:
         """The frames that still wait; the capture is over."""
         come = 0 if self._past is None else self._first + self._past.num_frames
-        return self._pass(come) if come > self._given else None
+        return self._denoise_recent(come) if come > self._given else None
 
-    def _pass(self, due: int) -> Denoised:
+    def _denoise_recent(self, due: int) -> DenoiseResult:
         assert self._past is not None
         # What was given back of a lost joint is written into the past: later passes may see nothing else of it.
-        masks = part_of(after(self._masks, self._given), self._first, self._first + self._past.num_frames)
+        masks = slice_masks(
+            trim_masks_before(self._masks, self._given), self._first, self._first + self._past.num_frames
+        )
         done = denoise(self._past, self._denoiser, masks=masks, settings=self._settings, rig=self._rig)
-        if not self._told and self._past.seconds >= _TELLING:
+        if not self._told and self._past.seconds >= _RIG_SECONDS:
             self._rig, self._told = done.rig, True
         start, count = self._given - self._first, due - self._given
         given = replace(done.slice(start, start + count), notes=self._notes(done, due))
@@ -105,24 +107,24 @@ class CausalDenoiser:
             shared = min(count, first + old.num_frames - self._given)
             if shared > 0:
                 before = old.slice(self._given - first, self._given - first + shared)
-                given = replace(given, motion=faded(before, given.motion, shared))
+                given = replace(given, motion=crossfade(before, given.motion, shared))
         old = self._past.slice(start, self._past.num_frames)
-        lost = part_of(self._masks, self._given, self._given + old.num_frames)
-        renewed = written_back(old, given.motion, lost)
+        lost = slice_masks(self._masks, self._given, self._given + old.num_frames)
+        renewed = write_back_masked(old, given.motion, lost)
         self._past = self._past.slice(0, start).join(renewed) if start else renewed
         self._foreseen, self._given = (done.motion, self._first), due
-        self._forget()
+        self._discard_past()
         return given
 
-    def _notes(self, done: Denoised, due: int) -> tuple[str, ...]:
+    def _notes(self, done: DenoiseResult, due: int) -> tuple[str, ...]:
         """Of the frames that a pass decides: what it says of its beginning, the first has said."""
         assert self._past is not None
-        if self._past.num_frames < SHORTEST:
+        if self._past.num_frames < MIN_DENOISE_FRAMES:
             few = f"frames {self._given}:{due} were due before noise could be told from motion: they were not changed"
             return (few,)
         return done.notes if self._given == 0 else ()
 
-    def _forget(self) -> None:
+    def _discard_past(self) -> None:
         """What lies further back than a pass looks."""
         assert self._past is not None
         kept = max(1, round((self._causal.past + self._causal.delay) * float(self._past.fps)))
@@ -140,28 +142,28 @@ def denoise_causal(
     delay: float = CausalSettings.delay,
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Denoised:
+) -> DenoiseResult:
     """A whole motion through a CausalDenoiser, a frame at a time."""
     began = time.perf_counter()
     stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay), rig=rig)
-    pieces: list[tuple[Denoised, int]] = []
+    pieces: list[tuple[DenoiseResult, int]] = []
     given = 0
     for frame in range(motion.num_frames):
         new = stream.push(motion.slice(frame, frame + 1), masks=masks if frame == 0 else ())
         if frame + 1 == motion.num_frames:
-            new = _both(new, stream.finish())
+            new = _concatenate_results(new, stream.finish())
         if new is not None:
             pieces.append((new, given))
             given += new.motion.num_frames
             if progress is not None:
                 progress(given, motion.num_frames)
-    whole = joined(pieces)
+    whole = join_segments(pieces)
     note = f"causal: a frame is decided at most {stream.delay:.2f} s after it came"
     return replace(whole, seconds=time.perf_counter() - began, notes=(note, *whole.notes))
 
 
-def _both(first: Denoised | None, second: Denoised | None) -> Denoised | None:
+def _concatenate_results(first: DenoiseResult | None, second: DenoiseResult | None) -> DenoiseResult | None:
     """One after the other, as far as they are there."""
     if first is None or second is None:
         return first or second
-    return joined([(first, 0), (second, first.motion.num_frames)])
+    return join_segments([(first, 0), (second, first.motion.num_frames)])

@@ -12,25 +12,35 @@ from typing import Any
 
 import torch
 
-from controllers.denoising.lead_pose import leads, led_by
-from controllers.denoising.lead_transition import passage
-from controllers.denoising.result import Denoised, joined
-from controllers.denoising.segment import DenoiseSettings, Piece
+from controllers.denoising.lead_pose import has_lead_pose, restore_lead_pose
+from controllers.denoising.lead_transition import find_lead_transition
+from controllers.denoising.result import DenoiseResult, join_segments
+from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Denoiser
-from mapctl.recording.inspection import examine
-from mapctl.recording.masks import Mask, after, by_own_names, masked, part_of, written_back
-from mapctl.retarget import settled, to_canonical
+from mapctl.recording.inspection import inspect_recording
+from mapctl.recording.masks import (
+    Mask,
+    expand_valid_masks,
+    resolve_joint_names,
+    slice_masks,
+    trim_masks_before,
+    write_back_masked,
+)
+from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
-__all__ = ["DenoiseSettings", "Denoised", "begins_with_tpose", "denoise"]
+__all__ = ["DenoiseResult", "DenoiseSettings", "begins_with_tpose", "denoise"]
 
-SHORTEST = 8
+MIN_DENOISE_FRAMES = 8
 """Frames of a capture that noise can be told in."""
-_TELLING = 3000  # frames that show what rig a capture is on
-_PIECE, _SHARED = 60.0, 2.0  # seconds of a long capture that are cleaned at once, and that two pieces share
+_RIG_FRAMES = 3000  # frames that show what rig a capture is on
+_SEGMENT_SECONDS, _OVERLAP_SECONDS = (
+    60.0,
+    2.0,
+)  # seconds of a long capture that are cleaned at once, and that two pieces share
 
 
 def denoise(
@@ -42,7 +52,7 @@ def denoise(
     densities: Sequence[Any] = (),
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Denoised:
+) -> DenoiseResult:
     """Denoise a motion on any rig that `mapctl.retarget.rigs` can tell, or on a given one; RequestError for others and
     for masks that do not fit.
 
@@ -52,60 +62,62 @@ def denoise(
     done and all frames.
     """
     settings = settings or DenoiseSettings()
-    masks = by_own_names(motion, masks, rig)
-    masked(motion, masks)  # whole: of a piece they are cut to its frames
+    masks = resolve_joint_names(motion, masks, rig)
+    expand_valid_masks(motion, masks)  # whole: of a piece they are cut to its frames
     # Told once: a piece may lack what shows the rig's T-pose.
-    beginning, rigmap = to_canonical(_beginning(motion), rig)
-    rig = settled(rigmap)
-    lead = 1 if leads(_beginning(motion), beginning, rigmap) else 0
-    mixed = passage(motion, rigmap) if lead else None
+    beginning, rigmap = to_canonical(_slice_beginning(motion), rig)
+    rig = as_rig(rigmap)
+    lead = 1 if has_lead_pose(_slice_beginning(motion), beginning, rigmap) else 0
+    mixed = find_lead_transition(motion, rigmap) if lead else None
     wanted = (*masks, *(mixed.masks(motion.skeleton.names) if mixed else ()))
     frames = motion.num_frames - lead
-    long, shared = (max(SHORTEST, round(seconds * float(motion.fps))) for seconds in (_PIECE, _SHARED))
-    pieces: list[tuple[Denoised, int]] = []
+    long, shared = (
+        max(MIN_DENOISE_FRAMES, round(seconds * float(motion.fps))) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS)
+    )
+    pieces: list[tuple[DenoiseResult, int]] = []
     start = stop = 0
     while stop < frames:
         before, stop = stop, frames if frames - start <= long + shared else start + long
-        part, hidden = motion.slice(lead + start, lead + stop), part_of(wanted, lead + start, lead + stop)
+        part, hidden = motion.slice(lead + start, lead + stop), slice_masks(wanted, lead + start, lead + stop)
         if pieces:  # what the piece before made of lost joints is all that is known of them
             last, first = pieces[-1]
-            part = written_back(part, last.motion.slice(start - first, before - first), hidden)
-            hidden = after(hidden, before - start)
-        pieces.append((_cleaned(part, denoiser, hidden, settings, densities, rig), start))
+            part = write_back_masked(part, last.motion.slice(start - first, before - first), hidden)
+            hidden = trim_masks_before(hidden, before - start)
+        pieces.append((_denoise_segment(part, denoiser, hidden, settings, densities, rig), start))
         start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
-    done = replace(joined(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
-    return led_by(motion, done, rigmap, mixed, masks) if mixed else done
+    done = replace(join_segments(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
+    return restore_lead_pose(motion, done, rigmap, mixed, masks) if mixed else done
 
 
 def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:
     """Whether frame 0 is a T-pose, or the rig's rest pose, that the motion does not begin with."""
-    beginning = _beginning(motion)
-    return leads(beginning, *to_canonical(beginning, rig))
+    beginning = _slice_beginning(motion)
+    return has_lead_pose(beginning, *to_canonical(beginning, rig))
 
 
-def _beginning(motion: Motion) -> Motion:
+def _slice_beginning(motion: Motion) -> Motion:
     """As much as is looked at to tell a rig."""
-    return motion.slice(0, min(motion.num_frames, _TELLING))
+    return motion.slice(0, min(motion.num_frames, _RIG_FRAMES))
 
 
-def _cleaned(
+def _denoise_segment(
     motion: Motion,
     denoiser: Denoiser,
     masks: Sequence[Mask],
     settings: DenoiseSettings,
     densities: Sequence[Any],
     rig: Rig,
-) -> Denoised:
+) -> DenoiseResult:
     began = time.perf_counter()
-    examined = examine(motion, masks)
-    if motion.num_frames < SHORTEST:
+    examined = inspect_recording(motion, masks)
+    if motion.num_frames < MIN_DENOISE_FRAMES:
         nothing = torch.zeros(motion.num_frames, 2, dtype=torch.bool)
         believed = torch.zeros(motion.num_frames, CANONICAL.num_joints)
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
-        return Denoised(
+        return DenoiseResult(
             motion, motion, examined.noise, examined.noise_root, (), nothing, believed, Ledger(), notes=(note,)
         )
-    done = Piece(examined, denoiser, settings, rig).run(densities)
+    done = SegmentDenoiser(examined, denoiser, settings, rig).run(densities)
     return replace(done, seconds=time.perf_counter() - began)

@@ -11,26 +11,37 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.denoising.lead_transition import Passage, carriers, fitted_frames, passed
-from controllers.denoising.result import Denoised
+from controllers.denoising.lead_transition import (
+    LeadTransition,
+    hips_and_ancestors,
+    line_fit_frames,
+    restore_lead_transition,
+)
+from controllers.denoising.result import DenoiseResult
 from mapctl import rotations
 from mapctl.motion import Motion
-from mapctl.recording.artefacts import Fault
-from mapctl.recording.masks import Mask, hidden
-from mapctl.recording.pose_mixing import apart, line_weights
+from mapctl.recording.artefacts import Artefact
+from mapctl.recording.masks import Mask, expand_masks
+from mapctl.recording.pose_mixing import angle_between, linear_fit_weights
 from mapctl.retarget import RigMap, from_canonical
-from mapctl.retarget.pose_axes import Poses
+from mapctl.retarget.pose_axes import RigPoses
 from mapctl.skeleton import CANONICAL
 
 _LIMBS = tuple(side + part for side in ("left", "right") for part in ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg"))
-_LIKE, _RESTING = math.radians(40), math.radians(35)  # of a limb in a noisy frame, from where a pose has it
-_LEAP, _BEYOND = math.radians(60), 2.0  # of all joints together, at least; and times what the motion does by itself
-_AHEAD = 0.05  # seconds left out before a frame is foreseen: what a pose may be mixed into
-_NEAR_REST = 5.0  # times the noise of one angle, that a resting joint is turned by at most
-_NOISY, _SPIKE = math.radians(1.0), math.radians(60.0)
+_TPOSE_TOLERANCE, _REST_TOLERANCE = (
+    math.radians(40),
+    math.radians(35),
+)  # of a limb in a noisy frame, from where a pose has it
+_MIN_OUTLIER_ANGLE, _OUTLIER_RATIO = (
+    math.radians(60),
+    2.0,
+)  # of all joints together, at least; and times what the motion does by itself
+_SKIPPED_SECONDS = 0.05  # seconds left out before a frame is foreseen: what a pose may be mixed into
+_REST_NOISE_RATIO = 5.0  # times the noise of one angle, that a resting joint is turned by at most
+_NOISY_SIGMA, _MAX_SPIKE_ANGLE = math.radians(1.0), math.radians(60.0)
 
 
-def leads(motion: Motion, canonical: Motion, rigmap: RigMap) -> bool:
+def has_lead_pose(motion: Motion, canonical: Motion, rigmap: RigMap) -> bool:
     """Whether frame 0 is a pose that the motion does not begin with: a T-pose, or the rig's own pose of no rotations.
 
     `canonical` is the same motion in canonical joint frames. Both may be noisy: a clear T-pose must differ from most of
@@ -38,19 +49,21 @@ def leads(motion: Motion, canonical: Motion, rigmap: RigMap) -> bool:
     """
     if motion.num_frames < 2:
         return False
-    if _clear_tpose(canonical):
+    if _is_clear_tpose(canonical):
         return True
-    return (_like_tpose(canonical) or _at_zero(motion, rigmap)) and _leaps(canonical)
+    return (_resembles_tpose(canonical) or _is_near_zero_pose(motion, rigmap)) and _is_first_frame_outlier(canonical)
 
 
-def led_by(motion: Motion, done: Denoised, rigmap: RigMap, found: Passage, masks: Sequence[Mask]) -> Denoised:
+def restore_lead_pose(
+    motion: Motion, done: DenoiseResult, rigmap: RigMap, found: LeadTransition, masks: Sequence[Mask]
+) -> DenoiseResult:
     """What was cleaned of frame 1 on, led by the pose in frame 0 and by the frames that it is mixed into.
 
     Joints of the pose go back to rest that are there but for the noise. `masks` are the user's, of the whole capture.
     """
-    pose = _at_rest(motion, done, rigmap)
-    clean = passed(motion, pose, done, found, masks) if found.stop > 1 else done.motion
-    faults = tuple(_later(fault) for fault in _without_passage(motion, done.faults, found, masks))
+    pose = _snap_to_rest_pose(motion, done, rigmap)
+    clean = restore_lead_transition(motion, pose, done, found, masks) if found.stop > 1 else done.motion
+    faults = tuple(_shift_fault(fault) for fault in _drop_transition_faults(motion, done.faults, found, masks))
     stretches = tuple(replace(part, start=part.start + 1, stop=part.stop + 1) for part in done.stretches)
     notes = ["frame 0 is a T-pose, or the rest pose: it stays, but for noise of joints at rest"]
     if found.stop > 1:
@@ -60,18 +73,18 @@ def led_by(motion: Motion, done: Denoised, rigmap: RigMap, found: Passage, masks
     )
 
 
-def _clear_tpose(canonical: Motion) -> bool:
+def _is_clear_tpose(canonical: Motion) -> bool:
     """Arms out, everything straight, and then not."""
     turned = torch.rad2deg(rotations.to_rotation_vector(canonical.local_quat_xyzw[:, 1:]).norm(dim=-1))
     arms = turned[:, [CANONICAL.index(name) - 1 for name in ("leftUpperArm", "rightUpperArm")]].amin(dim=-1)
     return bool(arms[0] < 25) and bool(turned[0].mean() < 15) and bool(arms[1:].median() > 40)
 
 
-def _like_tpose(canonical: Motion) -> bool:
+def _resembles_tpose(canonical: Motion) -> bool:
     """Whether frame 0 has its arms out and its legs down, by the places of its joints: whatever T-pose the rig is
     thought to have.
     """
-    first = Poses.of(canonical.slice(0, 1), range(CANONICAL.num_joints))
+    first = RigPoses.of(canonical.slice(0, 1), range(CANONICAL.num_joints))
     up, left = first.up()[0], first.left()[0]
     aims = (
         ("leftUpperArm", "leftHand", left),
@@ -80,47 +93,49 @@ def _like_tpose(canonical: Motion) -> bool:
         ("rightUpperLeg", "rightFoot", -up),
     )
     ways = [(first.place(stop)[0] - first.place(start)[0], aim) for start, stop, aim in aims]
-    return all(float(way @ aim) > math.cos(_LIKE) * float(way.norm()) for way, aim in ways)
+    return all(float(way @ aim) > math.cos(_TPOSE_TOLERANCE) * float(way.norm()) for way, aim in ways)
 
 
-def _at_zero(motion: Motion, rigmap: RigMap) -> bool:
+def _is_near_zero_pose(motion: Motion, rigmap: RigMap) -> bool:
     """Whether the limbs of frame 0 are turned as little as in the pose of no rotations."""
     joints = [joint for name in _LIMBS if (joint := rigmap.joint_of[CANONICAL.index(name)]) is not None]
-    return bool((rotations.to_rotation_vector(motion.local_quat_xyzw[0, joints]).norm(dim=-1) < _RESTING).all())
+    return bool((rotations.to_rotation_vector(motion.local_quat_xyzw[0, joints]).norm(dim=-1) < _REST_TOLERANCE).all())
 
 
-def _leaps(canonical: Motion) -> bool:
+def _is_first_frame_outlier(canonical: Motion) -> bool:
     """Whether the motion, continued backward, misses frame 0 by far more than it misses frames of its own."""
     fps, frames = float(canonical.fps), canonical.num_frames
-    skipped = max(1, round(_AHEAD * fps))
-    fitted = min(fitted_frames(fps), frames - 1 - skipped)
+    skipped = max(1, round(_SKIPPED_SECONDS * fps))
+    fitted = min(line_fit_frames(fps), frames - 1 - skipped)
     if fitted < 2:
         return False
-    quats = rotations.sign_continuous(canonical.local_quat_xyzw[:, 1:])
+    quats = rotations.make_sign_continuous(canonical.local_quat_xyzw[:, 1:])
     windows = quats[1 + skipped - 1 :].unfold(0, fitted, 1)  # of frame t those from t + skipped on
-    foreseen = torch.nn.functional.normalize(windows @ line_weights(fitted, -float(skipped)), dim=-1)
-    away = apart(foreseen, quats[: len(foreseen)]).square().sum(dim=-1)
+    foreseen = torch.nn.functional.normalize(windows @ linear_fit_weights(fitted, -float(skipped)), dim=-1)
+    away = angle_between(foreseen, quats[: len(foreseen)]).square().sum(dim=-1)
     own = away[skipped + 1 :]  # nothing of the pose is mixed into these
     if len(own) < fitted:
-        return float(away[0]) > 2 * _LEAP**2
+        return float(away[0]) > 2 * _MIN_OUTLIER_ANGLE**2
     usual = own.median()
-    return float(away[0] - usual) > max(_LEAP**2, _BEYOND * float(own.quantile(0.98) - usual))
+    return float(away[0] - usual) > max(_MIN_OUTLIER_ANGLE**2, _OUTLIER_RATIO * float(own.quantile(0.98) - usual))
 
 
-def _at_rest(motion: Motion, done: Denoised, rigmap: RigMap) -> Motion:
+def _snap_to_rest_pose(motion: Motion, done: DenoiseResult, rigmap: RigMap) -> Motion:
     """Frame 0, joints at rest that are there but for the noise."""
     first = motion.slice(0, 1)
-    rest = min(_rests(motion, rigmap), key=lambda quats: float(apart(quats, first.local_quat_xyzw).mean()))
+    rest = min(
+        _list_rest_poses(motion, rigmap), key=lambda quats: float(angle_between(quats, first.local_quat_xyzw).mean())
+    )
     # In a noisy capture a joint that is further off has been hit by a spike.
-    reach = torch.where(done.noise > _NOISY, _SPIKE, _NEAR_REST * done.noise)
+    reach = torch.where(done.noise > _NOISY_SIGMA, _MAX_SPIKE_ANGLE, _REST_NOISE_RATIO * done.noise)
     # But for the hips and what carries them: a T-pose may face another way than the rig's.
-    body = carriers(motion, rigmap)
-    reach[body] = _NEAR_REST * done.noise[body]
-    at_rest = apart(rest, first.local_quat_xyzw) < reach
+    body = hips_and_ancestors(motion, rigmap)
+    reach[body] = _REST_NOISE_RATIO * done.noise[body]
+    at_rest = angle_between(rest, first.local_quat_xyzw) < reach
     return replace(first, local_quat_xyzw=torch.where(at_rest[..., None], rest, first.local_quat_xyzw))
 
 
-def _rests(motion: Motion, rigmap: RigMap) -> list[Float[Tensor, "1 joints 4"]]:
+def _list_rest_poses(motion: Motion, rigmap: RigMap) -> list[Float[Tensor, "1 joints 4"]]:
     """Local rotations that a T-pose may be meant to have: none, as in CMU's takes, and those of the rig's T-pose."""
     none = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     tpose = Motion(
@@ -129,9 +144,11 @@ def _rests(motion: Motion, rigmap: RigMap) -> list[Float[Tensor, "1 joints 4"]]:
     return [none.expand(1, motion.num_joints, 4), from_canonical(tpose, rigmap).local_quat_xyzw]
 
 
-def _without_passage(motion: Motion, faults: Sequence[Fault], found: Passage, masks: Sequence[Mask]) -> list[Fault]:
+def _drop_transition_faults(
+    motion: Motion, faults: Sequence[Artefact], found: LeadTransition, masks: Sequence[Mask]
+) -> list[Artefact]:
     """Faults of frame 1 on, less the dropouts that the passage was taken for; what the user masked is one."""
-    names, lost = motion.skeleton.names, hidden(motion, masks)[0]
+    names, lost = motion.skeleton.names, expand_masks(motion, masks)[0]
     kept = []
     for fault in faults:
         if fault.kind == "dropout" and fault.start + 1 < found.stop and found.joints[names.index(fault.joint)]:
@@ -144,5 +161,5 @@ def _without_passage(motion: Motion, faults: Sequence[Fault], found: Passage, ma
     return kept
 
 
-def _later(fault: Fault) -> Fault:
+def _shift_fault(fault: Artefact) -> Artefact:
     return replace(fault, start=fault.start + 1, stop=fault.stop + 1)

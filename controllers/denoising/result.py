@@ -12,19 +12,19 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import runs
-from mapctl.problem.density_selection import Stretch
+from mapctl.numerics.intervals import true_intervals
+from mapctl.problem.density_selection import DensityInterval
 from mapctl.problem.ledger import Ledger
-from mapctl.recording.artefacts import Fault
+from mapctl.recording.artefacts import Artefact
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
-Part = TypeVar("Part", Fault, Stretch)
-_DOUBTED = 0.5  # share of a joint's frames from which the network counts as out of its depth
+Part = TypeVar("Part", Artefact, DensityInterval)
+_FALLBACK_SHARE = 0.5  # share of a joint's frames from which the network counts as out of its depth
 
 
 @dataclass(frozen=True, eq=False)
-class Denoised:
+class DenoiseResult:
     """A clean motion, and what was found and changed."""
 
     motion: Motion
@@ -35,11 +35,11 @@ class Denoised:
     """Of each of a joint's angles, by joint of the rig, radians."""
     noise_root: float
     """Of each coordinate of the root's place, metres."""
-    faults: tuple[Fault, ...]
+    faults: tuple[Artefact, ...]
     """Everything that was found wrong."""
     contacts: Bool[Tensor, "frames 2"]
     """Left and right toe planted, at the prior's rate."""
-    believed: Float[Tensor, "frames canonical"]
+    proposal_share: Float[Tensor, "frames canonical"]
     """By frame at the prior's rate and canonical joint: 1 where the proposal was followed, 0 where the capture itself,
     smoothed, took its place."""
     ledger: Ledger
@@ -50,24 +50,24 @@ class Denoised:
     """Compute, wall clock."""
     notes: tuple[str, ...] = ()
     """What the user should know."""
-    stretches: tuple[Stretch, ...] = ()
+    stretches: tuple[DensityInterval, ...] = ()
     """Of each window of the MAP stage, in frames of the capture, which density counted and how much; none where none
     was given."""
 
-    def slice(self, start: int, stop: int) -> "Denoised":
+    def slice(self, start: int, stop: int) -> "DenoiseResult":
         """Frames start to stop, with what was wrong in them; the noise stays that of the whole."""
         ratio = PRIOR_FPS / float(self.motion.fps)
         part = slice(round(start * ratio), round(stop * ratio))
-        faults = _shifted(_between(self.faults, start, stop), -start)
+        faults = _shift_frames(_clip_to_frames(self.faults, start, stop), -start)
         return replace(
             self,
             motion=self.motion.slice(start, stop),
             capture=self.capture.slice(start, stop),
             faults=tuple(faults),
             contacts=self.contacts[part],
-            believed=self.believed[part],
-            stretches=tuple(_shifted(_between(self.stretches, start, stop), -start)),
-            ledger=_part(self.ledger, part),
+            proposal_share=self.proposal_share[part],
+            stretches=tuple(_shift_frames(_clip_to_frames(self.stretches, start, stop), -start)),
+            ledger=_slice_ledger(self.ledger, part),
         )
 
     def summary(self) -> dict[str, Any]:
@@ -83,8 +83,8 @@ class Denoised:
             "faults": [vars(fault) for fault in self.faults],
             "correction_cm": dict(zip(names, moved.tolist(), strict=True)),
             "correction_deg": dict(zip(names, turned.tolist(), strict=True)),
-            "contacts": self.contact_frames(),
-            "fallback": self.fallback(),
+            "contacts": self.list_contact_frames(),
+            "fallback": self.find_fallbacks(),
             "densities": [vars(stretch) for stretch in self.stretches],
             "ledger": self.ledger.summary(),
             "seconds": self.seconds,
@@ -99,11 +99,11 @@ class Denoised:
         angle = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
         return 100 * moved.mean(dim=0), angle.mean(dim=0)
 
-    def contact_frames(self) -> dict[str, list[list[int]]]:
+    def list_contact_frames(self) -> dict[str, list[list[int]]]:
         """By foot, first frame and one past the last of each contact, in frames of the capture."""
         scale = float(self.motion.fps) / PRIOR_FPS
         found: dict[str, list[list[int]]] = {"left": [], "right": []}
-        for foot, start, stop in runs(self.contacts):
+        for foot, start, stop in true_intervals(self.contacts):
             found[("left", "right")[foot]].append([round(start * scale), self._last(stop, scale)])
         return found
 
@@ -111,16 +111,16 @@ class Denoised:
         """One past the last frame of the capture, for one at the prior's rate."""
         return min(self.motion.num_frames, round(stop * scale))
 
-    def fallback(self) -> list[dict[str, Any]]:
+    def find_fallbacks(self) -> list[dict[str, Any]]:
         """Joints, and frames of the capture, in which the network was out of its depth."""
         scale = float(self.motion.fps) / PRIOR_FPS
         return [
             {"joint": CANONICAL.names[joint], "start": round(start * scale), "stop": self._last(stop, scale)}
-            for joint, start, stop in runs(self.believed < _DOUBTED)
+            for joint, start, stop in true_intervals(self.proposal_share < _FALLBACK_SHARE)
         ]
 
 
-def joined(pieces: Sequence[tuple[Denoised, int]]) -> Denoised:
+def join_segments(pieces: Sequence[tuple[DenoiseResult, int]]) -> DenoiseResult:
     """Pieces of one capture, each with the frame that it begins at; where two overlap the second fades in.
 
     By halves: one after the other each frame would be copied once for every piece.
@@ -128,19 +128,24 @@ def joined(pieces: Sequence[tuple[Denoised, int]]) -> Denoised:
     if len(pieces) == 1:
         return pieces[0][0]
     middle = len(pieces) // 2
-    return _after(joined(pieces[:middle]), joined(pieces[middle:]), pieces[middle][1] - pieces[0][1])
+    return _append_segment(
+        join_segments(pieces[:middle]), join_segments(pieces[middle:]), pieces[middle][1] - pieces[0][1]
+    )
 
 
-def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
+def _append_segment(whole: DenoiseResult, piece: DenoiseResult, start: int) -> DenoiseResult:
     """`piece` begins at frame `start` of `whole`."""
     shared = whole.motion.num_frames - start
-    motion = faded(whole.motion, piece.motion, shared)
+    motion = crossfade(whole.motion, piece.motion, shared)
     ratio = PRIOR_FPS / float(motion.fps)
     skip = start + shared // 2
     kept = round(skip * ratio)
     skipped = kept - round(start * ratio)
-    faults = _chained(_between(whole.faults, 0, skip), _between(_shifted(piece.faults, start), skip, motion.num_frames))
-    later = _between(_shifted(piece.stretches, start), skip, motion.num_frames)
+    faults = _merge_faults(
+        _clip_to_frames(whole.faults, 0, skip),
+        _clip_to_frames(_shift_frames(piece.faults, start), skip, motion.num_frames),
+    )
+    later = _clip_to_frames(_shift_frames(piece.stretches, start), skip, motion.num_frames)
     share = piece.motion.num_frames / motion.num_frames
     return replace(
         whole,
@@ -150,26 +155,26 @@ def _after(whole: Denoised, piece: Denoised, start: int) -> Denoised:
         noise_root=(1 - share) * whole.noise_root + share * piece.noise_root,
         faults=faults,
         contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
-        believed=torch.cat([whole.believed[:kept], piece.believed[skipped:]]),
-        ledger=whole.ledger.slice(kept).join(_part(piece.ledger, slice(skipped, None))),
+        proposal_share=torch.cat([whole.proposal_share[:kept], piece.proposal_share[skipped:]]),
+        ledger=whole.ledger.slice(kept).join(_slice_ledger(piece.ledger, slice(skipped, None))),
         seconds=whole.seconds + piece.seconds,
         notes=tuple(dict.fromkeys(whole.notes + piece.notes)),
-        stretches=(*_between(whole.stretches, 0, skip), *later),
+        stretches=(*_clip_to_frames(whole.stretches, 0, skip), *later),
     )
 
 
-def _shifted(parts: Sequence[Part], frames: int) -> list[Part]:
+def _shift_frames(parts: Sequence[Part], frames: int) -> list[Part]:
     """The same, so many frames later."""
     return [replace(part, start=part.start + frames, stop=part.stop + frames) for part in parts]
 
 
-def _between(parts: Sequence[Part], start: int, stop: int) -> list[Part]:
+def _clip_to_frames(parts: Sequence[Part], start: int, stop: int) -> list[Part]:
     """What of the faults or stretches lies in frames start to stop."""
     cut = [replace(part, start=max(part.start, start), stop=min(part.stop, stop)) for part in parts]
     return [part for part in cut if part.start < part.stop]
 
 
-def _chained(before: Sequence[Fault], after: Sequence[Fault]) -> tuple[Fault, ...]:
+def _merge_faults(before: Sequence[Artefact], after: Sequence[Artefact]) -> tuple[Artefact, ...]:
     """Both; what ends where the same goes on is one fault, as bad as the worse of the two."""
     ends = {(fault.joint, fault.kind, fault.unit, fault.stop): number for number, fault in enumerate(before)}
     chained = list(before)
@@ -183,13 +188,13 @@ def _chained(before: Sequence[Fault], after: Sequence[Fault]) -> tuple[Fault, ..
     return tuple(chained)
 
 
-def _part(ledger: Ledger, frames: slice) -> Ledger:
+def _slice_ledger(ledger: Ledger, frames: slice) -> Ledger:
     """Of some frames."""
     entries = (replace(e, energy=e.energy[frames], residual=e.residual[frames]) for e in ledger.entries)
     return Ledger(tuple(entries))
 
 
-def faded(before: Motion, after: Motion, shared: int) -> Motion:
+def crossfade(before: Motion, after: Motion, shared: int) -> Motion:
     """`before`, then `after`, which fades in over the last `shared` frames of the one and the first of the other."""
     if shared == 0:
         return before.join(after)

@@ -9,21 +9,27 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.common.map_refinement import StandingSettings, Stood, anchored, rest_height, stand
-from controllers.denoising.result import Denoised
+from controllers.common.map_refinement import (
+    RefinedMotion,
+    RefinementSettings,
+    anchor_to_contacts,
+    estimate_rest_height,
+    refine,
+)
+from controllers.denoising.result import DenoiseResult
 from mapctl import retarget, rotations
-from mapctl.contacts import steadied
+from mapctl.contacts import debounced
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.problem.density_selection import Stretch
+from mapctl.problem.density_selection import DensityInterval
 from mapctl.protocols import Denoiser
 from mapctl.recording import Capture, artefacts
-from mapctl.recording.frequency_bands import split
-from mapctl.recording.inspection import Examined
-from mapctl.recording.noise_estimation import angle_noise, place_noise
-from mapctl.recording.residual_motion import returned
-from mapctl.recording.spike_detection import leaps
-from mapctl.recording.sure_smoothing import smoothed_angles
+from mapctl.recording.frequency_bands import split_bands
+from mapctl.recording.inspection import Inspection
+from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
+from mapctl.recording.residual_motion import restore_residual_motion
+from mapctl.recording.spike_detection import find_residual_spikes
+from mapctl.recording.sure_smoothing import smooth_rotations
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, leg_length
@@ -40,7 +46,7 @@ class DenoiseSettings:
     """Noise of each coordinate of the hips; told from the capture if None."""
     anchor: bool = False
     """Let the body go where its planted feet say, for captures that drift against them."""
-    standing: StandingSettings = field(default_factory=StandingSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
     """The MAP stage."""
 
     def __post_init__(self):
@@ -50,40 +56,40 @@ class DenoiseSettings:
                 raise RequestError(f"{name} must lie between 0 and 100, got {value:g}")
 
 
-class Piece:
+class SegmentDenoiser:
     """From an examined capture to a clean motion."""
 
-    def __init__(self, examined: Examined, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
+    def __init__(self, examined: Inspection, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
         self.examined, self.denoiser, self.settings = examined, denoiser, settings
-        self.repaired = _others_smoothed(examined, rig)
+        self.repaired = _smooth_noncanonical_joints(examined, rig)
         canonical, self.rigmap = to_canonical(self.repaired, rig)
-        seen = _on_canonical(examined.seen, self.rigmap)
-        self.hidden_root = examined.dropouts_root | ~_above_hips(~examined.dropouts, self.rigmap)
-        self.seen_root = examined.seen_root & _above_hips(examined.seen, self.rigmap)
-        self.sigma, self.sigma_root = self._noise(canonical, seen)
-        self.bands = split(canonical)
+        seen = _map_mask_to_canonical(examined.seen, self.rigmap)
+        self.hidden_root = examined.dropouts_root | ~_are_hip_ancestors_observed(~examined.dropouts, self.rigmap)
+        self.seen_root = examined.seen_root & _are_hip_ancestors_observed(examined.seen, self.rigmap)
+        self.sigma, self.sigma_root = self._estimate_noise(canonical, seen)
+        self.bands = split_bands(canonical)
         if self.bands.exact:
             # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
-            self.bands = split(_signed_like(to_canonical(examined.motion, rig)[0], canonical))
+            self.bands = split_bands(_match_quaternion_signs(to_canonical(examined.motion, rig)[0], canonical))
         self.shown = self.bands.at_prior_rate()
-        self.capture = self._capture(seen)
+        self.capture = self._build_capture(seen)
 
-    def run(self, densities: Sequence[Any]) -> Denoised:
+    def run(self, densities: Sequence[Any]) -> DenoiseResult:
         """Propose, give back, put the feet down, return to the rig."""
         proposal, contacts = self._propose()
         if self.bands.exact:
-            self.capture = self._look_again(proposal)
+            self.capture = self._redetect_spikes(proposal)
             proposal, contacts = self._propose()
-        proposal, share = self._given_back(proposal)
+        proposal, share = self._restore_residual(proposal)
         if self.settings.anchor:
-            proposal = anchored(proposal, steadied(contacts > 0))
-        stood = stand(proposal, contacts, self.capture, self.settings.standing, densities=densities)
-        joined = self.bands.joined(self.shown, stood.motion, self.sigma, self.sigma_root)
+            proposal = anchor_to_contacts(proposal, debounced(contacts > 0))
+        stood = refine(proposal, contacts, self.capture, self.settings.refinement, densities=densities)
+        joined = self.bands.recombine(self.shown, stood.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
         within = self.bands.within
         stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
-        examined, found = self.examined, self._faults(motion, proposal.slice(0, within), stood)
-        return Denoised(
+        examined, found = self.examined, self._collect_faults(motion, proposal.slice(0, within), stood)
+        return DenoiseResult(
             motion,
             examined.motion,
             examined.noise,
@@ -92,10 +98,10 @@ class Piece:
             stood.contacts,
             1 - share[:within],
             stood.ledger,
-            stretches=self._at_own_rate(stood.stretches),
+            stretches=self._convert_to_capture_rate(stood.stretches),
         )
 
-    def _at_own_rate(self, stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+    def _convert_to_capture_rate(self, stretches: Sequence[DensityInterval]) -> tuple[DensityInterval, ...]:
         """In frames of the capture; the last ends with it."""
         frames, shown = self.examined.motion.num_frames, self.shown.num_frames
         ratio = float(self.examined.motion.fps) / float(self.shown.fps)
@@ -109,30 +115,30 @@ class Piece:
         ]
         return tuple(part for part in moved if part.start < part.stop)
 
-    def _faults(self, motion: Motion, proposal: Motion, stood: Stood) -> tuple[artefacts.Fault, ...]:
+    def _collect_faults(self, motion: Motion, proposal: Motion, stood: RefinedMotion) -> tuple[artefacts.Artefact, ...]:
         """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""
         examined, names = self.examined, motion.skeleton.names
         turn = rotations.multiply(rotations.inverse(examined.motion.local_quat_xyzw), motion.local_quat_xyzw)
         away = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
         traveller = names[examined.travels]
         apart = 100 * (examined.place(motion) - examined.place(examined.motion)).norm(dim=-1)
-        found = artefacts.noise(
+        found = artefacts.list_noise(
             names, examined.noise, examined.noise_root, travels=examined.travels, frames=motion.num_frames
         )
-        found += artefacts.leaping(names, self._spikes_on_rig(), away, "deg")
-        found += artefacts.leaping([traveller], self._spikes_of_root(), apart[:, None], "cm")
-        found += artefacts.lost(names, examined.dropouts)
+        found += artefacts.list_spikes(names, self._map_spikes_to_rig(), away, "deg")
+        found += artefacts.list_spikes([traveller], self._find_root_spikes(), apart[:, None], "cm")
+        found += artefacts.list_dropouts(names, examined.dropouts)
         toes = [proposal.skeleton.index(name) for name in TOES]
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
         ratio = float(motion.fps) / float(self.shown.fps)
-        height = rest_height(proposal, stood.contacts)
-        steps = artefacts.feet(
+        height = estimate_rest_height(proposal, stood.contacts)
+        steps = artefacts.list_foot_artefacts(
             known, proposal.joint_positions()[:, toes], stood.contacts, rest_height=height, fps=float(self.shown.fps)
         )
         return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
 
-    def _spikes_on_rig(self) -> Bool[Tensor, "frames joints"]:
+    def _map_spikes_to_rig(self) -> Bool[Tensor, "frames joints"]:
         """By joint of the rig; where the proposal told them, as it told them."""
         spikes = self.examined.spikes.clone()
         if self.bands.exact:
@@ -142,36 +148,36 @@ class Piece:
                     spikes[:, joint] = told[:, canonical] & ~self.examined.dropouts[:, joint]
         return spikes
 
-    def _spikes_of_root(self) -> Bool[Tensor, "frames 1"]:
+    def _find_root_spikes(self) -> Bool[Tensor, "frames 1"]:
         """In which frames the root's place leaps."""
         if not self.bands.exact:
             return self.examined.spikes_root[:, None]
         return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
 
-    def _noise(self, canonical: Motion, seen: Tensor) -> tuple[Float[Tensor, " joints"], float]:
+    def _estimate_noise(self, canonical: Motion, seen: Tensor) -> tuple[Float[Tensor, " joints"], float]:
         """Of the canonical joints' angles (radians) and of the hips' place (metres), at the capture's rate."""
         wanted = self.settings
-        sigma = angle_noise(canonical.local_quat_xyzw, seen)
+        sigma = estimate_angle_noise(canonical.local_quat_xyzw, seen)
         if wanted.sigma_deg is not None:
             # Joints that never move have no noise either: they are locked, or the rig has none there.
             sigma = torch.where(sigma > 0, math.radians(wanted.sigma_deg), 0.0).to(sigma)
-        root = place_noise(canonical.root_position, self.seen_root)
+        root = estimate_position_noise(canonical.root_position, self.seen_root)
         return sigma, root if wanted.sigma_cm is None else wanted.sigma_cm / 100
 
-    def _capture(self, seen: Tensor) -> Capture:
+    def _build_capture(self, seen: Tensor) -> Capture:
         """What the network is shown, at its own rate."""
         root = self.seen_root[:, None]
         sigma = self.bands.noise_at_prior_rate(self.sigma)
         sigma_root = self.bands.noise_at_prior_rate(torch.tensor(self.sigma_root))
         return Capture.of_motion(
             self.shown,
-            seen=self._resampled(seen),
-            seen_root=self._resampled(root)[:, 0],
+            seen=self._resample_mask(seen),
+            seen_root=self._resample_mask(root)[:, 0],
             sigma=sigma,
             sigma_root=float(sigma_root),
         )
 
-    def _resampled(self, seen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
+    def _resample_mask(self, seen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
         """Seen at the prior's rate is what was seen in half of the frames about there."""
         ratio = float(self.examined.motion.fps) / float(self.shown.fps)
         side = max(0, round((ratio - 1) / 2))
@@ -185,53 +191,55 @@ class Piece:
         scale = leg_length(CANONICAL) / leg_length(self.rigmap.skeleton)
         asked = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
         cleaned = self.denoiser.clean(asked)
-        quats = rotations.sign_continuous(cleaned.local_quat_xyzw[0].double())
+        quats = rotations.make_sign_continuous(cleaned.local_quat_xyzw[0].double())
         motion = Motion(self.rigmap.skeleton, self.shown.fps, cleaned.root[0].double() / scale, quats)
         return motion, cleaned.contacts[0]
 
-    def _look_again(self, proposal: Motion) -> Capture:
+    def _redetect_spikes(self, proposal: Motion) -> Capture:
         """Spikes told anew by what is left beside the proposal: fast motion that passed for one is seen again."""
-        dropouts = ~_on_canonical(~self.examined.dropouts, self.rigmap)
-        spikes = leaps(self._rest(proposal), self.capture.sigma[0].double())
+        dropouts = ~_map_mask_to_canonical(~self.examined.dropouts, self.rigmap)
+        spikes = find_residual_spikes(self._compute_residual_rotations(proposal), self.capture.sigma[0].double())
         root = (self.shown.root_position - proposal.root_position)[:, None]
-        leap = leaps(root, self.capture.sigma_root.double())[:, 0]
+        leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]
         return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
 
-    def _given_back(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
+    def _restore_residual(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
         """The proposal with the motion that it left out, and the share of that by frame and joint."""
         capture = self.capture
-        angles, share = returned(self._rest(proposal), capture.seen[0], capture.sigma[0].double())
+        angles, share = restore_residual_motion(
+            self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double()
+        )
         place = (self.shown.root_position - proposal.root_position)[:, None]
-        root, _ = returned(place, capture.seen_root[0][:, None], capture.sigma_root.double())
+        root, _ = restore_residual_motion(place, capture.seen_root[0][:, None], capture.sigma_root.double())
         quats = rotations.multiply(proposal.local_quat_xyzw, rotations.from_rotation_vector(angles))
         changed = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)
         return changed, share
 
-    def _rest(self, proposal: Motion) -> Float[Tensor, "frames joints 3"]:
+    def _compute_residual_rotations(self, proposal: Motion) -> Float[Tensor, "frames joints 3"]:
         """By which turns the capture differs from the proposal."""
         turned = rotations.multiply(rotations.inverse(proposal.local_quat_xyzw), self.shown.local_quat_xyzw)
         return rotations.to_rotation_vector(turned)
 
 
-def _signed_like(motion: Motion, other: Motion) -> Motion:
+def _match_quaternion_signs(motion: Motion, other: Motion) -> Motion:
     """The same rotations with signs as the other's: frames that were not seen, and show anything, change none after."""
     dots = (motion.local_quat_xyzw * other.local_quat_xyzw).sum(dim=-1, keepdim=True)
     return replace(motion, local_quat_xyzw=torch.where(dots < 0, -1.0, 1.0) * motion.local_quat_xyzw)
 
 
-def _others_smoothed(examined: Examined, rig: Rig | None) -> Motion:
+def _smooth_noncanonical_joints(examined: Inspection, rig: Rig | None) -> Motion:
     """The repaired capture; joints that the canonical skeleton lacks, as fingers, are smoothed as their noise asks."""
     motion = examined.repaired()
-    used = set(retarget.map_rig(motion.skeleton, rig).joint_of)
+    used = set(retarget.identify_rig(motion.skeleton, rig).joint_of)
     others = [j for j in range(motion.num_joints) if j not in used and examined.noise[j] > 0]
     if not others:
         return motion
     quats = motion.local_quat_xyzw.clone()
-    quats[:, others] = smoothed_angles(quats[:, others], examined.noise[others])
+    quats[:, others] = smooth_rotations(quats[:, others], examined.noise[others])
     return replace(motion, local_quat_xyzw=quats)
 
 
-def _on_canonical(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, "frames joints"]:
+def _map_mask_to_canonical(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, "frames joints"]:
     """A canonical joint is seen if its own joint of the rig is, and all that lie between it and the one above."""
     parents = rigmap.rig_skeleton.parents
     columns = []
@@ -245,7 +253,7 @@ def _on_canonical(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[T
     return torch.stack(columns, dim=1)
 
 
-def _above_hips(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, " frames"]:
+def _are_hip_ancestors_observed(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, " frames"]:
     """Whether all joints above the hips were seen: they carry its place."""
     column, joint = torch.ones(len(seen), dtype=torch.bool), rigmap.joint_of[0]
     while joint is not None and (joint := rigmap.rig_skeleton.parents[joint]) >= 0:

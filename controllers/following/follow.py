@@ -9,18 +9,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.common.character import Stature
-from controllers.common.feasibility import after_the_fact, in_advance
-from controllers.common.initial_state import choose_start
+from controllers.common.character import Character
+from controllers.common.feasibility import check_path, check_tracking
+from controllers.common.initial_state import select_initial_state
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS, decode
-from mapctl.intent.path import Follow, SpeedProfile
+from mapctl.intent.path import PathRequest, SpeedProfile
 from mapctl.motion import Motion
-from mapctl.problem.receding_horizon import Committed, TermsOf, WindowSettings, WindowSolver
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
 from mapctl.problem.solution import Solution, Status
-from mapctl.problem.window_solvers import LatentMethod, Method
+from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms import Footing, Noise, Path, Term
+from mapctl.terms import FootContact, LatentPrior, Path, Term
 
 
 @dataclass(frozen=True)
@@ -35,21 +35,21 @@ class FollowSettings:
     """Sideways offset beyond it, metres."""
     path_sigma_progress: float = Path.sigma_progress
     """Arc missing or too much, metres."""
-    footing: Footing = field(default_factory=Footing)
+    footing: FootContact = field(default_factory=FootContact)
     """Planted feet."""
-    noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
+    noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
     """The prior, in the latents of its rollout. A well trained prior's own spread is small: at sigma 1 the same walk
     holds its path and its feet less well (docs/results.md)."""
-    window: WindowSettings = field(default_factory=WindowSettings)
+    window: HorizonSettings = field(default_factory=HorizonSettings)
     """How windows are laid."""
-    method: Method = field(default_factory=LatentMethod)
+    method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
     """How one window is solved."""
     extra: tuple[Term, ...] = ()
     """Further terms, the same in every window (a likelihood for the method over states)."""
     joint: str = "hips"
     """Which joint follows the curve."""
 
-    def seen_by(self, person: Stature) -> "FollowSettings":
+    def scaled_to(self, person: Character) -> "FollowSettings":
         """The same sigmas for somebody of this size, in metres of the prior's size."""
         if person.scale == 1.0:
             return self
@@ -83,27 +83,29 @@ def follow(
     """
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
-    request, lowered = Follow(curve, profile, seconds).fitted(PRIOR_FPS)
+    request, lowered = PathRequest(curve, profile, seconds).fitted(PRIOR_FPS)
     settings = settings or FollowSettings()
-    person = Stature(skeleton, settings.footing.rest_height)
+    person = Character(skeleton, settings.footing.rest_height)
     generator = generator or torch.Generator().manual_seed(0)
     frames = request.frames(PRIOR_FPS)
     # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
     arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
     seen, seen_arcs = person.curve(curve), arcs / person.scale
-    terms_of = follow_terms(seen, seen_arcs, settings.seen_by(person))
-    start = choose_start(prior, seen, seen_arcs, terms_of, skeleton=person.small, fps=PRIOR_FPS, generator=generator)
-    solver = WindowSolver(prior, settings.window, person.small, method=settings.method)
+    terms_of = build_follow_terms(seen, seen_arcs, settings.scaled_to(person))
+    start = select_initial_state(
+        prior, seen, seen_arcs, terms_of, skeleton=person.small, fps=PRIOR_FPS, generator=generator
+    )
+    solver = RecedingHorizonSolver(prior, settings.window, person.small, method=settings.method)
     done, outcome = solver.solve(
         start.committed, terms_of, frames, generator=generator, progress=progress, deadline=deadline
     )
-    known = (*([lowered] if lowered else ()), *in_advance(request, arcs[:frames], person.abilities(prior.abilities)))
+    known = (*([lowered] if lowered else ()), *check_path(request, arcs[:frames], person.abilities(prior.abilities)))
     motion = person.motion(decode(done.features, start.before_first, skeleton=person.small))
     done = replace(done, ledger=person.ledger(done.ledger))
-    return _solution(motion, done, Status(outcome), known, curve, settings.joint)
+    return _build_solution(motion, done, Status(outcome), known, curve, settings.joint)
 
 
-def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
+def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
     """The terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
     path = Path(
         curve,
@@ -121,8 +123,8 @@ def follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowS
     return terms
 
 
-def _solution(
-    motion: Motion, done: Committed, status: Status, known: Sequence[str], curve: Curve, joint: str
+def _build_solution(
+    motion: Motion, done: CommittedFrames, status: Status, known: Sequence[str], curve: Curve, joint: str
 ) -> Solution:
-    notes = (*known, *after_the_fact(motion, curve, joint))
+    notes = (*known, *check_tracking(motion, curve, joint))
     return Solution(motion, status.with_notes(notes, infeasible=bool(notes)), done.ledger, done.windows, done.features)

@@ -12,49 +12,49 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.common.character import Stature
-from mapctl.contacts import STEADY, steadied
+from controllers.common.character import Character
+from mapctl.contacts import MIN_CONTACT_FRAMES, debounced
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, Place
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.problem.ledger import Ledger
-from mapctl.problem.receding_horizon import Committed, WindowSettings, WindowSolver
-from mapctl.problem.window_solvers import GuidedMethod
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
+from mapctl.problem.window_solvers import GuidedNoiseSolver
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms import Closeness, Footing, Noise, Term
+from mapctl.terms import FootContact, LatentPrior, MotionTracking, Term
 
 
 @dataclass(frozen=True)
-class FinishSettings:
+class FootCleanupSettings:
     """Sigmas and search of the finishing pass; the terms' own docstrings give the meaning."""
 
     sigma_noise: float = 1.0
     """Of the noise prior: above 1 leaves more of the motion's own tremble."""
-    sigma_pose: float = Closeness.sigma_pose
+    sigma_pose: float = MotionTracking.sigma_pose
     """Distance of joints from the motion's, metres."""
-    sigma_way: float = Closeness.sigma_way
+    sigma_trajectory: float = MotionTracking.sigma_trajectory
     """Way over the ground within a window, metres."""
-    sigma_turn: float = Closeness.sigma_turn
+    sigma_heading: float = MotionTracking.sigma_heading
     """Turn within a window, radians."""
-    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.06))
+    footing: FootContact = field(default_factory=lambda: FootContact(sigma_speed=0.06))
     """Planted feet. Mocap's own move a little: feet that stood still would be told from them."""
-    window: WindowSettings = field(default_factory=WindowSettings)
+    window: HorizonSettings = field(default_factory=HorizonSettings)
     """How windows are laid."""
-    share: float = GuidedMethod.share
+    share: float = GuidedNoiseSolver.share
     """Of the motion's noise that the search starts with."""
 
-    def seen_by(self, person: Stature) -> "FinishSettings":
+    def scaled_to(self, person: Character) -> "FootCleanupSettings":
         """The same for somebody of this size, in metres of the prior's size."""
         return self if person.scale == 1.0 else replace(self, footing=person.footing(self.footing))
 
 
-def finish(
+def clean_up_feet(
     prior: Any,
     pieces: Iterable[Float[Tensor, "_ size"]],
     *,
     frames: int,
     state: Any,
     generator: torch.Generator,
-    settings: FinishSettings | None = None,
+    settings: FootCleanupSettings | None = None,
     skeleton: Skeleton = CANONICAL,
 ) -> Iterator[Float[Tensor, "_ size"]]:
     """Finished features of the first `frames` of consecutive pieces, their contact labels steadied.
@@ -62,62 +62,65 @@ def finish(
     `state` is the density's before the first frame (batch of one). Windows look ahead, so the pieces must hold
     `settings.window.frames` more than are asked for; RequestError where they do not.
     """
-    settings = settings or FinishSettings()
+    settings = settings or FootCleanupSettings()
     still = torch.zeros(0, skeleton.num_joints, 3)
-    done = Committed(state, Place.origin(), state.previous.float(), still, torch.zeros(0, LAYOUT.continuous))
+    done = CommittedFrames(state, GroundPose.origin(), state.previous.float(), still, torch.zeros(0, LAYOUT.continuous))
     waiting, left = torch.zeros(0, LAYOUT.size), frames
     for piece in pieces:
         waiting = torch.cat([waiting, piece.float()])
         while left > 0 and len(waiting) >= settings.window.frames:
             count = min(settings.window.frames - settings.window.overlap, left)
-            window = _with_steady_contacts(done.features, waiting[: settings.window.frames])
-            done = _window(prior, done, window, count, settings, skeleton, generator)
+            window = _debounce_window_contacts(done.features, waiting[: settings.window.frames])
+            done = _clean_up_window(prior, done, window, count, settings, skeleton, generator)
             yield done.features[-count:]
-            waiting, left, done = waiting[count:], left - count, _forgetting(done)
+            waiting, left, done = waiting[count:], left - count, _discard_history(done)
     if left > 0:
         raise RequestError(
             f"finishing needs {left + settings.window.frames - len(waiting)} more frames than it was given"
         )
 
 
-def _window(
+def _clean_up_window(
     prior: Any,
-    done: Committed,
+    done: CommittedFrames,
     window: Float[Tensor, "frames size"],
     count: int,
-    settings: FinishSettings,
+    settings: FootCleanupSettings,
     skeleton: Skeleton,
     generator: torch.Generator,
-) -> Committed:
+) -> CommittedFrames:
     """`done` and `count` more frames; a window without a finite solution is left as it was."""
-    closeness = Closeness(
-        window, sigma_pose=settings.sigma_pose, sigma_way=settings.sigma_way, sigma_turn=settings.sigma_turn
+    closeness = MotionTracking(
+        window,
+        sigma_pose=settings.sigma_pose,
+        sigma_trajectory=settings.sigma_trajectory,
+        sigma_heading=settings.sigma_heading,
     )
-    terms: tuple[Term, ...] = Noise(settings.sigma_noise), closeness, settings.footing
-    method = GuidedMethod(window, share=settings.share)
-    solver = WindowSolver(prior, settings.window, skeleton, method=method)
+    terms: tuple[Term, ...] = LatentPrior(settings.sigma_noise), closeness, settings.footing
+    method = GuidedNoiseSolver(window, share=settings.share)
+    solver = RecedingHorizonSolver(prior, settings.window, skeleton, method=method)
     following, _ = solver.solve(done, lambda first, frames: terms, len(done.features) + count, generator=generator)
     return following
 
 
-def _forgetting(done: Committed) -> Committed:
+def _discard_history(done: CommittedFrames) -> CommittedFrames:
     """Without all that no later window looks at, and moved to the origin, where single precision is finest."""
     here = done.place.position_xz
     joints = done.joints_world - torch.stack([here[0], here.new_zeros(()), here[1]])
     return replace(
         done,
-        features=done.features[-STEADY:],
+        features=done.features[-MIN_CONTACT_FRAMES:],
         ledger=Ledger(),
         windows=(),
         joints_world=joints,
-        place=Place(torch.zeros_like(here), done.place.heading),
+        place=GroundPose(torch.zeros_like(here), done.place.heading),
     )
 
 
-def _with_steady_contacts(
+def _debounce_window_contacts(
     before: Float[Tensor, "past size"], window: Float[Tensor, "frames size"]
 ) -> Float[Tensor, "frames size"]:
     """The window with contacts, and gaps in them, of less than STEADY frames gone."""
     bits = LAYOUT.pick(torch.cat([before, window]), "contacts") > 0.5
-    steady = steadied(bits)[len(before) :]
+    steady = debounced(bits)[len(before) :]
     return torch.cat([window[:, : LAYOUT.continuous], steady.to(window.dtype)], dim=-1)

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.common.character import Stature
-from controllers.generation.foot_cleanup import FinishSettings, finish
+from controllers.common.character import Character
+from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.features import PRIOR_FPS, Place, decode, encode, root_places
+from mapctl.features import PRIOR_FPS, GroundPose, decode, encode, integrate_root
 from mapctl.motion import Motion
 from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
@@ -33,19 +33,19 @@ class GenerateSettings:
     """Spread of the draws: 0 is the prior's mean, 1 the prior itself."""
     start: int | None = None
     """Which of the prior's starts; drawn by their weight if None."""
-    as_start: bool = True
+    condition_on_start: bool = True
     """Whether the prior is told what its data say of the start's clip (gait, style), if it can be told: left to itself
     it lets most runs fall into a walk within ten seconds, which no clip of the data does."""
-    finishing: FinishSettings | None = field(default_factory=FinishSettings)
+    foot_cleanup: FootCleanupSettings | None = field(default_factory=FootCleanupSettings)
     """Of the pass that makes planted feet stand; None leaves it out."""
 
     def __post_init__(self):
         if not 0 <= self.temperature <= 2:
             raise RequestError(f"the temperature must lie between 0 and 2, got {self.temperature:g}")
 
-    def person(self, skeleton: Skeleton) -> Stature:
+    def person(self, skeleton: Skeleton) -> Character:
         """Whose bones move, whose toes rest as high as the finishing pass has it."""
-        return Stature(skeleton, self.finishing.footing.rest_height if self.finishing else TOE_REST_HEIGHT)
+        return Character(skeleton, self.foot_cleanup.footing.rest_height if self.foot_cleanup else TOE_REST_HEIGHT)
 
 
 def stream(
@@ -66,7 +66,7 @@ def stream(
     """
     settings = settings or GenerateSettings()
     person = settings.person(skeleton)
-    return _decoded(*_begun(prior, seconds, generator, settings, start_clip, refiner, person), person)
+    return _decode_pieces(*_start_stream(prior, seconds, generator, settings, start_clip, refiner, person), person)
 
 
 def stream_features(
@@ -79,7 +79,7 @@ def stream_features(
     refiner: Refiner | None = None,
 ) -> Iterator[Float[Tensor, "_ size"]]:
     """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
-    return _begun(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner, Stature())[0]
+    return _start_stream(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner, Character())[0]
 
 
 def generate(
@@ -108,9 +108,9 @@ def generate(
     return motion
 
 
-def begin(
+def initialise_generation(
     prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
-) -> tuple[Any, Any, Place]:
+) -> tuple[Any, Any, GroundPose]:
     """The prior as it is to be told, its state and the place (float64) before the first frame.
 
     Begins at a start of its own, or at the end of a clip, of which nothing is told; the clip's lengths are divided by
@@ -122,20 +122,24 @@ def begin(
             bones = replace(canonical.skeleton, offsets=canonical.skeleton.offsets / scale)
             canonical = replace(canonical, skeleton=bones, root_position=canonical.root_position / scale)
         features, place = encode(canonical.resample(PRIOR_FPS))
-        ground, heading = root_places(features, place)
+        ground, heading = integrate_root(features, place)
         seen = features.float()
         state = prior.advance(prior.initial_state(seen[:1]), seen[1:].unsqueeze(0))
-        return prior, state, Place(ground[-1], heading[-1])
+        return prior, state, GroundPose(ground[-1], heading[-1])
     count = len(prior.starts.speed)
     if settings.start is not None and not 0 <= settings.start < count:
         raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
     drawn = int(torch.multinomial(prior.starts.weight, 1, generator=generator))
     pick = drawn if settings.start is None else settings.start
     state = prior.starts.state.pick(torch.tensor([pick]))
-    return prior.told_as_start(pick) if settings.as_start else prior, state, Place.origin(torch.float64)
+    return (
+        prior.conditioned_like_start(pick) if settings.condition_on_start else prior,
+        state,
+        GroundPose.origin(torch.float64),
+    )
 
 
-def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[int]:
+def sample_stratified_starts(prior: Any, count: int, generator: torch.Generator) -> list[int]:
     """A start for each of several motions, which together begin as the data do: spread over the speeds by weight.
 
     A golden-ratio sequence from a drawn beginning, so that a few motions are already spread, and the first of many are
@@ -148,44 +152,46 @@ def spread_starts(prior: Any, count: int, generator: torch.Generator) -> list[in
     return slow_to_fast[torch.searchsorted(upto, drawn).clamp(max=len(upto) - 1)].tolist()
 
 
-def _begun(
+def _start_stream(
     prior: Any,
     seconds: float,
     generator: torch.Generator,
     settings: GenerateSettings,
     clip: Motion | None,
     refiner: Refiner | None,
-    person: Stature,
-) -> tuple[Iterator[Float[Tensor, "_ size"]], Place]:
+    person: Character,
+) -> tuple[Iterator[Float[Tensor, "_ size"]], GroundPose]:
     """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
-    prior, state, place = begin(prior, settings, clip, generator, scale=person.scale)
-    pieces = _drawn(prior, state, generator, settings.temperature)
+    prior, state, place = initialise_generation(prior, settings, clip, generator, scale=person.scale)
+    pieces = _sample_chunks(prior, state, generator, settings.temperature)
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
-    if settings.finishing is not None:
-        pieces = finish(
+    if settings.foot_cleanup is not None:
+        pieces = clean_up_feet(
             prior,
             pieces,
             frames=frames,
             state=state,
             generator=generator,
-            settings=settings.finishing.seen_by(person),
+            settings=settings.foot_cleanup.scaled_to(person),
             skeleton=person.small,
         )
-    return _in_chunks(pieces, frames), place
+    return _rechunk(pieces, frames), place
 
 
-def _drawn(prior: Any, state: Any, generator: torch.Generator, temperature: float) -> Iterator[Float[Tensor, "_ size"]]:
+def _sample_chunks(
+    prior: Any, state: Any, generator: torch.Generator, temperature: float
+) -> Iterator[Float[Tensor, "_ size"]]:
     """Draws without end."""
     while True:
         features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
         yield features[0]
 
 
-def _in_chunks(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:
+def _rechunk(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:
     """The first `frames` frames, _CHUNK at a time."""
     held = None
     for piece in pieces:
@@ -197,8 +203,8 @@ def _in_chunks(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterat
                 return
 
 
-def _decoded(pieces: Iterator[Float[Tensor, "_ size"]], place: Place, person: Stature) -> Iterator[Motion]:
+def _decode_pieces(pieces: Iterator[Float[Tensor, "_ size"]], place: GroundPose, person: Character) -> Iterator[Motion]:
     for features in pieces:
         yield person.motion(decode(features, place, skeleton=person.small))
-        ground, heading = root_places(features.double(), place)
-        place = Place(ground[-1], heading[-1])
+        ground, heading = integrate_root(features.double(), place)
+        place = GroundPose(ground[-1], heading[-1])

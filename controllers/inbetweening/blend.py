@@ -9,29 +9,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from controllers.inbetweening.feasibility import JERKLESS
-from controllers.inbetweening.keyframes import limb_end
-from controllers.inbetweening.pipeline import Infilled, InfillSettings, fill
+from controllers.inbetweening.feasibility import MIN_JERK_PEAK_ACCELERATION
+from controllers.inbetweening.keyframes import effector_joint
+from controllers.inbetweening.pipeline import InfillResult, InfillSettings, fill
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import LIMBS
-from mapctl.inbetweening.missing import Lost, put_back
+from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.kinematics import heading, inverse
 from mapctl.kinematics.inverse import Limb
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import from_canonical, to_canonical
-from mapctl.retarget.carry import Body, carry
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import Stance
 from mapctl.skeleton import CANONICAL
 
-_LEAST = 0.3  # seconds
-_CALM, _HASTY = 20.0, 80.0  # m/s^2 of a hand
+_MIN_MARGIN_SECONDS = 0.3  # seconds
+_USUAL_HAND_ACCELERATION, _MAX_HAND_ACCELERATION = 20.0, 80.0  # m/s^2 of a hand
 
 
 @dataclass(frozen=True)
-class Borrowed:
+class LimbTransfer:
     """What is taken, and where it goes."""
 
     limbs: tuple[str, ...]
@@ -49,31 +49,31 @@ class Borrowed:
 def blend(
     motion: Motion,
     source: Motion,
-    borrowed: Borrowed,
+    borrowed: LimbTransfer,
     infiller: Inbetweener | None,
     *,
     settings: InfillSettings | None = None,
     densities: Sequence[Any] = (),
     rig: Rig | None = None,
-) -> Infilled:
+) -> InfillResult:
     """The motion with its limbs where the source's are, seen from shoulder or hip, in size, and bent as those are; all
     else stays to the bit. In the margins before and after, the limbs go there and come back.
 
     What is taken lasts as long as it does in the source, whatever the two frame rates. RequestError for frames that
     either motion has not, and for joints that are no hand or foot.
     """
-    _check(source, borrowed)
+    _check_transfer(source, borrowed)
     own, rigmap = to_canonical(motion, rig)
-    carried = carry(source, Body(rigmap, Stance.of(own, rigmap)))
-    other = _taken(carried.motion, borrowed, motion.fps)
+    carried = retarget_motion(source, RiggedCharacter(rigmap, Stance.of(own, rigmap)))
+    other = _resample_source(carried.motion, borrowed, motion.fps)
     borrowed = replace(borrowed, start=0, stop=other.num_frames)
-    _check_place(motion, borrowed)
-    limbs = [LIMBS[CANONICAL.names[limb_end(name, rigmap)]] for name in borrowed.limbs]
+    _check_destination(motion, borrowed)
+    limbs = [LIMBS[CANONICAL.names[effector_joint(name, rigmap)]] for name in borrowed.limbs]
     there = slice(borrowed.at, borrowed.at + borrowed.stop - borrowed.start)
     posed = own
     for limb in limbs:
-        posed = _with_limb(posed, own, other, limb, borrowed)
-    before, after = _margins(own, posed, limbs, there, borrowed.margin)
+        posed = _copy_limb(posed, own, other, limb, borrowed)
+    before, after = _compute_margins(own, posed, limbs, there, borrowed.margin)
     free = slice(max(0, there.start - before), min(motion.num_frames, there.stop + after))
     joints = [rigmap.joint_of[joint] for limb in limbs for joint in (limb.upper, limb.lower, limb.end)]
     new = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
@@ -81,20 +81,20 @@ def blend(
     moved = torch.zeros_like(new)
     moved[:, [joint for joint in joints if joint is not None]] = True
     nothing = torch.zeros(motion.num_frames, dtype=torch.bool)
-    lent = put_back(from_canonical(posed, rigmap, motion), motion, Lost(new & moved, nothing))
+    lent = restore_observed(from_canonical(posed, rigmap, motion), motion, MissingMask(new & moved, nothing))
     lost = torch.zeros_like(new)
     lost[free] = True
     lost[there] = False
-    done = fill(lent, Lost(lost & moved, nothing), infiller, settings=settings, densities=densities, rig=rig)
+    done = fill(lent, MissingMask(lost & moved, nothing), infiller, settings=settings, densities=densities, rig=rig)
     notes = (
         *carried.notes,
-        *_haste(own, posed, borrowed, limbs, free, there),
+        *_note_infeasible_margins(own, posed, borrowed, limbs, free, there),
         f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new",
     )
-    return replace(done, lost=Lost((lost | new) & moved, nothing), notes=(*done.notes, *notes))
+    return replace(done, lost=MissingMask((lost | new) & moved, nothing), notes=(*done.notes, *notes))
 
 
-def _taken(source: Motion, borrowed: Borrowed, fps: Fraction) -> Motion:
+def _resample_source(source: Motion, borrowed: LimbTransfer, fps: Fraction) -> Motion:
     """The frames that are borrowed, at another rate."""
     wanted = max(1, round((borrowed.stop - borrowed.start) * fps / source.fps))
     # To the frame after the last, where there is one: at a higher rate some frames lie between the two.
@@ -102,7 +102,7 @@ def _taken(source: Motion, borrowed: Borrowed, fps: Fraction) -> Motion:
     return taken.slice(0, min(wanted, taken.num_frames))
 
 
-def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: Borrowed) -> Motion:
+def _copy_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: LimbTransfer) -> Motion:
     """With one limb bent as the source's is, which is of the same bones, seen from the heading of the hips, and its end
     as far from its root.
     """
@@ -123,18 +123,22 @@ def _with_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, borrowed: 
     goals[:, limb.end] = goals[:, limb.upper] + way
     free = torch.zeros(goals.shape[:2], dtype=torch.bool)
     free[:, [limb.upper, limb.lower]] = True
-    solved = inverse.solve(goals, quats, own.skeleton, free=free, limbs=(limb,), root_position=part.root_position)
+    solved = inverse.solve_inverse_kinematics(
+        goals, quats, own.skeleton, free=free, limbs=(limb,), root_position=part.root_position
+    )
     whole = posed.local_quat_xyzw.clone()
-    whole[there] = torch.where(free[..., None] | _is(limb.end), solved, whole[there])
+    whole[there] = torch.where(free[..., None] | _make_joint_mask(limb.end), solved, whole[there])
     whole[there, limb.end] = quats[:, limb.end]
-    return replace(posed, local_quat_xyzw=rotations.sign_continuous(whole))
+    return replace(posed, local_quat_xyzw=rotations.make_sign_continuous(whole))
 
 
-def _is(joint: int) -> Tensor:
+def _make_joint_mask(joint: int) -> Tensor:
     return (torch.arange(CANONICAL.num_joints) == joint)[None, :, None]
 
 
-def _margins(own: Motion, posed: Motion, limbs: Sequence[Limb], there: slice, asked: float | None) -> tuple[int, int]:
+def _compute_margins(
+    own: Motion, posed: Motion, limbs: Sequence[Limb], there: slice, asked: float | None
+) -> tuple[int, int]:
     """Frames before and after in which limbs go there and back: as asked, or as long as they take so far without
     haste.
     """
@@ -142,12 +146,21 @@ def _margins(own: Motion, posed: Motion, limbs: Sequence[Limb], there: slice, as
     for frame in (there.start, there.stop - 1):
         way = (posed.slice(frame, frame + 1).joint_positions() - own.slice(frame, frame + 1).joint_positions())[0]
         far = max(float(way[limb.end].norm()) for limb in limbs)
-        found.append(round(fps * (max(_LEAST, math.sqrt(JERKLESS * far / _CALM)) if asked is None else asked)))
+        found.append(
+            round(
+                fps
+                * (
+                    max(_MIN_MARGIN_SECONDS, math.sqrt(MIN_JERK_PEAK_ACCELERATION * far / _USUAL_HAND_ACCELERATION))
+                    if asked is None
+                    else asked
+                )
+            )
+        )
     return found[0], found[1]
 
 
-def _haste(
-    own: Motion, posed: Motion, borrowed: Borrowed, limbs: Sequence[Limb], free: slice, there: slice
+def _note_infeasible_margins(
+    own: Motion, posed: Motion, borrowed: LimbTransfer, limbs: Sequence[Limb], free: slice, there: slice
 ) -> tuple[str, ...]:
     """A word on limbs that have to go far in little time, with numbers."""
     notes, fps = [], float(own.fps)
@@ -156,18 +169,18 @@ def _haste(
         for name, limb in zip(borrowed.limbs, limbs, strict=True):
             far, needed = (
                 float(way[limb.end].norm()),
-                JERKLESS * float(way[limb.end].norm()) * (fps / max(1, count)) ** 2,
+                MIN_JERK_PEAK_ACCELERATION * float(way[limb.end].norm()) * (fps / max(1, count)) ** 2,
             )
-            if needed > _HASTY:
+            if needed > _MAX_HAND_ACCELERATION:
                 notes.append(
                     f"{name} goes {100 * far:.0f} cm in {count / fps:.2f} s beside frame {frame}, which takes "
-                    f"{needed:.0f} m/s^2; {_HASTY:.0f} is the most that is common: a margin of "
-                    f"{math.sqrt(JERKLESS * far / _HASTY):.2f} s would do"
+                    f"{needed:.0f} m/s^2; {_MAX_HAND_ACCELERATION:.0f} is the most that is common: a margin of "
+                    f"{math.sqrt(MIN_JERK_PEAK_ACCELERATION * far / _MAX_HAND_ACCELERATION):.2f} s would do"
                 )
     return tuple(notes)
 
 
-def _check(source: Motion, borrowed: Borrowed) -> None:
+def _check_transfer(source: Motion, borrowed: LimbTransfer) -> None:
     if not borrowed.limbs:
         raise RequestError("blending needs a hand or a foot")
     if not 0 <= borrowed.start < borrowed.stop <= source.num_frames:
@@ -176,7 +189,7 @@ def _check(source: Motion, borrowed: Borrowed) -> None:
         raise RequestError(f"the margin must lie between 0 and 10 seconds, got {borrowed.margin:g}")
 
 
-def _check_place(motion: Motion, borrowed: Borrowed) -> None:
+def _check_destination(motion: Motion, borrowed: LimbTransfer) -> None:
     last = borrowed.at + borrowed.stop - borrowed.start
     if not 0 <= borrowed.at < last <= motion.num_frames:
         raise RequestError(f"frames {borrowed.at}:{last} are not within the motion's 0:{motion.num_frames}")

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.missing import Lost
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, leg_length
 
-_TIE = 1e-6  # frames
+_TIE_FRAMES = 1e-6  # frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,21 +31,21 @@ class CanonicalGap:
     """When each frame is: a key between two frames is taken for one of them, and stays at its own time."""
 
     @staticmethod
-    def of(canonical: Motion, lost: Lost, joint_of: Sequence[int | None]) -> "CanonicalGap":
+    def of(canonical: Motion, lost: MissingMask, joint_of: Sequence[int | None]) -> "CanonicalGap":
         """From the rig's rate. A frame between two shows the one near it that lacks least, if they lack more."""
-        whole = _to_the_end(canonical)
+        whole = _resample_to_end(canonical)
         at = torch.arange(whole.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
         at = at.clamp(max=canonical.num_frames - 1)
         low = (at + 1e-9).floor().long()
-        high = torch.where(at - low > _TIE, low + 1, low).clamp(max=canonical.num_frames - 1)
+        high = torch.where(at - low > _TIE_FRAMES, low + 1, low).clamp(max=canonical.num_frames - 1)
         lacking = torch.cat([lost.joints, lost.root[:, None]], dim=1)
-        best = _least_lacking(at, lacking.sum(dim=1))
+        best = _find_most_complete_frames(at, lacking.sum(dim=1))
         snapped = lacking[best].sum(dim=1) < (lacking[low] | lacking[high]).sum(dim=1)
         at = torch.where(snapped, best.to(at), at)
         low, high = torch.where(snapped, best, low), torch.where(snapped, best, high)
         quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[best], whole.local_quat_xyzw)
         root = torch.where(snapped[:, None], canonical.root_position[best], whole.root_position)
-        shown = replace(whole, root_position=root, local_quat_xyzw=rotations.sign_continuous(quats))
+        shown = replace(whole, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
         columns = [
             torch.zeros(canonical.num_frames, dtype=torch.bool) if joint is None else lost.joints[:, joint]
             for joint in joint_of
@@ -58,7 +58,7 @@ class CanonicalGap:
             shown, turns[low] | turns[high], lost.root[low] | lost.root[high], at / float(canonical.fps)
         )
 
-    def places_known(self) -> Bool[Tensor, "frames joints"]:
+    def compute_known_positions(self) -> Bool[Tensor, "frames joints"]:
         """A place is known if all that carries it is."""
         known = [~self.root]
         for parent in CANONICAL.parents[1:]:
@@ -72,7 +72,7 @@ class CanonicalGap:
         return leg_length(self.motion.skeleton) / leg_length(CANONICAL)
 
 
-def _to_the_end(canonical: Motion) -> Motion:
+def _resample_to_end(canonical: Motion) -> Motion:
     """At the prior's rate. Where the very end is far from the last moment it has one of its own."""
     last = canonical.num_frames - 1
     moments = int(last * PRIOR_FPS / canonical.fps) + 1
@@ -86,11 +86,11 @@ def _to_the_end(canonical: Motion) -> Motion:
     return held.resample(PRIOR_FPS).slice(0, moments + 1)
 
 
-def _least_lacking(at: Float[Tensor, " shown"], lacking: Int[Tensor, " frames"]) -> Int[Tensor, " shown"]:
+def _find_most_complete_frames(at: Float[Tensor, " shown"], lacking: Int[Tensor, " frames"]) -> Int[Tensor, " shown"]:
     """For each moment, in frames, the one that lacks least of those that are nearer to it than to another moment; the
     nearest of several; any other frame if there is none.
     """
-    edges = (at[1:] + at[:-1]) / 2 + _TIE  # a frame in the middle of two is the earlier one's
+    edges = (at[1:] + at[:-1]) / 2 + _TIE_FRAMES  # a frame in the middle of two is the earlier one's
     beyond = at.new_full((1,), torch.inf)
     own, last = at.round().long(), len(lacking) - 1
     reach = math.ceil(float(torch.diff(at).max()) / 2) + 1 if len(at) > 1 else last

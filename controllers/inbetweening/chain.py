@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.pipeline import Infilled, InfillSettings
+from controllers.inbetweening.pipeline import InfillResult, InfillSettings
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -16,9 +16,9 @@ from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask
-from mapctl.retarget.carry import Body, carry
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 
-_END = 5  # frames over which the way on at a piece's end is told
+_VELOCITY_FRAMES = 5  # frames over which the way on at a piece's end is told
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def chain(
     filling: InfillSettings | None = None,
     densities: Sequence[Any] = (),
     extending: Sequence[Any] = (),
-) -> Infilled:
+) -> InfillResult:
     """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
 
     Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's. In gaps
@@ -53,11 +53,11 @@ def chain(
     settings = settings or ChainSettings()
     if len(clips) < 2:
         raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
-    body, notes = Body.of(clips[0])[1], []
+    body, notes = RiggedCharacter.of(clips[0])[1], []
     whole: Motion | None = None
     masks: list[Mask] = []
     for clip in clips:
-        piece, missed = _piece(clip, body, settings.piece)
+        piece, missed = _cut_piece(clip, body, settings.piece)
         notes += missed
         if whole is None:
             whole = piece
@@ -65,7 +65,7 @@ def chain(
         low, high = settings.gap
         gap = int(torch.randint(low, high + 1, (), generator=generator))
         masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
-        piece = _led_on(whole, piece, gap)
+        piece = _align_to_predecessor(whole, piece, gap)
         held = torch.full((gap,), whole.num_frames - 1)
         whole = whole.join(
             replace(whole, root_position=whole.root_position[held], local_quat_xyzw=whole.local_quat_xyzw[held])
@@ -75,32 +75,39 @@ def chain(
     return replace(done, notes=(*done.notes, *notes))
 
 
-def _piece(clip: Motion, body: Body, frames: int) -> tuple[Motion, tuple[str, ...]]:
+def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int) -> tuple[Motion, tuple[str, ...]]:
     """Frames from a clip's middle, on the bones of the body and on its floor, and what of them could not be kept."""
-    carried = carry(clip, body)
+    carried = retarget_motion(clip, body)
     motion = carried.motion.resample(PRIOR_FPS)
     count = min(frames, motion.num_frames)
     start = (motion.num_frames - count) // 2
     return replace(motion.slice(start, start + count), source=None), carried.notes
 
 
-def _led_on(before: Motion, piece: Motion, gap: int) -> Motion:
+def _align_to_predecessor(before: Motion, piece: Motion, gap: int) -> Motion:
     """The piece, moved and turned to where the motion before it comes after so many frames."""
     facing = heading(before.local_quat_xyzw[-1:, 0])
-    turned = _turned(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
-    way = (gap + 1) / 2 * (_step(before.root_position[-_END:]) + _step(turned.root_position[:_END]))
+    turned = _rotate_about_vertical(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
+    way = (
+        (gap + 1)
+        / 2
+        * (
+            _compute_mean_velocity(before.root_position[-_VELOCITY_FRAMES:])
+            + _compute_mean_velocity(turned.root_position[:_VELOCITY_FRAMES])
+        )
+    )
     aim = before.root_position[-1] + way
     moved = aim - turned.root_position[0]
     moved[1] = 0
     return replace(turned, root_position=turned.root_position + moved)
 
 
-def _step(places: Tensor) -> Tensor:
+def _compute_mean_velocity(places: Tensor) -> Tensor:
     """Mean way of a frame."""
     return (places[-1] - places[0]) / max(1, len(places) - 1)
 
 
-def _turned(motion: Motion, angle: Tensor) -> Motion:
+def _rotate_about_vertical(motion: Motion, angle: Tensor) -> Motion:
     """About the vertical through the origin."""
     turn = rotations.about_y(angle).expand(motion.num_frames, 4)
     quats = motion.local_quat_xyzw.clone()

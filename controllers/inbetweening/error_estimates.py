@@ -10,13 +10,13 @@ import numpy as np
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, leg_length
 
-GOING = 0.35
+TRAVELLING_SPEED = 0.35
 """Metres a second of the hips, from one end of a gap to the other, of a body with canonical legs, from which it is on
 its way."""
-_FEW = 5  # clips that tell no tenth of them
-KNOWN_FRAMES = 75
+_MIN_CLIPS = 5  # clips that tell no tenth of them
+TRAINED_GAP_FRAMES = 75
 """Of the longest gaps that the infiller was trained on: their mean length and a standard deviation."""
-MEASURED: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float, int]]] = {
+MEASURED_ERRORS: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float, int]]] = {
     ("infiller", "going", False): (
         (15, 4.5, 8.3, 22),
         (30, 5.5, 9.5, 23),
@@ -61,19 +61,21 @@ centimetres in half and in nine of ten of the clips, and how many these were; by
 --count 25`."""
 
 
-def going_between(motion: Motion, start: int, stop: int) -> bool:
+def is_travelling(motion: Motion, start: int, stop: int) -> bool:
     """Whether the body (canonical joints) goes elsewhere in a gap, faster than one shifts one's weight."""
     way = float((motion.root_position[stop] - motion.root_position[start])[::2].norm())
-    return way * leg_length(CANONICAL) / leg_length(motion.skeleton) > GOING * (stop - start) / float(motion.fps)
+    return way * leg_length(CANONICAL) / leg_length(motion.skeleton) > TRAVELLING_SPEED * (stop - start) / float(
+        motion.fps
+    )
 
 
 @dataclass(frozen=True)
-class Sureness:
+class ErrorEstimate:
     """What an answer for a gap is off by, mean over joints and frames, in the world."""
 
-    half_cm: float
+    median_cm: float
     """At most, in half of unseen clips."""
-    nine_in_ten_cm: float
+    percentile_90_cm: float
     """And in nine of ten."""
     clips: int
     """That these were."""
@@ -81,15 +83,17 @@ class Sureness:
     @property
     def text(self) -> str:
         """In words."""
-        if self.clips < _FEW:
-            return f"joints about {self.half_cm:.0f} cm from mocap's in the only {self.clips} unseen clips of the kind"
+        if self.clips < _MIN_CLIPS:
+            return (
+                f"joints about {self.median_cm:.0f} cm from mocap's in the only {self.clips} unseen clips of the kind"
+            )
         return (
-            f"joints within {self.half_cm:.0f} cm of mocap's in half of {self.clips} unseen clips and within"
-            f" {self.nine_in_ten_cm:.0f} cm in nine of ten"
+            f"joints within {self.median_cm:.0f} cm of mocap's in half of {self.clips} unseen clips and within"
+            f" {self.percentile_90_cm:.0f} cm in nine of ten"
         )
 
 
-def sureness_of(by: str, frames: int, *, going: bool, beside: bool) -> Sureness:
+def estimate_error(by: str, frames: int, *, going: bool, beside: bool) -> ErrorEstimate:
     """Of an answer for a gap of so many frames at the prior's rate; `beside` where frames around it are known.
 
     Between measured lengths straight lines; longer gaps than measured are at least as unsure as the longest. What was
@@ -97,7 +101,7 @@ def sureness_of(by: str, frames: int, *, going: bool, beside: bool) -> Sureness:
     """
     name = "rollout" if by.split(" ")[0] in ("rollout", "density") else "infiller"
     what = "going" if going else "in place"
-    rows = MEASURED.get((name, what, beside)) or MEASURED[("infiller", what, beside)]
+    rows = MEASURED_ERRORS.get((name, what, beside)) or MEASURED_ERRORS[("infiller", what, beside)]
     lengths, half, most, clips = np.array(rows).T
     nearest = int(clips[np.abs(lengths - frames).argmin()])
-    return Sureness(float(np.interp(frames, lengths, half)), float(np.interp(frames, lengths, most)), nearest)
+    return ErrorEstimate(float(np.interp(frames, lengths, half)), float(np.interp(frames, lengths, most)), nearest)

@@ -11,21 +11,21 @@ from pathlib import Path
 
 import torch
 
-from controllers.inbetweening.keyframes import limb_end
+from controllers.inbetweening.keyframes import effector_joint
 from mapctl import formats, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.inbetweening.missing import Lost, straight
-from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, from_canonical, settled
-from mapctl.retarget.carry import Body, carry
+from mapctl.retarget import RigMap, as_rig, from_canonical
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
 
 
 @dataclass(frozen=True, eq=False)
-class Keyed:
+class KeyframeClip:
     """Ready for `tween`."""
 
     motion: Motion
@@ -36,76 +36,76 @@ class Keyed:
     """The body's, where it is known."""
 
 
-def keyed(request: KeyRequest, rig: Rig | None = None) -> Keyed:
+def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> KeyframeClip:
     """The motion and the keys that a request asks for. RequestError, which names the key, for poses and joints that are
     not there; `rig` is the body's where it is not the one that would be recognised.
     """
     first = next((number for number, key in enumerate(request.key) if key.needs_pose), 0)
-    reader = _Reader(rig)
-    with _of("body" if request.body is not None else f"key[{first}].pose"):
+    reader = _PoseReader(rig)
+    with _prefix_errors("body" if request.body is not None else f"key[{first}].pose"):
         body = reader.body(request.body or request.key[first].pose or "")
     fps = Fraction(request.fps).limit_denominator(100_000)
     keys, poses = {}, {}
     for number, key in enumerate(request.key):
         frame = request.frame_of(key)
-        keys[frame] = _key(key, frame, body.rigmap, number)
+        keys[frame] = _build_key(key, frame, body.rigmap, number)
         if key.needs_pose:
-            poses[frame] = replace(_pose(key, request, reader, body, number), fps=fps, source=body.clip.source)
-    return Keyed(_in_time(poses, max(keys) + 1), Keys(tuple(keys.values())), settled(body.rigmap))
+            poses[frame] = replace(_build_pose(key, request, reader, body, number), fps=fps, source=body.clip.source)
+    return KeyframeClip(_interpolate_poses(poses, max(keys) + 1), Keys(tuple(keys.values())), as_rig(body.rigmap))
 
 
 @dataclass(frozen=True, eq=False)
-class _Clip:
+class _LoadedClip:
     """A file that has been read."""
 
     clip: Motion
     """As it is."""
     canonical: Motion
     """On canonical joints, with the bones of the body and on its floor."""
-    whose: Body
+    target_body: RiggedCharacter
     """The body."""
 
     @property
     def rigmap(self) -> RigMap:
         """The way back to the body's rig."""
-        return self.whose.rigmap
+        return self.target_body.rigmap
 
 
 @dataclass(eq=False)
-class _Reader:
+class _PoseReader:
     """Reads every file once."""
 
     rig: Rig | None
     """Of the body."""
-    seen: dict[str, _Clip] = field(default_factory=dict)
+    seen: dict[str, _LoadedClip] = field(default_factory=dict)
     """By path."""
 
-    def body(self, path: str) -> _Clip:
+    def body(self, path: str) -> _LoadedClip:
         """The body's own file, by its rig where one is asked for."""
         unit = None if self.rig is None else self.rig.metres_per_unit
         clip = formats.load(Path(path), metres_per_unit=unit)
-        self.seen[path] = _Clip(clip, *Body.of(clip, self.rig))
+        self.seen[path] = _LoadedClip(clip, *RiggedCharacter.of(clip, self.rig))
         return self.seen[path]
 
-    def pose(self, path: str, body: _Clip) -> _Clip:
+    def pose(self, path: str, body: _LoadedClip) -> _LoadedClip:
         """A clip, brought to the body; the rig of another skeleton must be recognised."""
         if path not in self.seen:
             clip = formats.load(Path(path))
-            self.seen[path] = _Clip(clip, carry(clip, body.whose).motion, body.whose)
+            self.seen[path] = _LoadedClip(clip, retarget_motion(clip, body.target_body).motion, body.target_body)
         return self.seen[path]
 
 
-def _key(key: PlacedKey, frame: int, rigmap: RigMap, number: int) -> Key:
+def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:
     for name, names in (("joints", key.joints), ("reach", tuple(key.reach))):
-        with _of(f"key[{number}].{name}"):
+        with _prefix_errors(f"key[{number}].{name}"):
             for joint in names:
-                limb_end(joint, rigmap)
+                effector_joint(joint, rigmap)
     return Key(frame, limbs=key.joints, places=key.reach, root_only=key.root_only)
 
 
-def _pose(key: PlacedKey, request: KeyRequest, reader: _Reader, body: _Clip, number: int) -> Motion:
+def _build_pose(key: KeyEntry, request: KeyRequest, reader: _PoseReader, body: _LoadedClip, number: int) -> Motion:
     """One frame on the body's rig, where it is wanted."""
-    with _of(f"key[{number}].pose"):
+    with _prefix_errors(f"key[{number}].pose"):
         found = reader.pose(key.pose or request.body or "", body)
     clip = found.clip
     frame = key.pose_frame or 0
@@ -118,11 +118,11 @@ def _pose(key: PlacedKey, request: KeyRequest, reader: _Reader, body: _Clip, num
     same = clip.skeleton.matches(body.clip.skeleton)
     if same and key.place is None and key.height is None and key.facing_deg is None:
         return own
-    placed = _placed(replace(canonical, source=None), key)
+    placed = _position_pose(replace(canonical, source=None), key)
     return from_canonical(placed, body.rigmap, own if same else None)
 
 
-def _placed(pose: Motion, key: PlacedKey) -> Motion:
+def _position_pose(pose: Motion, key: KeyEntry) -> Motion:
     """A canonical pose at its place over the ground, at its height, turned to where it is to face."""
     root, quats = pose.root_position.clone(), pose.local_quat_xyzw.clone()
     if key.place is not None:
@@ -135,7 +135,7 @@ def _placed(pose: Motion, key: PlacedKey) -> Motion:
     return replace(pose, root_position=root, local_quat_xyzw=quats)
 
 
-def _in_time(poses: dict[int, Motion], frames: int) -> Motion:
+def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:
     """Poses at their frames, and straight lines between them."""
     at = torch.tensor(sorted(poses))
     joined = reduce(Motion.join, (poses[frame] for frame in sorted(poses)))
@@ -145,15 +145,15 @@ def _in_time(poses: dict[int, Motion], frames: int) -> Motion:
         joined,
         root_position=joined.root_position[held],
         moving_offsets=moving,
-        local_quat_xyzw=rotations.sign_continuous(joined.local_quat_xyzw)[held],
+        local_quat_xyzw=rotations.make_sign_continuous(joined.local_quat_xyzw)[held],
     )
     free = torch.ones(frames, dtype=torch.bool)
     free[at] = False
-    return straight(motion, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free))
+    return interpolate_missing(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free))
 
 
 @contextmanager
-def _of(where: str) -> Iterator[None]:
+def _prefix_errors(where: str) -> Iterator[None]:
     """Errors within name the key of the request."""
     try:
         yield

@@ -22,11 +22,11 @@ from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, leg_length
 
-GOING = 0.3
+TRAVELLING_DISTANCE = 0.3
 """Metres of the hips over the ground from which a pair of poses is on its way, and the distance tells the time."""
-FARTHEST = 4.0
+MAX_FITTED_DISTANCE = 4.0
 """Metres beyond which people go on as fast as they do over so many: mocap's pairs end about there."""
-_CUES = ("step", "stride", "lift", "hips", "toes", "knees", "arms", "lean")
+_GAIT_CUES = ("step", "stride", "lift", "hips", "toes", "knees", "arms", "lean")
 FEATURES = (
     "one",
     "way",
@@ -37,12 +37,12 @@ FEATURES = (
     "way_apart",
     "aside",
     "ahead",
-    *_CUES,
-    *(f"way_{name}" for name in _CUES),
+    *_GAIT_CUES,
+    *(f"way_{name}" for name in _GAIT_CUES),
 )
-"""Of a pair of poses, as `pair_features` gives them."""
-_SOFT = 0.03  # metres below which it is all one how far two poses are apart
-_JOINT = {name: index for index, name in enumerate(CANONICAL.names)}
+"""Of a pair of poses, as `compute_pair_features` gives them."""
+_MIN_POSE_DISTANCE = 0.03  # metres below which it is all one how far two poses are apart
+_JOINT_INDEX = {name: index for index, name in enumerate(CANONICAL.names)}
 WEIGHTS: tuple[float, ...] = (
     0.7268,
     0.5584,
@@ -70,14 +70,17 @@ WEIGHTS: tuple[float, ...] = (
     -0.2542,
     -1.575,
 )
-"""Of the features, for the logarithm of seconds: `controllers.benchmarks.keyframe_timing.fitted` on 5,000 pairs of
-poses 0.25 to 4 s apart, of clips drawn from those that the bundled infiller was trained on."""
-_LEAST, _MOST = 0.25, 4.0  # seconds within which pairs lay
-_USUAL = {"going": (0.74, 1.35), "staying": (0.35, 2.05)}  # 10th and 90th percentiles of true over fitted seconds
+"""Of the features, for the logarithm of seconds: `controllers.benchmarks.keyframe_timing.fit_timing_weights` on 5,000
+pairs of poses 0.25 to 4 s apart, of clips drawn from those that the bundled infiller was trained on."""
+_MIN_SECONDS, _MAX_SECONDS = 0.25, 4.0  # seconds within which pairs lay
+_RATIO_PERCENTILES = {
+    "going": (0.74, 1.35),
+    "staying": (0.35, 2.05),
+}  # 10th and 90th percentiles of true over fitted seconds
 
 
 @dataclass(frozen=True)
-class Interval:
+class KeyInterval:
     """Between two neighbouring keys that are whole poses."""
 
     start: int
@@ -94,7 +97,7 @@ class Interval:
     """Over these, m/s, with the given timing."""
     suggested_speed: float
     """And with the suggested one."""
-    apart_cm: float
+    pose_distance_cm: float
     """Mean distance of the joints seen from the hips."""
 
     @property
@@ -107,9 +110,9 @@ class Interval:
         """Why, in numbers."""
         low, high = self.usual
         verdict = "short" if self.given < low else "long" if self.given > high else "usual"
-        if self.metres < GOING:
+        if self.metres < TRAVELLING_DISTANCE:
             return (
-                f"{verdict}: about in place ({self.metres:.2f} m), joints {self.apart_cm:.0f} cm apart; mocap "
+                f"{verdict}: about in place ({self.metres:.2f} m), joints {self.pose_distance_cm:.0f} cm apart; mocap "
                 f"mostly takes {low} to {high} frames"
             )
         return (
@@ -128,30 +131,30 @@ class Interval:
             "metres": self.metres,
             "given_m_s": self.given_speed,
             "suggested_m_s": self.suggested_speed,
-            "apart_cm": self.apart_cm,
+            "apart_cm": self.pose_distance_cm,
             "reason": self.reason,
         }
 
 
-def suggest(motion: Motion, keys: Keys, rig: Rig | None = None) -> list[Interval]:
+def suggest_intervals(motion: Motion, keys: Keys, rig: Rig | None = None) -> list[KeyInterval]:
     """For neighbouring keys that are whole poses how long the way between them would take; keys that tell less lie
     within. RequestError for keys that do not fit the motion.
     """
     wanted = [key.frame for key in keys.checked(motion) if key.what == "pose"]
-    poses = _at(motion, wanted)
+    poses = _select_frames(motion, wanted)
     canonical = to_canonical(poses, rig)[0]
     scale, fps = leg_length(canonical.skeleton) / leg_length(CANONICAL), float(motion.fps)
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
     first = torch.arange(len(wanted) - 1)
-    features, ways = pair_features(body, first, first + 1), travelled(body, first, first + 1)
+    features, ways = compute_pair_features(body, first, first + 1), compute_travel_distance(body, first, first + 1)
     intervals = []
     for number, (start, stop) in enumerate(pairwise(wanted)):
         metres = ways[number]
-        seconds = float(seconds_of(features[number : number + 1], metres[None]))
-        usual = _USUAL["going" if float(metres) >= GOING else "staying"]
+        seconds = float(predict_seconds(features[number : number + 1], metres[None]))
+        usual = _RATIO_PERCENTILES["going" if float(metres) >= TRAVELLING_DISTANCE else "staying"]
         suggested = max(1, round(seconds * fps))
         intervals.append(
-            Interval(
+            KeyInterval(
                 start,
                 stop,
                 suggested,
@@ -159,19 +162,21 @@ def suggest(motion: Motion, keys: Keys, rig: Rig | None = None) -> list[Interval
                 float(metres) * scale,
                 float(metres) * scale * fps / (stop - start),
                 float(metres) * scale * fps / suggested,
-                100 * scale * (math.exp(float(features[number, 2])) - _SOFT),
+                100 * scale * (math.exp(float(features[number, 2])) - _MIN_POSE_DISTANCE),
             )
         )
     return intervals
 
 
-def seconds_of(features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]) -> Float[Tensor, " pairs"]:
+def predict_seconds(
+    features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
+) -> Float[Tensor, " pairs"]:
     """What the regression makes of pairs of poses so far apart."""
-    seconds = torch.exp(features @ features.new_tensor(WEIGHTS)).clamp(_LEAST, _MOST)
-    return seconds * (metres / FARTHEST).clamp_min(1)
+    seconds = torch.exp(features @ features.new_tensor(WEIGHTS)).clamp(_MIN_SECONDS, _MAX_SECONDS)
+    return seconds * (metres / MAX_FITTED_DISTANCE).clamp_min(1)
 
 
-def pair_features(
+def compute_pair_features(
     body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]
 ) -> Float[Tensor, "pairs features"]:
     """Of pairs of frames of a motion on canonical bones, in the order of `FEATURES`: of metres, also their logarithms,
@@ -180,29 +185,32 @@ def pair_features(
     places, facing = body.joint_positions(), heading(body.local_quat_xyzw[:, 0])
     turn = rotations.about_y(-facing)[:, None].expand(-1, CANONICAL.num_joints, 4)
     own = rotations.rotate(turn, places - places[:, :1])
-    metres = travelled(body, first, second)
-    way = torch.log(metres.clamp(max=FARTHEST) + 0.1)
+    metres = compute_travel_distance(body, first, second)
+    way = torch.log(metres.clamp(max=MAX_FITTED_DISTANCE) + 0.1)
     off = (own[second] - own[first]).norm(dim=-1)
-    apart, worst = torch.log(off.mean(dim=-1) + _SOFT), torch.log(off.amax(dim=-1) + 0.05)
+    apart, worst = torch.log(off.mean(dim=-1) + _MIN_POSE_DISTANCE), torch.log(off.amax(dim=-1) + 0.05)
     turned = rotations.wrap_angle(facing[second] - facing[first]).abs()
     gone = rotations.rotate(rotations.about_y(-facing[first]), places[second, 0] - places[first, 0])
     gone = gone / (metres + 0.1)[:, None]
-    cues = _cues(own, places)
+    cues = _compute_gait_cues(own, places)
     cues = (cues[first] + cues[second]) / 2
     plain = [torch.ones_like(way), way, apart, worst, turned, way.square(), way * apart, gone[:, 0].abs(), gone[:, 2]]
     return torch.cat([torch.stack(plain, dim=-1), cues, way[:, None] * cues], dim=-1)
 
 
-def _cues(
+def _compute_gait_cues(
     own: Float[Tensor, "frames joints 3"], places: Float[Tensor, "frames joints 3"]
 ) -> Float[Tensor, "frames cues"]:
     """What a pose shows of the gait, metres; joints seen from hips that face ahead, and in the world."""
-    left, right = own[:, _JOINT["leftToes"]], own[:, _JOINT["rightToes"]]
+    left, right = own[:, _JOINT_INDEX["leftToes"]], own[:, _JOINT_INDEX["rightToes"]]
     lowest = torch.minimum(left[:, 1], right[:, 1])
     ahead = (left - right).abs()
     legs, arms = (
         torch.stack(
-            [(own[:, _JOINT[side + upper]] - own[:, _JOINT[side + end]]).norm(dim=-1) for side in ("left", "right")]
+            [
+                (own[:, _JOINT_INDEX[side + upper]] - own[:, _JOINT_INDEX[side + end]]).norm(dim=-1)
+                for side in ("left", "right")
+            ]
         ).mean(dim=0)
         for upper, end in (("UpperLeg", "Foot"), ("UpperArm", "Hand"))
     )
@@ -215,18 +223,20 @@ def _cues(
             places[:, 0, 1] + lowest,
             legs,
             arms,
-            own[:, _JOINT["head"], 2],
+            own[:, _JOINT_INDEX["head"], 2],
         ],
         dim=-1,
     )
 
 
-def travelled(body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]) -> Float[Tensor, " pairs"]:
+def compute_travel_distance(
+    body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]
+) -> Float[Tensor, " pairs"]:
     """Of the hips over the ground, metres."""
     return (body.root_position[second] - body.root_position[first])[:, ::2].norm(dim=-1)
 
 
-def _at(motion: Motion, frames: Sequence[int]) -> Motion:
+def _select_frames(motion: Motion, frames: Sequence[int]) -> Motion:
     """These frames alone."""
     picked = torch.tensor(frames)
     moving = {joint: values[picked] for joint, values in motion.moving_offsets.items()}

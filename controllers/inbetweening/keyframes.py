@@ -7,17 +7,17 @@ import torch
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import LIMBS, Targets
-from mapctl.inbetweening.missing import Lost
+from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Key, Keys
-from mapctl.joint_names import find_joint, nearest, role
+from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, places_on_rig, to_canonical
+from mapctl.retarget import RigMap, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
 
-def lost_between(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> Lost:
+def missing_between_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> MissingMask:
     """What of a motion the keys do not tell."""
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in keys if key.what == "pose"]] = False
@@ -27,25 +27,25 @@ def lost_between(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> Lost:
         if key.what == "root":
             root[key.frame] = False
             joints[key.frame] = ~above
-    return Lost(joints, root)
+    return MissingMask(joints, root)
 
 
-def targets_of(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> Targets | None:
+def collect_effector_targets(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> EffectorTargets | None:
     """Where hands and feet are to be; None where no key tells that alone. RequestError for joints that are neither."""
     if all(key.what != "limbs" for key in keys):
         return None
     wanted = torch.zeros(motion.num_frames, CANONICAL.num_joints, dtype=torch.bool)
-    places, own = torch.zeros(*wanted.shape, 3, dtype=torch.float64), places_on_rig(motion, rigmap)
+    places, own = torch.zeros(*wanted.shape, 3, dtype=torch.float64), rig_joint_positions(motion, rigmap)
     for key in keys:
         for name in key.ends:
-            limb = limb_end(name, rigmap)
+            limb = effector_joint(name, rigmap)
             wanted[key.frame, limb] = True
             told = key.places.get(name)
             places[key.frame, limb] = own[key.frame, limb] if told is None else own.new_tensor(told)
-    return Targets(places, wanted)
+    return EffectorTargets(places, wanted)
 
 
-def missed_by(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
+def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
     """By key, how far what it tells is missed by the joint that misses it by most: places in cm, and rotations in
     degrees where it tells any.
     """
@@ -53,12 +53,12 @@ def missed_by(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[
     away = 100 * (made.joint_positions() - source.joint_positions()).norm(dim=-1)
     turn = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
     turned = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
-    targets = targets_of(wanted, source, rigmap)
+    targets = collect_effector_targets(wanted, source, rigmap)
     rows = []
     for key in wanted:
         row: dict[str, Any] = {"frame": key.frame, "what": key.what}
         if key.what == "limbs" and targets is not None:
-            off = (places_on_rig(made, rigmap)[key.frame] - targets.places[key.frame]).norm(dim=-1)
+            off = (rig_joint_positions(made, rigmap)[key.frame] - targets.places[key.frame]).norm(dim=-1)
             rows.append(row | {"missed_cm": 100 * float(off[targets.wanted[key.frame]].max())})
             continue
         joints = [hips or 0] if key.what == "root" else list(range(source.num_joints))
@@ -69,14 +69,14 @@ def missed_by(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[
     return rows
 
 
-def check_limbs(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
+def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
     """RequestError for a name that is no hand or foot of the motion's rig."""
     rigmap = to_canonical(motion, rig)[1]
     for name in names:
-        limb_end(name, rigmap)
+        effector_joint(name, rigmap)
 
 
-def limb_end(name: str, rigmap: RigMap) -> int:
+def effector_joint(name: str, rigmap: RigMap) -> int:
     """The canonical joint of a limb's end, by its canonical name or the rig's own in any case; RequestError, with the
     nearest name, for anything else."""
     names = rigmap.rig_skeleton.names
@@ -85,8 +85,8 @@ def limb_end(name: str, rigmap: RigMap) -> int:
     joint = find_joint(name, names, lambda: known)
     if joint in ends:
         return ends[joint]
-    told = [role(CANONICAL.names[end]) for end in ends.values()]
-    raise RequestError(f"no hand or foot {name!r}; {nearest(name, [names[end] for end in ends], told)}")
+    told = [classify_joint(CANONICAL.names[end]) for end in ends.values()]
+    raise RequestError(f"no hand or foot {name!r}; {describe_nearest(name, [names[end] for end in ends], told)}")
 
 
 def _carries_hips(joint: int, rigmap: RigMap) -> bool:

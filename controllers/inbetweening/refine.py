@@ -8,26 +8,26 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from controllers.common.map_refinement import StandingSettings, stand
+from controllers.common.map_refinement import RefinementSettings, refine
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from mapctl.inbetweening.effector_targets import Targets
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import runs
+from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.ledger import Ledger
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms import Clearance, Footing, Seam
+from mapctl.terms import Clearance, FootContact, Jerk
 
-_BESIDE = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
-FINISHING = StandingSettings(
-    ease=8.0,
-    unseen_deg=2.0,
-    unseen_cm=2.0,
-    seam=Seam(sigma=150.0, frames=96),
+_CONTEXT_FRAMES = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
+INFILL_REFINEMENT = RefinementSettings(
+    uncertainty_ramp=8.0,
+    unobserved_sigma_deg=2.0,
+    unobserved_sigma_cm=2.0,
+    jerk=Jerk(sigma=150.0, frames=96),
     clearance=Clearance(),
-    footing=Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05),
+    footing=FootContact(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05),
     budget=Budget(evaluations=40),
     lbfgs=LbfgsSettings(max_iterations=40),
 )
@@ -36,17 +36,17 @@ network's, since styles differ in them, but for those of toes that skate; jerk c
 the evaluations."""
 
 
-def stood(
+def refine_gaps(
     proposal: Motion,
     bits: Tensor,
     gap: CanonicalGap,
-    settings: StandingSettings,
+    settings: RefinementSettings,
     densities: Sequence[Any],
-    targets: Targets | None,
+    targets: EffectorTargets | None,
 ) -> tuple[Motion, Ledger]:
     """The proposal with its feet put down, gap by gap; and the ledger of these."""
     quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
-    for first, last in _surroundings(gap.turns.any(dim=1) | gap.root):
+    for first, last in _find_gap_windows(gap.turns.any(dim=1) | gap.root):
         if last - first < 2:
             continue
         part = slice(first, last)
@@ -57,8 +57,8 @@ def stood(
             sigma=torch.zeros(CANONICAL.num_joints),
             sigma_root=0.0,
         )
-        wanted = None if targets is None else Targets(targets.places[part], targets.wanted[part])
-        standing = stand(
+        wanted = None if targets is None else EffectorTargets(targets.places[part], targets.wanted[part])
+        standing = refine(
             proposal.slice(first, last), bits[part], capture, settings, densities=densities, targets=wanted
         )
         quats[part] = torch.where(gap.turns[part, :, None], standing.motion.local_quat_xyzw, quats[part])
@@ -67,9 +67,9 @@ def stood(
     return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
 
 
-def _surroundings(lost: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+def _find_gap_windows(lost: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
     """First frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
     near = lost.clone()
-    for _, start, stop in runs(lost[:, None]):
-        near[max(0, start - _BESIDE) : stop + _BESIDE] = True
-    return [(start, stop) for _, start, stop in runs(near[:, None])]
+    for _, start, stop in true_intervals(lost[:, None]):
+        near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True
+    return [(start, stop) for _, start, stop in true_intervals(near[:, None])]

@@ -9,16 +9,16 @@ from typing import Any
 
 import torch
 
-from controllers.inbetweening.feasibility import between_keys
-from controllers.inbetweening.keyframes import lost_between, missed_by, targets_of
-from controllers.inbetweening.pipeline import Infilled, InfillSettings, end_notes, fill
-from controllers.inbetweening.proposers.answers import Another
+from controllers.inbetweening.feasibility import check_keyframes
+from controllers.inbetweening.keyframes import collect_effector_targets, keyframe_errors, missing_between_keys
+from controllers.inbetweening.pipeline import InfillResult, InfillSettings, fill, note_open_ends
+from controllers.inbetweening.proposers.answers import Proposer
 from controllers.inbetweening.proposers.selection import choose_proposals
-from mapctl.inbetweening.missing import Lost, straight
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
-from mapctl.retarget import RigMap, settled, to_canonical
+from mapctl.retarget import RigMap, as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 
 
@@ -31,8 +31,8 @@ def tween(
     densities: Sequence[Any] = (),
     rig: Rig | None = None,
     rollable: Sequence[Any] = (),
-    another: Another | None = None,
-) -> Infilled:
+    another: Proposer | None = None,
+) -> InfillResult:
     """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
 
     Where keys are so far apart that the infiller does not know enough, one of the densities `rollable` proposes if a
@@ -41,9 +41,9 @@ def tween(
     note.
     """
     wanted = keys.checked(motion)
-    canonical, rigmap, shown = shown_by(wanted, motion, rig)
-    lost, targets = lost_between(wanted, motion, rigmap), targets_of(wanted, shown, rigmap)
-    hasty = between_keys(shown, canonical, rigmap, lost, targets)
+    canonical, rigmap, shown = keyframe_motion(wanted, motion, rig)
+    lost, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
+    hasty = check_keyframes(shown, canonical, rigmap, lost, targets)
     if another is None and (settings is None or settings.method == "map"):
         another = partial(choose_proposals, densities=rollable)
     done = fill(
@@ -52,24 +52,24 @@ def tween(
         infiller,
         settings=settings,
         densities=densities,
-        rig=settled(rigmap),
+        rig=as_rig(rigmap),
         targets=targets,
         another=another,
     )
     by = "nearest key" if infiller is None else "infiller"
-    return replace(done, notes=(*hasty, *end_notes(lost, by, by), *done.notes))
+    return replace(done, notes=(*hasty, *note_open_ends(lost, by, by), *done.notes))
 
 
-def shown_by(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
+def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
     """All that counts, the keys and straight lines between them: on canonical joints, and on the rig, which is told
     from these, too.
     """
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in wanted if key.shown]] = False
-    shown = straight(motion, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free))
+    shown = interpolate_missing(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free))
     return *to_canonical(shown, rig), shown
 
 
-def key_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:
-    """By key, how far what it tells is missed (see `controllers.inbetweening.keyframes.missed_by`)."""
-    return missed_by(made, source, keys, shown_by(keys.checked(source), source, rig)[1])
+def measure_keyframe_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:
+    """By key, how far what it tells is missed (see `controllers.inbetweening.keyframes.keyframe_errors`)."""
+    return keyframe_errors(made, source, keys, keyframe_motion(keys.checked(source), source, rig)[1])

@@ -9,33 +9,33 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.common.score import energy_of
+from controllers.common.score import score
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.pipeline import Infilled, InfillSettings
-from controllers.inbetweening.proposers.answers import Answer
-from controllers.inbetweening.proposers.rollout import RolloutSettings, likeliest, rolled
+from controllers.inbetweening.pipeline import InfillResult, InfillSettings
+from controllers.inbetweening.proposers.answers import Proposal
+from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps, select_likeliest_density
 from controllers.inbetweening.tween import tween
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.effector_targets import Targets
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.intent.keyframes import Keys
-from mapctl.metrics.realism import Diversity, sample_diversity
+from mapctl.metrics.realism import Diversity, measure_diversity
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 
-MOST = 1000
+MAX_VARIATIONS = 1000
 """Variations at a time."""
-_SHORTEST = 8  # frames at the prior's rate: shorter motions have no energy to speak of
+_MIN_FRAMES = 8  # frames at the prior's rate: shorter motions have no energy to speak of
 
 
 @dataclass(frozen=True, eq=False)
 class Variation:
     """One answer."""
 
-    infilled: Infilled
+    infill_result: InfillResult
     """The motion, and how it became so."""
     ledger: Ledger
     """Of the finished motion, by term: likelihood, footing, clearance, support and jerk."""
@@ -56,7 +56,7 @@ class Variations:
     """How different they are on average."""
 
 
-def variations(
+def sample_variations(
     motion: Motion,
     keys: Keys,
     infiller: Inbetweener,
@@ -75,20 +75,20 @@ def variations(
     The first is that of `tween`; in the others densities that are `rollable` are drawn from and steered from key to
     key. RequestError for fewer than two, for keys that are too near to each other to leave a choice, and as `tween`.
     """
-    if not 2 <= count <= MOST:
-        raise RequestError(f"variations are 2 to {MOST}, got {count}")
+    if not 2 <= count <= MAX_VARIATIONS:
+        raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
     settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [_first(motion, partial(make, rollable=rollable))]
-    density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
-    found += _rollouts(make, count - 1, density, generator, rolling, progress)
+    found = [_make_first(motion, partial(make, rollable=rollable))]
+    density = select_likeliest_density(rollable, to_canonical(found[0].motion, rig)[0])
+    found += _sample_rollouts(make, count - 1, density, generator, rolling, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
-        raise RequestError(f"no two keys have {_span(rolling)} between them, which leaves nothing to vary")
-    each = tuple(Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)) for one in found)
-    return Variations(each, sample_diversity([one.motion for one in found]))
+        raise RequestError(f"no two keys have {_format_span(rolling)} between them, which leaves nothing to vary")
+    each = tuple(Variation(one, score(one.motion, one.contacts, density, settings.refinement, rig)) for one in found)
+    return Variations(each, measure_diversity([one.motion for one in found]))
 
 
-def best_of(
+def lowest_energy(
     motion: Motion,
     keys: Keys,
     infiller: Inbetweener,
@@ -101,20 +101,18 @@ def best_of(
     densities: Sequence[Any] = (),
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Infilled:
+) -> InfillResult:
     """The one with the least energy of so many finished answers: from the infiller's proposal, from slerp's, and from
     rollouts; its notes tell all energies. RequestError for fewer than two, and as `tween`.
     """
-    if not 2 <= count <= MOST:
-        raise RequestError(f"the best is of 2 to {MOST}, got {count}")
+    if not 2 <= count <= MAX_VARIATIONS:
+        raise RequestError(f"the best is of 2 to {MAX_VARIATIONS}, got {count}")
     settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [_first(motion, make), make(another=_straight)]
-    density = likeliest(rollable, to_canonical(found[0].motion, rig)[0])
-    found += _rollouts(make, count - 2, density, generator, rolling, progress)
-    nats = [
-        Variation(one, energy_of(one.motion, one.contacts, density, settings.standing, rig)).energy for one in found
-    ]
+    found = [_make_first(motion, make), make(another=_propose_interpolation)]
+    density = select_likeliest_density(rollable, to_canonical(found[0].motion, rig)[0])
+    found += _sample_rollouts(make, count - 2, density, generator, rolling, progress)
+    nats = [Variation(one, score(one.motion, one.contacts, density, settings.refinement, rig)).energy for one in found]
     names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
     best, told = (
         min(range(count), key=nats.__getitem__),
@@ -125,40 +123,42 @@ def best_of(
     return replace(found[best], seconds=seconds, notes=(*found[best].notes, note))
 
 
-def _first(motion: Motion, make: Callable[..., Infilled]) -> Infilled:
+def _make_first(motion: Motion, make: Callable[..., InfillResult]) -> InfillResult:
     """The infiller's answer; RequestError for motions too short for an energy."""
-    if motion.num_frames < _SHORTEST * motion.fps / PRIOR_FPS:
+    if motion.num_frames < _MIN_FRAMES * motion.fps / PRIOR_FPS:
         raise RequestError(f"a motion of {motion.num_frames} frames leaves nothing to vary")
     return make()
 
 
-def _rollouts(
-    make: Callable[..., Infilled],
+def _sample_rollouts(
+    make: Callable[..., InfillResult],
     count: int,
     density: Any,
     generator: torch.Generator,
     rolling: RolloutSettings,
     progress: Callable[[int, int], None] | None,
-) -> list[Infilled]:
+) -> list[InfillResult]:
     """Answers of a density, each of a seed of its own."""
     found = []
-    for number, seed in enumerate(_seeds(count, generator)):
+    for number, seed in enumerate(_sample_seeds(count, generator)):
         if progress is not None:
             progress(number, count)
         draws = torch.Generator().manual_seed(seed)
-        found.append(make(another=partial(rolled, densities=[density], generator=draws, settings=rolling)))
+        found.append(make(another=partial(roll_through_gaps, densities=[density], generator=draws, settings=rolling)))
     return found
 
 
-def _straight(gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: Targets | None) -> Answer:
+def _propose_interpolation(
+    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: EffectorTargets | None
+) -> Proposal:
     """Slerp's proposal, with the infiller's contacts."""
-    return Answer(gap.motion, odds)
+    return Proposal(gap.motion, odds)
 
 
-def _seeds(count: int, generator: torch.Generator) -> Iterator[int]:
+def _sample_seeds(count: int, generator: torch.Generator) -> Iterator[int]:
     """One for each, the first ones the same however many there are."""
     return (int(torch.randint(2**62, (1,), generator=generator)) for _ in range(count))
 
 
-def _span(rolling: RolloutSettings) -> str:
+def _format_span(rolling: RolloutSettings) -> str:
     return f"{(rolling.shortest + 1) / PRIOR_FPS:.2g} to {(rolling.longest + 1) / PRIOR_FPS:.2g} s"

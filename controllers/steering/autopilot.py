@@ -3,21 +3,21 @@
 import math
 from dataclasses import replace
 
-from controllers.steering.pure_pursuit import Pursuit
+from controllers.steering.pure_pursuit import PurePursuit
 from controllers.steering.steer import SteerFrames
 from mapctl.curves.curve import Curve
-from mapctl.intent.steering import Command, Limits
+from mapctl.intent.steering import Command, SteeringLimits
 
-_ARRIVED = 0.15  # metres before the end of a path at which to stand
+_ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which to stand
 
 
-class Pilot:
+class Autopilot:
     """A Source, and the Display from which it knows where the character is."""
 
-    def __init__(self, command: Command, limits: Limits):
+    def __init__(self, command: Command, limits: SteeringLimits):
         """`limits` tell how soon to brake before the end of a path."""
         self._command, self._limits = command, limits
-        self._pursuit: Pursuit | None = None
+        self._pursuit: PurePursuit | None = None
         self._last: SteerFrames | None = None
 
     def command(self, command: Command) -> None:
@@ -26,7 +26,7 @@ class Pilot:
 
     def walk(self, curve: Curve, speed: float) -> None:
         """Go along a curve, in the steps, gait and style of the last command; to stand at an open one's end."""
-        self._pursuit = Pursuit(curve, speed=speed)
+        self._pursuit = PurePursuit(curve, speed=speed)
         if self._last is not None:
             self._pursuit.show(self._last, 0.0)
 
@@ -43,8 +43,8 @@ class Pilot:
         wanted, left = self._pursuit.at(seconds), self._pursuit.left
         if left is not None:
             # As fast as can still be braked: v^2 = 2 a s.
-            speed = min(wanted.speed, math.sqrt(2 * self._limits.braking * max(0.0, left - _ARRIVED)))
-            if left <= _ARRIVED:
+            speed = min(wanted.speed, math.sqrt(2 * self._limits.braking * max(0.0, left - _ARRIVAL_DISTANCE)))
+            if left <= _ARRIVAL_DISTANCE:
                 self.command(Command(0.0, wanted.heading, told=self._command.told))
                 return self._command
             wanted = Command(speed, wanted.heading)

@@ -21,10 +21,10 @@ import torch
 from controllers.steering.steer import SteerFrames, SteerState, step
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Command, Wish
+from mapctl.intent.steering import Command, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
-from mapctl.rotations import sign_continuous
+from mapctl.rotations import make_sign_continuous
 
 
 @runtime_checkable
@@ -161,12 +161,12 @@ class Recorder:
         first = self.pieces[0].motion
         roots = torch.cat([piece.motion.root_position for piece in self.pieces])[:frames]
         quats = torch.cat([piece.motion.local_quat_xyzw for piece in self.pieces])[:frames]
-        return Motion(first.skeleton, first.fps, roots, sign_continuous(quats))
+        return Motion(first.skeleton, first.fps, roots, make_sign_continuous(quats))
 
     @property
-    def wishes(self) -> list[Wish]:
+    def steering_targets(self) -> list[SteeringTarget]:
         """Of every frame."""
-        return [wish for piece in self.pieces for wish in piece.wishes]
+        return [wish for piece in self.pieces for wish in piece.steering_targets]
 
     @property
     def ledger(self) -> Ledger:
@@ -177,7 +177,7 @@ class Recorder:
         return ledger
 
 
-def steps(
+def iterate_steps(
     state: SteerState,
     source: Source,
     displays: Sequence[Display],
@@ -222,7 +222,7 @@ def drive(
 ) -> tuple[SteerState, list[StepRecord]]:
     """Steer until `frames` have been delivered, or `stop()` says so, or Ctrl-C."""
     records: list[StepRecord] = []
-    stream = steps(state, source, displays, clock=clock or StreamClock(), settings=settings)
+    stream = iterate_steps(state, source, displays, clock=clock or StreamClock(), settings=settings)
     try:
         while state.frames < frames and not stop():
             state, record = next(stream)
@@ -233,14 +233,16 @@ def drive(
     return state, records
 
 
-def timing(records: Sequence[StepRecord], arrivals: Sequence[float] = ()) -> dict[str, float | int | None]:
+def summarise_step_timing(
+    records: Sequence[StepRecord], arrivals: Sequence[float] = ()
+) -> dict[str, float | int | None]:
     """For a report: compute of each frame, late frames, evaluations, and the longest latency of a command.
 
     The latency of a command runs from its arrival to the due time of the first frame that it could still change.
     """
     each = np.repeat([1000 * r.seconds / r.frames for r in records], [r.frames for r in records])
     count = sum(record.frames for record in records)
-    latencies = [seen - at for at in arrivals if (seen := _first_changed(records, at)) is not None]
+    latencies = [seen - at for at in arrivals if (seen := _find_first_affected_due(records, at)) is not None]
     return {
         "frame_ms_p50": float(np.percentile(each, 50)) if count else None,
         "frame_ms_p99": float(np.percentile(each, 99)) if count else None,
@@ -254,7 +256,7 @@ def timing(records: Sequence[StepRecord], arrivals: Sequence[float] = ()) -> dic
     }
 
 
-def _first_changed(records: Sequence[StepRecord], arrival: float) -> float | None:
+def _find_first_affected_due(records: Sequence[StepRecord], arrival: float) -> float | None:
     return next((record.due for record in records if record.asked >= arrival - 1e-9), None)
 
 

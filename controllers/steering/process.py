@@ -18,27 +18,27 @@ from typing import Any
 
 import numpy as np
 
-from controllers.steering.process_worker import RemoteRequest, work
+from controllers.steering.process_worker import CharacterRequest, run_worker
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Command
-from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 
-__all__ = ["Remote", "RemoteRequest"]
+__all__ = ["CharacterProcess", "CharacterRequest"]
 
 _READY_SECONDS = 120.0
-_MOST_WAITING = 3000  # steps that are kept for somebody who does not look: five minutes
-_GONE = "a character's process ended by itself"
+_MAX_QUEUED_STEPS = 3000  # steps that are kept for somebody who does not look: five minutes
+_PROCESS_ENDED = "a character's process ended by itself"
 
 
-class Remote:
+class CharacterProcess:
     """A LiveCharacter (mapctl.runtime.live_protocol) in a process of its own."""
 
     skeleton: Skeleton = CANONICAL
 
-    def __init__(self, request: RemoteRequest):
+    def __init__(self, request: CharacterRequest):
         """Start it; several start at once if all are made before the first is waited for."""
         self._request = request
         self._start()
@@ -73,9 +73,9 @@ class Remote:
         else:
             self._send("reset")
 
-    def poll(self) -> list[Delivered]:
+    def poll(self) -> list[FrameChunk]:
         """See LiveCharacter."""
-        failed, found = self._failed, list[Delivered]()  # in this order: what came before the end is kept
+        failed, found = self._failed, list[FrameChunk]()  # in this order: what came before the end is kept
         while self._delivered:
             found.append(self._delivered.popleft())
         if failed and not found:
@@ -101,16 +101,16 @@ class Remote:
 
     def _start(self) -> None:
         self._ours, theirs = multiprocessing.Pipe()
-        self._process = spawn(work, theirs, self._request)
+        self._process = spawn(run_worker, theirs, self._request)
         theirs.close()
-        self._delivered: deque[Delivered] = deque(maxlen=_MOST_WAITING)
+        self._delivered: deque[FrameChunk] = deque(maxlen=_MAX_QUEUED_STEPS)
         self._orders: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
         self._ready, self._failed = threading.Event(), ""
         # A full pipe would hold up the character, so it is emptied whether or not somebody looks; and whoever gives
         # orders is not held up by a character that does not read them.
         self._receiver = threading.Thread(target=self._receive, daemon=True)
         self._receiver.start()
-        threading.Thread(target=_post, args=(self._ours, self._orders), daemon=True).start()
+        threading.Thread(target=_send_orders, args=(self._ours, self._orders), daemon=True).start()
 
     def _send(self, *message: Any) -> None:
         self._orders.put(message)
@@ -125,11 +125,11 @@ class Remote:
                     self._failed = content
                 self._ready.set()
         except (EOFError, OSError):
-            self._failed = self._failed or _GONE
+            self._failed = self._failed or _PROCESS_ENDED
             self._ready.set()
 
 
-def _post(ours: Connection, orders: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
+def _send_orders(ours: Connection, orders: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
     """Send what is ordered, until None or the end of the other side, which the receiver notices."""
     with suppress(OSError):
         while (message := orders.get()) is not None:

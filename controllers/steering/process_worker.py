@@ -12,20 +12,20 @@ from typing import Any
 import torch
 
 from controllers.steering import steer
-from controllers.steering.autopilot import Pilot
-from controllers.steering.loop import steps
+from controllers.steering.autopilot import Autopilot
+from controllers.steering.loop import iterate_steps
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command
-from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.live_protocol import FrameChunk
 
-_WARM_UP = 3  # steps before the clock starts, in which what is loaded on first use is loaded
+_WARM_UP_STEPS = 3  # steps before the clock starts, in which what is loaded on first use is loaded
 
 
 @dataclass(frozen=True)
-class RemoteRequest:
+class CharacterRequest:
     """Who is to be steered."""
 
     load: Callable[[], Any]
@@ -40,16 +40,16 @@ class RemoteRequest:
     """Sigmas, lengths and effort."""
 
 
-class Closed(Exception):
+class ParentClosed(Exception):
     """The other side wants the end, or is gone."""
 
 
-class Desk:
+class ProcessClock:
     """Clock and Display of the character's process: it reads orders while it waits, and sends frames."""
 
     real = True
 
-    def __init__(self, connection: Connection, pilot: Pilot, prior: Any):
+    def __init__(self, connection: Connection, pilot: Autopilot, prior: Any):
         self._connection, self._pilot, self._prior = connection, pilot, prior
         self.again = False
         self._began = 0.0  # when the stream's second 0 is
@@ -67,7 +67,7 @@ class Desk:
         while True:
             left = None if self._paused_since is not None else max(0.0, seconds - self.now())
             if self._connection.poll(left):
-                self._obey()
+                self._handle_order()
             elif left is not None:
                 return
 
@@ -81,7 +81,7 @@ class Desk:
         self._pilot.show(frames, due)
         at = self._began + due + self._shift
         spare = at - time.perf_counter() - self._held
-        self._connection.send(("frames", _plain(frames, due, at=at, spare=spare, notes=tuple(self._notes))))
+        self._connection.send(("frames", _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes))))
         self._held = 0.0
         self._notes.clear()
 
@@ -89,29 +89,29 @@ class Desk:
         """Show the first pose, from which on the stream's seconds count."""
         self.again = False
         lead = state.settings.commit / PRIOR_FPS
-        self._began = self.now() - state.frames / PRIOR_FPS + lead  # as controllers.steering.loop.steps has it
+        self._began = self.now() - state.frames / PRIOR_FPS + lead  # as controllers.steering.loop.iterate_steps has it
         self.show(frames, 0.0)
 
-    def _obey(self) -> None:
+    def _handle_order(self) -> None:
         try:
             word, *content = self._connection.recv()
         except EOFError:
-            raise Closed from None
+            raise ParentClosed from None
         if word == "close":
-            raise Closed
+            raise ParentClosed
         try:
-            self._do(word, *content)
+            self._execute_order(word, *content)
         except MapctlError as error:  # an order that cannot be; the one before it holds
             self._notes.append(str(error))
 
-    def _do(self, word: str, *content: Any) -> None:
+    def _execute_order(self, word: str, *content: Any) -> None:
         if word == "reset":
             self.again = True
         elif word == "pause":
             self._pause(*content)
         elif word == "walk":
             points, speed = content
-            self._pilot.walk(curves.through(points), min(speed, self._prior.abilities.fastest_asked))
+            self._pilot.walk(curves.through(points), min(speed, self._prior.abilities.max_steering_speed))
         else:
             command, notes = steer.accept(self._prior, *content)
             self._notes += notes
@@ -125,13 +125,15 @@ class Desk:
             self._paused_since = None
 
 
-def work(connection: Connection, request: RemoteRequest) -> None:
+def run_worker(connection: Connection, request: CharacterRequest) -> None:
     """Steer until the other side wants the end; what else ends it is told to the other side, in a line."""
     torch.set_num_threads(1)
-    with suppress(Closed, BrokenPipeError):
+    with suppress(ParentClosed, BrokenPipeError):
         try:
-            _steer(connection, request)
-        except Closed:  # wanted: nobody is to be told that anything failed, least of all who is started in its place
+            _run_character(connection, request)
+        except (
+            ParentClosed
+        ):  # wanted: nobody is to be told that anything failed, least of all who is started in its place
             return
         except MapctlError as error:
             connection.send(("failed", str(error)))
@@ -141,34 +143,36 @@ def work(connection: Connection, request: RemoteRequest) -> None:
             connection.send(("failed", f"a character's process ended: {what} ({last.name}, line {last.lineno})"))
 
 
-def _steer(connection: Connection, request: RemoteRequest) -> None:
+def _run_character(connection: Connection, request: CharacterRequest) -> None:
     prior, generator = request.load(), torch.Generator().manual_seed(request.seed)
     first, _ = steer.accept(prior, request.first)
-    pilot = Pilot(first, request.settings.limits)
-    desk = Desk(connection, pilot, prior)
+    pilot = Autopilot(first, request.settings.limits)
+    desk = ProcessClock(connection, pilot, prior)
     for number in itertools.count():
         state, pose = steer.begin(prior, first, generator=generator, at=request.at, settings=request.settings)
         if number == 0:
-            for _ in range(_WARM_UP):
+            for _ in range(_WARM_UP_STEPS):
                 steer.step(state, first)
             connection.send(("ready", None))
         desk.begin(state, pose)
-        for _ in steps(state, pilot, [desk], clock=desk):
+        for _ in iterate_steps(state, pilot, [desk], clock=desk):
             if desk.again:
                 break
         first = pilot.at(desk.now())
 
 
-def _plain(frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]) -> Delivered:
+def _to_frame_chunk(
+    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]
+) -> FrameChunk:
     energies = {entry.name: float(entry.energy.mean()) for entry in frames.ledger.entries}
-    return Delivered(
+    return FrameChunk(
         at,
         seconds,
         frames.motion.root_position.numpy(),
         frames.motion.local_quat_xyzw.numpy(),
         frames.contacts.numpy(),
         frames.forecast.numpy(),
-        frames.wishes[-1].velocity,
+        frames.steering_targets[-1].velocity,
         energies,
         spare,
         frames.seconds,

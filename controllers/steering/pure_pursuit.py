@@ -1,6 +1,6 @@
 """Walk a curve live: a source that heads for the point of the curve a little ahead of where the character is.
 
-Pure pursuit, for curves that are not known in advance or change; `controllers.following.follow` is more exact where
+Pure pursuit, for curves that are not known in advance or change; `controllers.follow` is more exact where
 they are.
 """
 
@@ -12,10 +12,14 @@ from controllers.steering.steer import SteerFrames
 from mapctl.curves.curve import Curve
 from mapctl.intent.steering import Command
 
-_BACK, _ON, _POINTS = 0.1, 0.5, 61  # metres around the last nearest arc that are searched for the next, and how finely
+_SEARCH_BACKWARD, _SEARCH_FORWARD, _SEARCH_POINTS = (
+    0.1,
+    0.5,
+    61,
+)  # metres around the last nearest arc that are searched for the next, and how finely
 
 
-class Pursuit:
+class PurePursuit:
     """A Source, and the Display from which it knows where the character is. Closed curves go round and round."""
 
     def __init__(self, curve: Curve, *, speed: float, look_ahead: float = 0.5):
@@ -40,7 +44,9 @@ class Pursuit:
 
     def at(self, seconds: float) -> Command:
         """See Source."""
-        arcs = torch.linspace(self.arc - _BACK, self.arc + _ON, _POINTS, dtype=torch.float64).tolist()
+        arcs = torch.linspace(
+            self.arc - _SEARCH_BACKWARD, self.arc + _SEARCH_FORWARD, _SEARCH_POINTS, dtype=torch.float64
+        ).tolist()
         distances = torch.stack([(self._point(arc) - self.place).norm() for arc in arcs])
         self.arc = arcs[int(distances.argmin())]
         way = self._point(self.arc + self.look_ahead) - self.place

@@ -15,28 +15,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.common.character import Stature
-from controllers.common.initial_state import standing
+from controllers.common.character import Character
+from controllers.common.initial_state import start_from_state
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, ground_speed
-from mapctl.intent.steering import Command, Limits, Wish
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, decode, ground_speed
+from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
 from mapctl.motion import Motion
-from mapctl.problem.context import Context
+from mapctl.problem.context import WindowContext
 from mapctl.problem.ledger import Ledger
-from mapctl.problem.receding_horizon import Committed, WindowSettings, WindowSolver
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Outcome
-from mapctl.problem.warm_start import BestOf, SteeringKnots
-from mapctl.problem.window_solvers import LatentMethod, Method, SolvedWindow
+from mapctl.problem.warm_start import BestOfSamples, SteeringKnots
+from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
-from mapctl.terms import Footing, Noise, Steps, Term, Travel
+from mapctl.terms import FootContact, LatentPrior, RootVelocity, StepLength, Term
 
-_OWED = 60  # wishes of the past that are kept: more than the travel term looks back on
-_RECENT = 15  # frames of the half second whose wishes must not be missed by far
-_MOVING = 0.3  # m/s below which a direction of travel means nothing
-_KNOTS, _SPREAD = 7, 0.8  # of draws for who is stuck: noise of every feature, slow enough to make a step of it
-_NEAREST = 6  # starts nearest to the wanted speed, of which one is drawn
+_PAST_TARGET_FRAMES = 60  # wishes of the past that are kept: more than the travel term looks back on
+_RECENT_FRAMES = 15  # frames of the half second whose wishes must not be missed by far
+_MIN_TRAVEL_SPEED = 0.3  # m/s below which a direction of travel means nothing
+_KNOTS, _KNOT_SIGMA = 7, 0.8  # of draws for who is stuck: noise of every feature, slow enough to make a step of it
+_NEAREST_STARTS = 6  # starts nearest to the wanted speed, of which one is drawn
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,23 @@ class SteerSettings:
     """Of energy and gradient in a step, at most: what one core does in the time that three frames last."""
     least_evaluations: int = 6
     """In a step, however late it is: with fewer wishes are missed (docs/results.md). Never more than `evaluations`."""
-    limits: Limits = field(default_factory=Limits)
+    limits: SteeringLimits = field(default_factory=SteeringLimits)
     """How fast a wish may change."""
-    sigma_speed: float = Travel.sigma_speed
+    sigma_speed: float = RootVelocity.sigma_speed
     """Along the wanted velocity, m/s."""
-    sigma_direction: float = Travel.sigma_direction
+    sigma_direction: float = RootVelocity.sigma_direction
     """Across it, radians."""
-    sigma_facing: float = Travel.sigma_facing
+    sigma_facing: float = RootVelocity.sigma_facing
     """Of the hips' heading, radians."""
-    sigma_step: float = Steps.sigma
+    sigma_step: float = StepLength.sigma
     """Of a wanted step length, metres."""
     stuck: float = 0.4
     """Speed, m/s, by which the last half second may miss its wish; beyond it feet are first let off the ground."""
-    draws: int = 12
+    random_starts: int = 12
     """Random beginnings, tried all at once beside the evaluations, of which the best is searched from then."""
-    footing: Footing = field(default_factory=Footing)
+    footing: FootContact = field(default_factory=FootContact)
     """Planted feet."""
-    noise: Noise = field(default_factory=lambda: Noise(sigma=2.0))
+    noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
     """The prior, as in following a curve."""
 
     def __post_init__(self):
@@ -76,7 +76,7 @@ class SteerSettings:
                 f"steering needs 1 <= commit < horizon, evaluations >= 1 and least_evaluations >= 0, got {self}"
             )
 
-    def seen_by(self, person: Stature) -> "SteerSettings":
+    def scaled_to(self, person: Character) -> "SteerSettings":
         """The same for somebody of this size, in metres of the prior's size."""
         if person.scale == 1.0:
             return self
@@ -92,13 +92,13 @@ class SteerState:
     """The density."""
     settings: SteerSettings
     """The same in every step, in metres of the prior's size."""
-    person: Stature
+    person: Character
     """Bones of the character, and how long its legs are beside the prior's."""
-    committed: Committed
+    committed: CommittedFrames
     """The end of what was delivered."""
-    wish: Wish
+    wish: SteeringTarget
     """Of the last delivered frame, in the prior's size."""
-    owed: Float[Tensor, "past 2"]
+    past_targets: Float[Tensor, "past 2"]
     """Wanted velocities of the last delivered frames, oldest first, m/s in the prior's size."""
     frames: int = 1
     """Delivered so far, the first pose among them."""
@@ -112,7 +112,7 @@ class SteerFrames:
     """The new frames, at PRIOR_FPS, where they are in the world."""
     contacts: Float[Tensor, "frames 2"]
     """Left and right toe planted, 1 or 0."""
-    wishes: tuple[Wish, ...]
+    steering_targets: tuple[SteeringTarget, ...]
     """Of those frames."""
     forecast: Float[Tensor, "ahead joints 3"]
     """World joint positions of the frames that would come next, metres; what the next command changes."""
@@ -143,20 +143,20 @@ def begin(
     `settings.footing`; commands, limits and what is delivered are in its metres.
     """
     chosen = settings or SteerSettings()
-    person = Stature(skeleton, chosen.footing.rest_height)
+    person = Character(skeleton, chosen.footing.rest_height)
     command = person.command(command)
-    starts = (_told(prior, command.told) if command.told else prior).starts
-    near = (starts.speed - command.speed).abs().argsort()[:_NEAREST]
+    starts = (_condition_prior(prior, command.told) if command.told else prior).starts
+    near = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
     there = torch.tensor(at) if person.scale == 1.0 else torch.tensor(at) / person.scale
-    start = standing(state, Place(there, torch.tensor(command.heading)), person.small)
+    start = start_from_state(state, GroundPose(there, torch.tensor(command.heading)), person.small)
     first = start.committed.features
     motion = person.motion(decode(first, start.before_first, skeleton=person.small))
-    wish = Wish(float(ground_speed(first)[0]), command.heading, command.heading)
-    delivered = (_in_their_metres(wish, person),)
+    wish = SteeringTarget(float(ground_speed(first)[0]), command.heading, command.heading)
+    delivered = (_scale_target_to_character(wish, person),)
     frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), delivered, start.committed.joints_world[:0], Ledger())
-    settings = chosen.seen_by(person)
+    settings = chosen.scaled_to(person)
     return SteerState(prior, settings, person, start.committed, wish, torch.tensor([wish.velocity])), frames
 
 
@@ -166,8 +166,8 @@ def accept(prior: Any, command: Command) -> tuple[Command, list[str]]:
     RequestError where it tells the prior what it does not know.
     """
     if command.told:
-        _told(prior, command.told)
-    return command.within(prior.abilities.fastest_asked)
+        _condition_prior(prior, command.told)
+    return command.within(prior.abilities.max_steering_speed)
 
 
 def step(state: SteerState, command: Command, *, seconds: float | None = None) -> tuple[SteerState, SteerFrames]:
@@ -179,19 +179,21 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     began = time.perf_counter()
     settings, person = state.settings, state.person
     command = person.command(command)
-    stuck = _behind(state) > settings.stuck
+    stuck = _velocity_error(state) > settings.stuck
     if stuck:
-        state = _from_here(state)
+        state = _restart_target(state)
     wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
-    told = replace(state, prior=_told(state.prior, command.told)) if command.told else state
-    terms = _terms(state, wishes, command.step_length)
-    done, outcome = _solve(told, terms, seconds, free=stuck)
+    told = replace(state, prior=_condition_prior(state.prior, command.told)) if command.told else state
+    terms = _build_steering_terms(state, wishes, command.step_length)
+    done, outcome = _solve_step(told, terms, seconds, free=stuck)
     if outcome is not Outcome.DONE:
         unsearched = replace(settings, least_evaluations=0)
         afresh = replace(
-            told, settings=unsearched, committed=replace(state.committed, tail=state.committed.tail[:0], forecast=None)
+            told,
+            settings=unsearched,
+            committed=replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None),
         )
-        done, _ = _solve(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
+        done, _ = _solve_step(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
     motion = person.motion(decode(new, state.committed.place, skeleton=person.small))
     record, own = done.windows[-1], tuple(wishes[: settings.commit])
@@ -199,7 +201,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations" if short else ""
     forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
     forecast = forecast if person.scale == 1.0 else forecast * person.scale
-    delivered = tuple(_in_their_metres(wish, person) for wish in own)
+    delivered = tuple(_scale_target_to_character(wish, person) for wish in own)
     frames = SteerFrames(
         motion,
         LAYOUT.pick(new, "contacts"),
@@ -210,112 +212,118 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         time.perf_counter() - began,
         note,
     )
-    owed = torch.cat([state.owed, torch.tensor([wish.velocity for wish in own])])[-_OWED:]
+    owed = torch.cat([state.past_targets, torch.tensor([wish.velocity for wish in own])])[-_PAST_TARGET_FRAMES:]
     kept = replace(done, features=new, ledger=Ledger(), windows=())
-    following = replace(state, committed=kept, wish=own[-1], owed=owed, frames=state.frames + len(new))
+    following = replace(state, committed=kept, wish=own[-1], past_targets=owed, frames=state.frames + len(new))
     return following, frames
 
 
-def _in_their_metres(wish: Wish, person: Stature) -> Wish:
+def _scale_target_to_character(wish: SteeringTarget, person: Character) -> SteeringTarget:
     return wish if person.scale == 1.0 else replace(wish, speed=wish.speed * person.scale)
 
 
 @lru_cache(maxsize=64)
-def _told(prior: Any, labels: tuple[str, ...]) -> Any:
+def _condition_prior(prior: Any, labels: tuple[str, ...]) -> Any:
     """The prior that has been told; kept, since it takes as long to make as a step may last."""
     return prior.told(labels)
 
 
-def _solve(state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool) -> tuple[Committed, Outcome]:
+def _solve_step(
+    state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool
+) -> tuple[CommittedFrames, Outcome]:
     settings = state.settings
-    method: Method = _bounded(settings.evaluations, settings.least_evaluations, seconds)
+    method: SingleWindowSolver = _limit_evaluations(settings.evaluations, settings.least_evaluations, seconds)
     if free:
-        method = _step_first(state, terms, seconds)
-    window = WindowSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
-    solver = WindowSolver(state.prior, window, state.person.small, method=method)
+        method = _relax_footing_first(state, terms, seconds)
+    window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
+    solver = RecedingHorizonSolver(state.prior, window, state.person.small, method=method)
     frames = len(state.committed.features) + settings.commit
     return solver.solve(
         state.committed, lambda first, count: terms, frames, generator=torch.Generator().manual_seed(state.frames)
     )
 
 
-def _bounded(evaluations: int, least: int, seconds: float | None) -> LatentMethod:
+def _limit_evaluations(evaluations: int, least: int, seconds: float | None) -> LatentNoiseSolver:
     """One round of so many evaluations at most, fewer by then, but the least in any case."""
     most = max(1, evaluations)
     budget = Budget(most, seconds, min(least, most))
-    return LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
+    return LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
 
 
-def _step_first(state: SteerState, terms: Sequence[Term], seconds: float | None) -> "_StepFirst":
+def _relax_footing_first(state: SteerState, terms: Sequence[Term], seconds: float | None) -> "_RelaxedFootingFirst":
     """The search for who is stuck: the draws are looked at in any case, the evaluations are halved."""
     settings, soon = state.settings, seconds and seconds / 2
-    half = _bounded(settings.evaluations // 2, max(1, settings.least_evaluations // 2), soon)
+    half = _limit_evaluations(settings.evaluations // 2, max(1, settings.least_evaluations // 2), soon)
     few, least = half.budget.evaluations or 1, half.budget.least
-    draws = BestOf(settings.draws, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _SPREAD))
-    bold = replace(half, proposal=draws, budget=Budget(settings.draws + few, soon, settings.draws + least))
-    return _StepFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
+    draws = BestOfSamples(settings.random_starts, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA))
+    bold = replace(
+        half, proposal=draws, budget=Budget(settings.random_starts + few, soon, settings.random_starts + least)
+    )
+    return _RelaxedFootingFirst(bold, half, [term for term in terms if term.name != settings.footing.name])
 
 
 @dataclass(frozen=True)
-class _StepFirst:
+class _RelaxedFootingFirst:
     """A Method that spends half on the wishes without footing, from the best of some draws, and half on all.
 
     Who stands has both feet planted, by contact bits that stay while a window is solved: footing then holds what the
     wish would move. The search without it finds a step, and along that step the prior says anew which feet stand.
     """
 
-    bold: LatentMethod
-    half: LatentMethod
-    loose: Sequence[Term]
+    relaxed_method: LatentNoiseSolver
+    half: LatentNoiseSolver
+    relaxed_terms: Sequence[Term]
 
     def __call__(
         self,
-        context: Context,
+        context: WindowContext,
         terms: Sequence[Term],
         tail: Tensor,
         generator: torch.Generator,
         *,
         seconds: float = math.inf,
     ) -> SolvedWindow:
-        first = self.bold(context, self.loose, tail, generator, seconds=seconds / 2)
+        first = self.relaxed_method(context, self.relaxed_terms, tail, generator, seconds=seconds / 2)
         second = self.half(context, terms, first.carry, generator, seconds=seconds / 2)
         return replace(second, evaluations=first.evaluations + second.evaluations)
 
 
-def _behind(state: SteerState) -> float:
+def _velocity_error(state: SteerState) -> float:
     """How far the mean velocity of the last half second missed its wishes, m/s."""
-    if min(len(state.committed.joints_world) - 1, len(state.owed)) < _RECENT:
+    if min(len(state.committed.joints_world) - 1, len(state.past_targets)) < _RECENT_FRAMES:
         return 0.0
-    return float((_recent_velocity(state) - state.owed[-_RECENT:].mean(0)).norm())
+    return float((_recent_velocity(state) - state.past_targets[-_RECENT_FRAMES:].mean(0)).norm())
 
 
 def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
     """Of the hips over the ground, mean of the last half second, m/s."""
-    past = state.committed.joints_world[-_RECENT - 1 :, 0, ::2]
-    return (past[-1] - past[0]) * PRIOR_FPS / _RECENT
+    past = state.committed.joints_world[-_RECENT_FRAMES - 1 :, 0, ::2]
+    return (past[-1] - past[0]) * PRIOR_FPS / _RECENT_FRAMES
 
 
-def _from_here(state: SteerState) -> SteerState:
+def _restart_target(state: SteerState) -> SteerState:
     """The state with a wish that begins anew from how the character moves and faces, and nothing owed.
 
     A wish that ran ahead (a walk off to the side of who stands and faces elsewhere) leads no search there.
     """
     velocity, facing = _recent_velocity(state), float(state.committed.place.heading)
     speed = float(velocity.norm())
-    heading = math.atan2(*velocity.tolist()) if speed > _MOVING else facing
-    wish = Wish(speed, heading, facing)
-    return replace(state, wish=wish, owed=torch.tensor([wish.velocity]).expand(_RECENT, 2))
+    heading = math.atan2(*velocity.tolist()) if speed > _MIN_TRAVEL_SPEED else facing
+    wish = SteeringTarget(speed, heading, facing)
+    return replace(state, wish=wish, past_targets=torch.tensor([wish.velocity]).expand(_RECENT_FRAMES, 2))
 
 
-def _terms(state: SteerState, wishes: Sequence[Wish], step_length: float | None) -> Sequence[Term]:
+def _build_steering_terms(
+    state: SteerState, wishes: Sequence[SteeringTarget], step_length: float | None
+) -> Sequence[Term]:
     settings = state.settings
-    travel = Travel(
+    travel = RootVelocity(
         torch.tensor([wish.velocity for wish in wishes]),
-        state.owed,
+        state.past_targets,
         facing=torch.tensor([wish.facing for wish in wishes]),
         sigma_speed=settings.sigma_speed,
         sigma_direction=settings.sigma_direction,
         sigma_facing=settings.sigma_facing,
     )
     terms = settings.noise, travel, settings.footing
-    return (*terms, Steps(step_length, sigma=settings.sigma_step)) if step_length else terms
+    return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms

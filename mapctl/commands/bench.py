@@ -10,12 +10,12 @@ from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.tables import print_records
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
-    from controllers.benchmarks.denoising import Clip
+    from controllers.benchmarks.denoising import CleanClip
     from mapctl.motion import Motion
 
 
@@ -76,54 +76,61 @@ class Bench:
 
     def run(self) -> int:
         """Measure and print."""
-        compute_on_one()
+        use_single_thread()
         from mapctl import report
 
         others = {
-            "denoise": self._denoise,
-            "infill": self._infill,
-            "tween": self._tween,
+            "denoise": self._bench_denoise,
+            "infill": self._bench_infill,
+            "tween": self._bench_tween,
             "timing": self._timing,
-            "gaps": self._gaps,
+            "gaps": self._bench_gaps,
         }
-        rows = others.get(self.what, self._of_a_prior)()
+        rows = others.get(self.what, self._bench_prior)()
         if self.json:
-            print(report.as_json({"bench": self.what, "versions": report.versions(), "rows": rows}), end="")
+            print(report.to_json({"bench": self.what, "versions": report.package_versions(), "rows": rows}), end="")
         else:
             print_records(rows, title=f"{self.what}, one thread")
         return 0
 
-    def _of_a_prior(self) -> list[dict[str, Any]]:
+    def _bench_prior(self) -> list[dict[str, Any]]:
         import priors
         from controllers.benchmarks import solver
 
         name = self.prior or ("locomotion-live" if self.what in ("steer", "live") else "locomotion")
         prior = priors.load(name)
         if self.what == "generation":
-            return self._generation(prior, name)
+            return self._bench_generation(prior, name)
         if self.what == "steer":
-            from controllers.benchmarks.steering import SteeringSettings, pursued, steering
+            from controllers.benchmarks.steering import SteeringBenchmarkSettings, benchmark_pursuit, benchmark_steering
 
-            return [*steering(prior, SteeringSettings(commands=self.count)), *pursued(prior)]
+            return [
+                *benchmark_steering(prior, SteeringBenchmarkSettings(commands=self.count)),
+                *benchmark_pursuit(prior),
+            ]
         if self.what == "live":
-            return self._live(name)
-        return {"speed": solver.speed, "ablation": solver.ablation, "free-run": solver.free_run}[self.what](prior)
+            return self._bench_live(name)
+        return {
+            "speed": solver.benchmark_speed,
+            "ablation": solver.benchmark_ablation,
+            "free-run": solver.benchmark_free_run,
+        }[self.what](prior)
 
-    def _denoise(self) -> list[dict[str, Any]]:
+    def _bench_denoise(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.benchmarks.denoising import table
+        from controllers.benchmarks.denoising import benchmark_denoising
 
         denoiser = priors.load_denoiser(self.denoiser)
         infiller = priors.load_infiller(self.infiller)
-        clips = self._clips_by_kind(denoiser.card)
+        clips = self._load_clips_by_kind(denoiser.card)
         densities = priors.load_choice(self.prior)
-        with bar("denoising") as progress:
-            return table(clips, denoiser, infiller=infiller, densities=densities, progress=progress)
+        with show_progress("denoising") as progress:
+            return benchmark_denoising(clips, denoiser, infiller=infiller, densities=densities, progress=progress)
 
-    def _infill(self) -> list[dict[str, Any]]:
+    def _bench_infill(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.benchmarks.infilling import by_kind, table
-        from controllers.benchmarks.lost_joints import lost_joints
+        from controllers.benchmarks.infilling import benchmark_infilling, benchmark_infilling_by_kind
+        from controllers.benchmarks.lost_joints import benchmark_missing_joints
         from mapctl import retarget
 
         infiller = priors.load_infiller(self.infiller)
@@ -134,60 +141,60 @@ class Bench:
             # Two of one kind are told apart by their names.
             networks[f"{architecture} {name}" if architecture in networks else architecture] = other
         kinds: dict[str, list[Motion]] = {}
-        for clip in self._clips_by_kind(infiller.card):
+        for clip in self._load_clips_by_kind(infiller.card):
             kinds.setdefault(clip.kind, []).append(retarget.to_canonical(clip.motion)[0])
         clips = [clip for found in kinds.values() for clip in found]
-        with bar("filling") as progress:
-            rows = table(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
-        return [*rows, *by_kind(kinds, infiller), *lost_joints(kinds, infiller)]
+        with show_progress("filling") as progress:
+            rows = benchmark_infilling(clips, networks, ours=infiller.card.config["architecture"], progress=progress)
+        return [*rows, *benchmark_infilling_by_kind(kinds, infiller), *benchmark_missing_joints(kinds, infiller)]
 
-    def _tween(self) -> list[dict[str, Any]]:
-        from controllers.benchmarks.tweening import table
+    def _bench_tween(self) -> list[dict[str, Any]]:
+        from controllers.benchmarks.tweening import benchmark_tweening
 
-        return self._of_kinds(table)
+        return self._bench_by_kind(benchmark_tweening)
 
-    def _gaps(self) -> list[dict[str, Any]]:
-        from controllers.benchmarks.gaps import table
+    def _bench_gaps(self) -> list[dict[str, Any]]:
+        from controllers.benchmarks.gaps import benchmark_gaps
 
-        return self._of_kinds(table)
+        return self._bench_by_kind(benchmark_gaps)
 
-    def _of_kinds(self, table: "Callable[..., list[dict[str, Any]]]") -> list[dict[str, Any]]:
+    def _bench_by_kind(self, table: "Callable[..., list[dict[str, Any]]]") -> list[dict[str, Any]]:
         """A table over canonical clips by kind, of the infiller and densities."""
         import priors
         from mapctl import retarget
         from mapctl.features import PRIOR_FPS
 
         infiller, kinds = priors.load_infiller(self.infiller), {}
-        for clip in self._clips_by_kind(infiller.card):
+        for clip in self._load_clips_by_kind(infiller.card):
             kinds.setdefault(clip.kind, []).append(retarget.to_canonical(clip.motion)[0].resample(PRIOR_FPS))
-        with bar(self.what) as progress:
+        with show_progress(self.what) as progress:
             return table(kinds, infiller, priors.load_choice(self.prior or "auto"), progress=progress)
 
     def _timing(self) -> list[dict[str, Any]]:
         import priors
-        from controllers.benchmarks.keyframe_timing import timing
+        from controllers.benchmarks.keyframe_timing import benchmark_keyframe_timing
         from mapctl import retarget
 
-        clips = self._clips_by_kind(priors.load_infiller(self.infiller).card)
-        return timing([retarget.to_canonical(clip.motion)[0] for clip in clips])
+        clips = self._load_clips_by_kind(priors.load_infiller(self.infiller).card)
+        return benchmark_keyframe_timing([retarget.to_canonical(clip.motion)[0] for clip in clips])
 
-    def _clips_by_kind(self, card: Any) -> "list[Clip]":
+    def _load_clips_by_kind(self, card: Any) -> "list[CleanClip]":
         """Unseen clips, as many of each kind, without their T-poses."""
-        from controllers.benchmarks.denoising import KINDS, Clip, kind_of, shortened
+        from controllers.benchmarks.denoising import CLIP_KINDS, CleanClip, classify_clip, trim_clip
         from controllers.denoising.denoise import begins_with_tpose
         from mapctl import formats
 
         paths: dict[str, list[Path]] = {}
-        for path in self._held_out(card):
-            paths.setdefault(kind_of(path.relative_to(self.data or "").as_posix()), []).append(path)
+        for path in self._find_held_out(card):
+            paths.setdefault(classify_clip(path.relative_to(self.data or "").as_posix()), []).append(path)
         clips = []
-        for kind in KINDS:
-            for path in paths.get(kind, [])[: max(1, self.count // len(KINDS))]:
+        for kind in CLIP_KINDS:
+            for path in paths.get(kind, [])[: max(1, self.count // len(CLIP_KINDS))]:
                 motion = formats.load(path)
-                clips.append(Clip(kind, shortened(motion, skip_first=begins_with_tpose(motion))))
+                clips.append(CleanClip(kind, trim_clip(motion, skip_first=begins_with_tpose(motion))))
         return clips
 
-    def _held_out(self, card: Any) -> list[Path]:
+    def _find_held_out(self, card: Any) -> list[Path]:
         """The clips that were kept from training; RequestError where they are not all there."""
         if self.data is None:
             raise RequestError(f"bench {self.what} compares with mocap: name the training data's folder with --data")
@@ -198,9 +205,9 @@ class Bench:
             raise RequestError(f"{self.data} does not hold the clips kept from training: {lost}")
         return paths
 
-    def _live(self, name: str) -> list[dict[str, Any]]:
+    def _bench_live(self, name: str) -> list[dict[str, Any]]:
         import priors
-        from controllers.benchmarks.live import live
+        from controllers.benchmarks.live import benchmark_live
 
         if not 0 < self.minutes <= 24 * 60:
             raise RequestError(f"--minutes must be more than 0 and at most a day, got {self.minutes:g}")
@@ -212,18 +219,20 @@ class Bench:
             raise RequestError(f"--characters must be numbers from 1 to 64, as 1,2,4; got {self.characters!r}")
         rows = []
         for count in counts:
-            with bar(f"{count} at once") as progress:
+            with show_progress(f"{count} at once") as progress:
                 load = functools.partial(priors.load, name)
-                rows.append(live(load, characters=count, minutes=self.minutes, progress=progress))
+                rows.append(benchmark_live(load, characters=count, minutes=self.minutes, progress=progress))
         return rows
 
-    def _generation(self, prior: Any, name: str) -> list[dict[str, Any]]:
+    def _bench_generation(self, prior: Any, name: str) -> list[dict[str, Any]]:
         import priors
-        from controllers.benchmarks.generation import GenerationSettings, generation
+        from controllers.benchmarks.generation import GenerationBenchmarkSettings, benchmark_generation
         from mapctl import formats, retarget
         from mapctl.features import PRIOR_FPS
 
-        paths = self._held_out(prior.card)
+        paths = self._find_held_out(prior.card)
         mocap = [retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS) for path in paths]
         mocap = [clip for clip in mocap if clip.num_frames > PRIOR_FPS]
-        return generation(prior, priors.refiner_of(name, self.refiner), mocap, GenerationSettings(count=self.count))
+        return benchmark_generation(
+            prior, priors.refiner_of(name, self.refiner), mocap, GenerationBenchmarkSettings(count=self.count)
+        )

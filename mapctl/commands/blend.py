@@ -8,7 +8,7 @@ from tyro.conf import arg
 
 from mapctl.commands.shared import options, results
 from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 
 
 @dataclass(frozen=True)
@@ -43,23 +43,23 @@ class Blend:
 
     def run(self) -> int:
         """Check everything, blend, write, tell."""
-        compute_on_one()
+        use_single_thread()
         from mapctl import formats
 
-        results.check(self.out, self.video, given=(self.source, self.other))
+        results.check_destinations(self.out, self.video, given=(self.source, self.other))
         rig = options.read_rig(self.rig)
         motion, other = options.read_motion(self.source, rig), options.read_motion(self.other, None)
         import priors
-        from controllers.inbetweening.blend import Borrowed, blend
+        from controllers.inbetweening.blend import LimbTransfer, blend
         from controllers.inbetweening.pipeline import InfillSettings
 
         start, stop = parse_range(self.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
         names = tuple(name.strip() for name in self.joints.split(","))
-        borrowed = Borrowed(names, start, stop, parse_frame(self.at, fps=float(motion.fps)), margin=self.margin)
+        borrowed = LimbTransfer(names, start, stop, parse_frame(self.at, fps=float(motion.fps)), margin=self.margin)
         settings = InfillSettings(method=self.method)
         done = blend(motion, other, borrowed, priors.load_infiller(self.infiller), settings=settings, rig=rig)
         formats.save(done.motion, self.out)
-        results.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
+        results.film_comparison(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             print("\n".join((f"{self.out}: {done.motion.num_frames} frames", *done.notes)))
         return 0

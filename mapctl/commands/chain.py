@@ -8,7 +8,7 @@ import tyro
 from tyro.conf import arg
 
 from mapctl.commands.shared import options, results
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
 
 
@@ -37,19 +37,19 @@ class Chain:
 
     def run(self) -> int:
         """Check everything, chain, write, tell."""
-        compute_on_one()
+        use_single_thread()
         options.check_seed(self.seed)
         from mapctl import formats
 
         results.check_method(self.method, infiller=self.infiller)
-        results.check(self.out, self.video, given=self.clips)
+        results.check_destinations(self.out, self.video, given=self.clips)
         import torch
 
         import priors
         from controllers.inbetweening.chain import ChainSettings, chain
         from controllers.inbetweening.pipeline import InfillSettings
 
-        settings = ChainSettings(piece=self.piece, gap=self._gap())
+        settings = ChainSettings(piece=self.piece, gap=self._parse_gap())
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         done = chain(
             [options.read_motion(path, None) for path in self.clips],
@@ -62,10 +62,10 @@ class Chain:
         formats.save(done.motion, self.out)
         if self.video is not None:
             from mapctl.retarget import to_canonical
-            from mapctl.runtime.progress import bar
+            from mapctl.runtime.progress import show_progress
             from scenes.film import film
 
-            with bar("filming", quiet=self.quiet) as progress:
+            with show_progress("filming", quiet=self.quiet) as progress:
                 film([(to_canonical(done.motion)[0], None)], self.video, progress=progress)
         if not self.quiet:
             filled = int(done.lost.frames.sum())
@@ -77,7 +77,7 @@ class Chain:
                 print(note)
         return 0
 
-    def _gap(self) -> tuple[int, int]:
+    def _parse_gap(self) -> tuple[int, int]:
         low, colon, high = self.gap.partition(":")
         if not (colon and low.isdecimal() and high.isdecimal()):
             raise RequestError(f"--gap is A:B, frames as in 50:100; got {self.gap!r}")

@@ -12,7 +12,7 @@ from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from mapctl.motion import Motion
-    from mapctl.retarget.carry import Carried
+    from mapctl.retarget.carry import RetargetedMotion
     from mapctl.retarget.rigs import Rig
 
 
@@ -47,7 +47,7 @@ class Convert:
         fps_in = None if self.fps_in is None else parse_fps(self.fps_in)
         motion, notes = options.read_motion(self.source, source_rig, fps=fps_in), ()
         if self.rig is not None:
-            carried = on_rig(motion, self.rig, source_rig)
+            carried = transfer_to_rig(motion, self.rig, source_rig)
             motion, notes = carried.motion, carried.notes
         if fps is not None:
             motion = motion.resample(fps)
@@ -70,7 +70,7 @@ def parse_fps(text: str) -> Fraction:
     return fps
 
 
-def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Carried":
+def transfer_to_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "RetargetedMotion":
     """The motion on the canonical joints, on a clip's skeleton in that clip's layout, or on a rig that is told; and
     what could not be kept.
 
@@ -79,10 +79,10 @@ def on_rig(motion: "Motion", rig: str, source_rig: "Rig | None" = None) -> "Carr
     (see mapctl.retarget.carry).
     """
     from mapctl import retarget
-    from mapctl.retarget.carry import Body, Carried, carry
+    from mapctl.retarget.carry import RetargetedMotion, RiggedCharacter, retarget_motion
 
     if rig == "canonical":
-        return Carried(retarget.to_canonical(motion, source_rig)[0])
-    body = Body.of(*options.read_figure(rig))[1]
-    carried = carry(motion, body, source_rig)
-    return Carried(body.on_rig(carried.motion), carried.notes)
+        return RetargetedMotion(retarget.to_canonical(motion, source_rig)[0])
+    body = RiggedCharacter.of(*options.read_rig_clip(rig))[1]
+    carried = retarget_motion(motion, body, source_rig)
+    return RetargetedMotion(body.on_rig(carried.motion), carried.notes)

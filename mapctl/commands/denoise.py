@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options, outputs, results
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
-    from controllers.denoising.result import Denoised
+    from controllers.denoising.result import DenoiseResult
 
-_NOT_ALL_HOLDS = 3
-_MOST_NAMED = 6
-_DOUBTED = 0.5  # of a density's weight
-_DELAY = 0.2  # seconds
+_EXIT_NOT_SATISFIED = 3
+_MAX_NAMED = 6
+_LOW_WEIGHT = 0.5  # of a density's weight
+_DEFAULT_DELAY = 0.2  # seconds
 
 
 @dataclass(frozen=True)
@@ -68,49 +68,52 @@ class Denoise:
 
     def run(self) -> int:
         """Check everything, denoise, write, tell."""
-        compute_on_one()
+        use_single_thread()
         if self.source.is_dir():
             from mapctl.commands.shared import denoise_folder
 
             return denoise_folder.run(self)
         self._check()
-        done = self._denoised()
+        done = self._run_denoising()
         from mapctl import formats
 
         formats.save(done.motion, self.out)
         if self.report is not None:
             from mapctl import report as reports
 
-            reports.write(self.as_report(done), self.report)
-        self._pictures(done)
+            reports.write_report(self.as_report(done), self.report)
+        self._draw_pictures(done)
         if not self.quiet:
             self._tell(done)
-        lost = float(done.believed.mean()) < 0.5 and done.noise.max() > 0
-        return _NOT_ALL_HOLDS if self.strict and lost else 0
+        lost = float(done.proposal_share.mean()) < 0.5 and done.noise.max() > 0
+        return _EXIT_NOT_SATISFIED if self.strict and lost else 0
 
-    def as_report(self, done: "Denoised") -> dict[str, object]:
+    def as_report(self, done: "DenoiseResult") -> dict[str, object]:
         """The request, versions, and what the result says of itself."""
-        return results.report("denoise", self, done.motion, done.summary())
+        return results.build_report("denoise", self, done.motion, done.summary())
 
     def _check(self) -> None:
         for name, idle in (("cluster", self.cluster is None), ("again", not self.again), ("jobs", self.jobs == 1)):
             if not idle:
                 raise RequestError(f"--{name} is for folders; {self.source} is a file")
-        results.check(self.out, self.video, self.report, self.plot, given=(self.source,))
+        results.check_destinations(self.out, self.video, self.report, self.plot, given=(self.source,))
         outputs.check_plot(self.plot)
 
-    def _denoised(self) -> "Denoised":
+    def _run_denoising(self) -> "DenoiseResult":
         import priors
 
         settings, masks, rig = self.settings(), self._masks(), options.read_rig(self.rig)
         densities = priors.load_choice(self.prior)
-        denoiser, (motion, lost, _) = priors.load_denoiser(self.denoiser), options.read_lossy(self.source, rig)
+        denoiser, (motion, lost, _) = (
+            priors.load_denoiser(self.denoiser),
+            options.read_motion_with_gaps(self.source, rig),
+        )
         masks = (*masks, *lost)
-        with bar("denoising", quiet=self.quiet) as progress:
+        with show_progress("denoising", quiet=self.quiet) as progress:
             if self.causal:
                 from controllers.denoising.causal import denoise_causal
 
-                delay = _DELAY if self.delay is None else self.delay
+                delay = _DEFAULT_DELAY if self.delay is None else self.delay
                 return denoise_causal(
                     motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
                 )
@@ -135,27 +138,27 @@ class Denoise:
 
         return () if self.mask is None else load_masks(self.mask)
 
-    def _pictures(self, done: "Denoised") -> None:
+    def _draw_pictures(self, done: "DenoiseResult") -> None:
         if self.plot is not None:
             from scenes.plots.denoising import plot
 
             plot(done.capture, done.motion, self.plot, rig=done.rig)
-        results.film(done.capture, done.motion, self.video, rig=done.rig, quiet=self.quiet)
+        results.film_comparison(done.capture, done.motion, self.video, rig=done.rig, quiet=self.quiet)
 
-    def _tell(self, done: "Denoised") -> None:
+    def _tell(self, done: "DenoiseResult") -> None:
         summary = done.summary()
         moved = sum(summary["correction_cm"].values()) / len(summary["correction_cm"])
         print(
             f"{self.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
             f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame"
         )
-        for line in fault_lines(done):
+        for line in format_faults(done):
             print(line)
-        for note in (*done.notes, *density_lines(done)):
+        for note in (*done.notes, *format_densities(done)):
             print(note)
 
 
-def fault_lines(done: "Denoised") -> list[str]:
+def format_faults(done: "DenoiseResult") -> list[str]:
     """The faults in a few lines, a line a kind."""
     kinds: dict[str, dict[str, list]] = {}
     for fault in done.faults:
@@ -164,7 +167,7 @@ def fault_lines(done: "Denoised") -> list[str]:
     for kind, joints in kinds.items():
         worst = sorted(joints, key=lambda name: -max(fault.amount for fault in joints[name]))
         named = []
-        for name in worst[:_MOST_NAMED]:
+        for name in worst[:_MAX_NAMED]:
             found = joints[name]
             top = max(found, key=lambda fault: fault.amount)
             amount = f" {top.amount:.1f} {top.unit}" if top.unit else f" {sum(f.stop - f.start for f in found)} frames"
@@ -174,7 +177,7 @@ def fault_lines(done: "Denoised") -> list[str]:
     return lines
 
 
-def density_lines(done: "Denoised") -> list[str]:
+def format_densities(done: "DenoiseResult") -> list[str]:
     """Which densities counted, how likely the motion is under each, and where they were out of their depth."""
     if not done.stretches:
         return []
@@ -187,10 +190,10 @@ def density_lines(done: "Denoised") -> list[str]:
     whole = sum(frames.values())
     told = ", ".join(f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames)
     lines = [f"prior: {told} of {whole} frames"]
-    doubted = [part for part in done.stretches if part.weight < _DOUBTED]
+    doubted = [part for part in done.stretches if part.weight < _LOW_WEIGHT]
     if doubted:
-        places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MOST_NAMED])
-        rest = len(doubted) - _MOST_NAMED
+        places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MAX_NAMED])
+        rest = len(doubted) - _MAX_NAMED
         lines.append(
             f"prior out of its depth, so that it counts for less than half: frames {places}"
             + (f" and {rest} more windows" if rest > 0 else "")

@@ -7,12 +7,12 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import character, options, outputs
-from mapctl.commands.shared.path_walk import INTERRUPTED, Walk, as_follow, walk
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.path_walk import EXIT_INTERRUPTED, Walk, parse_follow, walk
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
-_NOT_ALL_HOLDS = 3
+_EXIT_NOT_SATISFIED = 3
 _SIZE = "1280x720"
 
 
@@ -52,29 +52,29 @@ class FollowCurve:
 
     def run(self) -> int:
         """Check everything, solve, write, tell. Ctrl-C ends the solve; what it has is written, without a film."""
-        compute_on_one()
+        use_single_thread()
         self._check()
-        request = as_follow(options.read_curve(self.curve, self.metres_per_unit), self.speed, self.seconds)
+        request = parse_follow(options.read_curve(self.curve, self.metres_per_unit), self.speed, self.seconds)
         import priors
 
-        person, prior = character.read(self.rig), priors.load(self.prior)
-        with bar("walking", quiet=self.quiet) as progress:
+        person, prior = character.read_character(self.rig), priors.load(self.prior)
+        with show_progress("walking", quiet=self.quiet) as progress:
             done = walk(prior, request, seed=self.seed, progress=progress, person=person)
         video = None if done.interrupted else self.video
         self._write(done, video)
         if not self.quiet:
-            files = ", ".join(map(str, options.given(self.out, video, self.report)))
+            files = ", ".join(map(str, options.collect_paths(self.out, video, self.report)))
             print("\n".join([*done.summary(), f"wrote     {files}"]))
         if done.interrupted:
-            return INTERRUPTED
-        return _NOT_ALL_HOLDS if self.strict and not done.solution.status.ok else 0
+            return EXIT_INTERRUPTED
+        return _EXIT_NOT_SATISFIED if self.strict and not done.solution.status.ok else 0
 
     def _check(self) -> None:
         from mapctl import formats
 
         options.check_seed(self.seed)
         formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.video, self.report))
+        outputs.check_files(options.collect_paths(self.out, self.video, self.report))
         for name in ("camera", "size"):
             if self.video is None and getattr(self, name) is not None:
                 raise RequestError(f"--{name} is of the film, and --video asks for none")
@@ -86,12 +86,12 @@ class FollowCurve:
 
         done.on_rig.save(self.out)
         if self.report is not None:
-            report.write(done.report(options.as_request("follow", self)), self.report)
+            report.write_report(done.report(options.describe_request("follow", self)), self.report)
         if video is not None:
             from scenes.cameras import CameraSettings
             from scenes.film import film
 
             actors, camera = [(done.solution.motion, done.request.curve)], CameraSettings(self.camera or "follow")
-            with bar("filming", quiet=self.quiet) as progress:
+            with show_progress("filming", quiet=self.quiet) as progress:
                 size = options.parse_size(self.size or _SIZE)
                 film(actors, video, camera=camera, size=size, progress=progress)

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import character, options, outputs
-from mapctl.commands.shared.resumption import telling_what_is_finished
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.resumption import explain_progress
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
     from controllers.generation.generate import GenerateSettings
     from mapctl.motion import Motion
 
-_MOST_CLIPS = 10_000
+_MAX_CLIPS = 10_000
 
 
 @dataclass(frozen=True)
@@ -58,46 +58,46 @@ class Generate:
 
     def run(self) -> int:
         """Check everything, then write clip after clip; clips that are finished stay if it is interrupted."""
-        compute_on_one()
-        frames, settings, clip = options.frames_of(self.seconds), *self._checked()
+        use_single_thread()
+        frames, settings, clip = options.count_frames(self.seconds), *self._check_settings()
         import torch
 
         import priors
-        from controllers.generation.generate import spread_starts, stream
+        from controllers.generation.generate import sample_stratified_starts, stream
 
         prior = priors.load(self.prior)
         if self.style not in (None, "none"):
             prior = prior.told([name.strip() for name in self.style.split(",")])
         wanted = self.refiner != "auto" or (self.no_footing and not self.no_refine)
         refiner = priors.refiner_of(self.prior, self.refiner) if wanted else None
-        person = character.read(self.rig)
-        if settings.finishing is not None:
-            footing = replace(settings.finishing.footing, rest_height=person.toe_rest_height)
-            settings = replace(settings, finishing=replace(settings.finishing, footing=footing))
+        person = character.read_character(self.rig)
+        if settings.foot_cleanup is not None:
+            footing = replace(settings.foot_cleanup.footing, rest_height=person.toe_rest_height)
+            settings = replace(settings, foot_cleanup=replace(settings.foot_cleanup, footing=footing))
         draw = partial(stream, prior, seconds=self.seconds, start_clip=clip, refiner=refiner, skeleton=person.skeleton)
-        starts = spread_starts(prior, self.count, torch.Generator().manual_seed(self.seed))
-        with outputs.made_folder(self.out) as folder, telling_what_is_finished(self.count, "clips") as finished:
-            for number, seed in enumerate(self._seeds()):
+        starts = sample_stratified_starts(prior, self.count, torch.Generator().manual_seed(self.seed))
+        with outputs.make_folder(self.out) as folder, explain_progress(self.count, "clips") as finished:
+            for number, seed in enumerate(self._sample_seeds()):
                 own = settings if settings.start is not None else replace(settings, start=starts[number])
                 pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
                 self._write(map(person.on_rig, pieces), folder / f"generated_{number:03d}.bvh", frames)
                 finished(number + 1)
         return 0
 
-    def _checked(self) -> tuple["GenerateSettings", "Motion | None"]:
-        from controllers.generation.foot_cleanup import FinishSettings
+    def _check_settings(self) -> tuple["GenerateSettings", "Motion | None"]:
+        from controllers.generation.foot_cleanup import FootCleanupSettings
         from controllers.generation.generate import GenerateSettings
 
         options.check_seed(self.seed)
-        if not 1 <= self.count <= _MOST_CLIPS:
-            raise RequestError(f"the count must be 1 to {_MOST_CLIPS}, got {self.count}")
+        if not 1 <= self.count <= _MAX_CLIPS:
+            raise RequestError(f"the count must be 1 to {_MAX_CLIPS}, got {self.count}")
         outputs.check_folder(self.out)
         numbered = self.start is not None and self.start.lstrip("-").isdecimal()
         if self.no_refine and self.refiner != "auto":
             raise RequestError("--refiner and --no-refine exclude each other")
         if self.no_refine and self.no_footing:
             raise RequestError("--no-refine leaves out the footing pass as well; leave --no-footing out")
-        finishing = None if self.no_refine or self.no_footing else FinishSettings()
+        finishing = None if self.no_refine or self.no_footing else FootCleanupSettings()
         start = int(self.start) if self.start and numbered else None
         settings = GenerateSettings(self.temperature, start, self.style is None, finishing)
         if self.start is None or numbered:
@@ -106,7 +106,7 @@ class Generate:
 
         return settings, formats.load(self.start)
 
-    def _seeds(self) -> list[int]:
+    def _sample_seeds(self) -> list[int]:
         """One for each clip; the first clips are the same however many are asked for."""
         import torch
 
@@ -115,10 +115,10 @@ class Generate:
 
     def _write(self, pieces: Iterable["Motion"], path: Path, frames: int) -> None:
         from mapctl.features import PRIOR_FPS
-        from mapctl.formats.bvh.stream import bvh_stream
+        from mapctl.formats.bvh.stream import open_bvh_stream
 
         began = time.perf_counter()
-        with bar(path.name, quiet=self.quiet) as progress, bvh_stream(path, frames) as file:
+        with show_progress(path.name, quiet=self.quiet) as progress, open_bvh_stream(path, frames) as file:
             for piece in pieces:
                 file.append(piece)
                 if progress is not None:

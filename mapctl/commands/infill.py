@@ -8,11 +8,11 @@ from tyro.conf import UseAppendAction, arg
 
 from mapctl.commands.shared import options, results
 from mapctl.commands.shared.frame_syntax import parse_ranges
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
-    from controllers.inbetweening.infill import Infilled
+    from controllers.inbetweening.infill import InfillResult
     from mapctl.motion import Motion
     from mapctl.recording.masks import Mask
     from mapctl.retarget.rigs import Rig
@@ -54,33 +54,33 @@ class Infill:
 
     def run(self) -> int:
         """Check everything, fill, write, tell."""
-        compute_on_one()
+        use_single_thread()
         self._check()
         rig = options.read_rig(self.rig)
-        motion, marked, holed = options.read_lossy(self.source, rig)
-        masks = (*marked, *self._asked(motion)) or (() if holed else self._found(motion))
-        done = self._infilled(motion, masks, rig)
+        motion, marked, holed = options.read_motion_with_gaps(self.source, rig)
+        masks = (*marked, *self._asked(motion)) or (() if holed else self._detect_gaps(motion))
+        done = self._run_infilling(motion, masks, rig)
         from mapctl import formats
 
         formats.save(done.motion, self.out)
         if self.report is not None:
             from mapctl import report
 
-            report.write(self.as_report(done), self.report)
-        results.film(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
+            report.write_report(self.as_report(done), self.report)
+        results.film_comparison(motion, done.motion, self.video, rig=rig, quiet=self.quiet)
         if not self.quiet:
             self._tell(done)
         return 0
 
-    def as_report(self, done: "Infilled") -> dict[str, object]:
+    def as_report(self, done: "InfillResult") -> dict[str, object]:
         """The request, versions, and what the result says of itself."""
-        return results.report("infill", self, done.motion, done.summary())
+        return results.build_report("infill", self, done.motion, done.summary())
 
     def _check(self) -> None:
         if self.curve is not None and self.method == "linear":
             raise RequestError("--curve needs a network's steps; leave --method linear out")
         results.check_method(self.method, prior=self.prior, infiller=self.infiller)
-        results.check(self.out, self.video, self.report, given=(self.source,))
+        results.check_destinations(self.out, self.video, self.report, given=(self.source,))
 
     def _asked(self, motion: "Motion") -> Sequence["Mask"]:
         """What is lost by the options; RequestError for what cannot be."""
@@ -92,13 +92,13 @@ class Infill:
         names = [ALL] if self.joints is None else [name.strip() for name in self.joints.split(",")]
         return [Mask(name, start, stop) for start, stop in gaps for name in names]
 
-    def _found(self, motion: "Motion") -> Sequence["Mask"]:
+    def _detect_gaps(self, motion: "Motion") -> Sequence["Mask"]:
         """What is wrong where nothing is marked; RequestError where nothing is."""
-        from mapctl.recording.gap_detection import find
+        from mapctl.recording.gap_detection import find_gaps
 
-        return find(motion)
+        return find_gaps(motion)
 
-    def _infilled(self, motion: "Motion", masks: Sequence["Mask"], rig: "Rig | None") -> "Infilled":
+    def _run_infilling(self, motion: "Motion", masks: Sequence["Mask"], rig: "Rig | None") -> "InfillResult":
         import priors
         from controllers.inbetweening.infill import InfillSettings, infill
 
@@ -111,7 +111,7 @@ class Infill:
             motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course, extending=extending
         )
 
-    def _tell(self, done: "Infilled") -> None:
+    def _tell(self, done: "InfillResult") -> None:
         summary = done.summary()
         gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in summary["gaps"])
         print(

@@ -32,13 +32,16 @@ class Info:
         from mapctl import report
 
         if self.name is not None and clip_info.is_clip(self.name):
-            clip_info.tell(Path(self.name), self.rig, as_json=self.json)
+            clip_info.print_clip(Path(self.name), self.rig, as_json=self.json)
         elif self.rig is not None:
             raise RequestError("--rig is of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
         elif self.name is not None:
-            print(report.as_json(card(self.name)), end="")
+            print(report.to_json(read_prior_card(self.name)), end="")
         elif self.json:
-            print(report.as_json({"priors": priors_here(), "installation": installation(), "notice": NOTICE}), end="")
+            print(
+                report.to_json({"priors": list_priors(), "installation": describe_installation(), "notice": NOTICE}),
+                end="",
+            )
         else:
             self._tables()
         return 0
@@ -46,15 +49,15 @@ class Info:
     def _tables(self) -> None:
         columns = ["prior", "kind", "size", "speeds", "licence of the weights"]
         rows = [
-            [row["name"], row["kind"], f"{row['megabytes']:.1f} MB", _speeds(row), row["licence"]]
-            for row in priors_here()
+            [row["name"], row["kind"], f"{row['megabytes']:.1f} MB", _format_speeds(row), row["licence"]]
+            for row in list_priors()
         ]
         print_table(columns, rows or [["none is bundled", None, None, None, None]])
-        print_table(["installation", ""], [[name, str(value)] for name, value in installation().items()])
+        print_table(["installation", ""], [[name, str(value)] for name, value in describe_installation().items()])
         print(NOTICE)
 
 
-def card(name: str) -> dict[str, Any]:
+def read_prior_card(name: str) -> dict[str, Any]:
     """The whole card of a prior, and where it lies; CheckpointError if there is none."""
     from priors import checkpoints
 
@@ -62,14 +65,14 @@ def card(name: str) -> dict[str, Any]:
     return {"file": str(path), **vars(checkpoints.read_card(path.with_suffix(".json")))}
 
 
-def priors_here() -> list[dict[str, Any]]:
+def list_priors() -> list[dict[str, Any]]:
     """The bundled priors in short."""
     from priors import checkpoints
 
-    return [_outline(name, card(name)) for name in checkpoints.bundled()]
+    return [_summarise_prior(name, read_prior_card(name)) for name in checkpoints.list_bundled()]
 
 
-def installation() -> dict[str, Any]:
+def describe_installation() -> dict[str, Any]:
     """Versions, scenes, rendering back end, threads and cores."""
     import torch
 
@@ -79,20 +82,20 @@ def installation() -> dict[str, Any]:
     threads = {"threads of a solve": 1, "threads of torch": torch.get_num_threads(), "cores": os.cpu_count()}
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return {
-        **report.versions(),
+        **report.package_versions(),
         **threads,
         "GPU": gpu,
         "rendering": scenes.back_end(),
-        "scenes": ", ".join(scenes.ready()),
+        "scenes": ", ".join(scenes.list_scenes()),
     }
 
 
-def _outline(name: str, whole: Mapping[str, Any]) -> dict[str, Any]:
+def _summarise_prior(name: str, whole: Mapping[str, Any]) -> dict[str, Any]:
     size = Path(whole["file"]).stat().st_size / 1e6
     kept = {key: whole[key] for key in ("kind", "licence", "abilities", "config")}
     return {"name": name, **kept, "megabytes": size}
 
 
-def _speeds(row: Mapping[str, Any]) -> str:
+def _format_speeds(row: Mapping[str, Any]) -> str:
     able = row["abilities"]
     return f"{able['slowest']:.1f} to {able['fastest']:.1f} m/s" if able else "-"

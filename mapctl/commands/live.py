@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import RequestError
-from mapctl.runtime.processes import insist_on_ctrl_c
+from mapctl.runtime.processes import reraise_ctrl_c
 
 if TYPE_CHECKING:
-    from controllers.steering.process import Remote
-    from scenes.live.app import Show
+    from controllers.steering.process import CharacterProcess
+    from scenes.live.app import LiveApp
 
-_MOST = 16
-_APART = 1.5  # metres between characters where they begin
+_MAX_CHARACTERS = 16
+_START_SPACING = 1.5  # metres between characters where they begin
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Live:
 
     def run(self) -> int:
         """Check, open, serve until Ctrl-C."""
-        compute_on_one()
+        use_single_thread()
         self._check()
-        with insist_on_ctrl_c():
-            show = self._opened()
+        with reraise_ctrl_c():
+            show = self._open_app()
         try:
             if not show.url.endswith(f":{self.port}"):
                 print(f"port {self.port} is in use")
@@ -48,23 +48,25 @@ class Live:
             show.run()
         except KeyboardInterrupt:
             print()
-            for path in show.keep_recordings(Path.cwd()):
+            for path in show.save_recordings(Path.cwd()):
                 print(f"the recording that was going on is in {path.name}")
         finally:
             show.close()
         return 0
 
-    def _opened(self) -> "Show":
+    def _open_app(self) -> "LiveApp":
         import priors
-        from scenes.live.app import Show
-        from scenes.live.inputs import Orders
+        from scenes.live.app import LiveApp
+        from scenes.live.inputs import SteeringInputs
 
         prior = priors.load(self.prior)
-        orders = [Orders() for _ in range(self.characters)]
-        with insist_on_ctrl_c():
-            characters = self._characters()
+        orders = [SteeringInputs() for _ in range(self.characters)]
+        with reraise_ctrl_c():
+            characters = self._start_characters()
         try:
-            return Show(characters, orders, port=self.port, fastest=prior.abilities.fastest_asked, labels=prior.labels)
+            return LiveApp(
+                characters, orders, port=self.port, fastest=prior.abilities.max_steering_speed, labels=prior.labels
+            )
         except BaseException:
             for character in characters:
                 character.close()
@@ -74,23 +76,23 @@ class Live:
         options.check_seed(self.seed)
         if not 1 <= self.port <= 65535:
             raise RequestError(f"the port must be a number from 1 to 65535, got {self.port}")
-        if not 1 <= self.characters <= _MOST:
-            raise RequestError(f"--characters must be 1 to {_MOST}, got {self.characters}")
+        if not 1 <= self.characters <= _MAX_CHARACTERS:
+            raise RequestError(f"--characters must be 1 to {_MAX_CHARACTERS}, got {self.characters}")
         for package in ("viser", "trimesh"):
             if find_spec(package) is None:
                 raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
 
-    def _characters(self) -> "Sequence[Remote]":
+    def _start_characters(self) -> "Sequence[CharacterProcess]":
         import priors
-        from controllers.steering.process import Remote, RemoteRequest
+        from controllers.steering.process import CharacterProcess, CharacterRequest
         from mapctl.intent.steering import Command
 
         load = functools.partial(priors.load, self.prior)
-        places = [(_APART * (number - (self.characters - 1) / 2), 0.0) for number in range(self.characters)]
-        found: list[Remote] = []
+        places = [(_START_SPACING * (number - (self.characters - 1) / 2), 0.0) for number in range(self.characters)]
+        found: list[CharacterProcess] = []
         try:
             for number, at in enumerate(places):
-                found.append(Remote(RemoteRequest(load, Command(1.2, 0.0), self.seed + number, at)))
+                found.append(CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), self.seed + number, at)))
             for character in found:
                 character.wait()
         except BaseException:

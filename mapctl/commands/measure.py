@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.tables import cell, print_table
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.tables import format_cell, print_table
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import CheckpointError, RequestError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mapctl.curves.curve import Curve
     from mapctl.motion import Motion
 
-_MOST_LINES = 12  # of notes and clips that are left out
+_MAX_LINES = 12  # of notes and clips that are left out
 
 
 @dataclass(frozen=True)
@@ -48,38 +48,38 @@ class Measure:
 
     def run(self) -> int:
         """Measure and print."""
-        folders = [path.is_dir() for path in options.given(self.clip, self.reference)]
+        folders = [path.is_dir() for path in options.collect_paths(self.clip, self.reference)]
         if any(folders):
             self._check_folders(all(folders))
-            compute_on_one()
-        values = self._folders() if any(folders) else self._clips()
+            use_single_thread()
+        values = self._measure_folders() if any(folders) else self._measure_clips()
         if self.json:
             from mapctl import report
 
-            print(report.as_json(values), end="")
+            print(report.to_json(values), end="")
         else:
             _print_tables(values)
         return 0
 
-    def _clips(self) -> dict[str, Any]:
+    def _measure_clips(self) -> dict[str, Any]:
         from mapctl import metrics
 
-        curve = self._curve()
-        clip, notes = _comparable(self.clip)
+        curve = self._read_curve()
+        clip, notes = _load_comparable(self.clip)
         ours = metrics.measure(clip, curve, speed=self.speed)
         reference = {}
         if self.reference is not None:
-            other, more = _comparable(self.reference)
+            other, more = _load_comparable(self.reference)
             reference, notes = metrics.measure(other), notes + more
         return {
             "clip": str(self.clip),
             "measures": ours,
             "reference": reference,
-            "mocap": _mocap(self.prior),
+            "mocap": _read_mocap_values(self.prior),
             "notes": notes,
         }
 
-    def _curve(self) -> "Curve | None":
+    def _read_curve(self) -> "Curve | None":
         if self.speed is not None and not 0 < self.speed < float("inf"):
             raise RequestError(f"speed must be positive, got {self.speed:g} m/s")
         if self.curve is None and (self.speed is not None or self.metres_per_unit is not None):
@@ -93,7 +93,7 @@ class Measure:
         if any(option is not None for option in (self.curve, self.speed, self.metres_per_unit)):
             raise RequestError(f"{self.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
 
-    def _folders(self) -> dict[str, Any]:
+    def _measure_folders(self) -> dict[str, Any]:
         from mapctl.commands.shared.clip_sets import ClipSet
 
         compared = self.reference is not None
@@ -104,27 +104,29 @@ class Measure:
             "clips": len(ours.motions),
             "measures": ours.means,
             "reference": {} if reference is None else reference.means,
-            "mocap": _mocap(self.prior),
+            "mocap": _read_mocap_values(self.prior),
             "notes": ours.notes + (() if reference is None else reference.notes),
             "skipped": ours.skipped | ({} if reference is None else reference.skipped),
         }
-        return values if reference is None else values | self._compared(ours, reference)
+        return values if reference is None else values | self._compare_folders(ours, reference)
 
-    def _compared(self, ours: "ClipSet", reference: "ClipSet") -> dict[str, Any]:
-        from mapctl.commands.shared.clip_sets import compared_realism, compared_spread
+    def _compare_folders(self, ours: "ClipSet", reference: "ClipSet") -> dict[str, Any]:
+        from mapctl.commands.shared.clip_sets import compare_realism, compare_variability
 
-        realism = compared_realism(ours, reference, seed=self.seed)
+        realism = compare_realism(ours, reference, seed=self.seed)
         return {
             "reference_clips": len(reference.motions),
             "realism": asdict(realism),
-            "spread": compared_spread(ours, reference),
+            "spread": compare_variability(ours, reference),
         }
 
 
 def _print_tables(values: Mapping[str, Any]) -> None:
     """What there is of measures, realism and spread, each as a table."""
     reference, mocap = values["reference"], values["mocap"]
-    rows = [[name, value, reference.get(name), _spread(mocap.get(name))] for name, value in values["measures"].items()]
+    rows = [
+        [name, value, reference.get(name), _format_range(mocap.get(name))] for name, value in values["measures"].items()
+    ]
     title = None if "clips" not in values else f"means over {values['clips']} clips"
     if "reference_clips" in values:
         title = f"{title}, and over {values['reference_clips']} of the reference"
@@ -135,17 +137,17 @@ def _print_tables(values: Mapping[str, Any]) -> None:
         print_table(
             ["spread", "ours", "reference", "ratio"], rows, title="how widely the clips spread (in pieces of 3 s)"
         )
-    for line in _short([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
+    for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
         print(line)
 
 
-def _short(lines: Sequence[str]) -> list[str]:
+def _shorten(lines: Sequence[str]) -> list[str]:
     """The first of them, and how many more there are."""
-    more = len(lines) - _MOST_LINES
-    return [*lines[:_MOST_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
+    more = len(lines) - _MAX_LINES
+    return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
 
 
-def _comparable(path: Path) -> "tuple[Motion, list[str]]":
+def _load_comparable(path: Path) -> "tuple[Motion, list[str]]":
     """A clip as mocap's values were measured, and what could not be made so."""
     from mapctl import formats
     from mapctl.metrics.comparison import make_comparable
@@ -164,18 +166,18 @@ def _print_realism(realism: Mapping[str, Any]) -> None:
     print_table(columns, rows, title=f"{counts}; 50 % cannot be told apart")
 
 
-def _mocap(prior: str) -> Mapping[str, Any]:
+def _read_mocap_values(prior: str) -> Mapping[str, Any]:
     """Mocap's values from the prior's card; none where the prior is not there."""
     from mapctl import report
     from priors import checkpoints
 
     try:
-        return report.mocap_values(checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality)
+        return report.reference_measures(checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality)
     except CheckpointError:
         return {}
 
 
-def _spread(values: Mapping[str, float] | None) -> str | None:
+def _format_range(values: Mapping[str, float] | None) -> str | None:
     if values is None:
         return None
-    return f"{cell(values['mean'])} ({cell(values['p2'])} to {cell(values['p98'])})"
+    return f"{format_cell(values['mean'])} ({format_cell(values['p2'])} to {format_cell(values['p98'])})"

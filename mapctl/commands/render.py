@@ -6,7 +6,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import options, outputs
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Render:
         from scenes.film import film
 
         motion, notes = put_upright(formats.load(self.source))
-        with bar("filming", quiet=self.quiet) as progress:
+        with show_progress("filming", quiet=self.quiet) as progress:
             camera = CameraSettings(self.camera)
             film([(motion, curve)], self.out, camera=camera, size=size, progress=progress)
         if not self.quiet:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import character, options, outputs
-from mapctl.commands.shared.path_walk import INTERRUPTED, Walk, as_follow, walk
-from mapctl.commands.shared.threads import compute_on_one
-from mapctl.runtime.progress import bar
+from mapctl.commands.shared.path_walk import EXIT_INTERRUPTED, Walk, parse_follow, walk
+from mapctl.commands.shared.threads import use_single_thread
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
-    from mapctl.intent.path import Follow
+    from mapctl.intent.path import PathRequest
     from priors.lstm_gmm.density import LstmGmmDensity
     from scenes.scene_file import SceneDescription
 
@@ -38,31 +38,35 @@ class RunScene:
 
         Ctrl-C ends the walks; those that have begun are written, without a film.
         """
-        compute_on_one()
+        use_single_thread()
         import priors
         import scenes
         from scenes.scene_file import load
 
-        scene, curves = load(scenes.find(self.scene))
+        scene, curves = load(scenes.find_scene(self.scene))
         requests = [
-            as_follow(curve, actor.speed, actor.seconds) for actor, curve in zip(scene.actors, curves, strict=True)
+            parse_follow(curve, actor.speed, actor.seconds) for actor, curve in zip(scene.actors, curves, strict=True)
         ]
         outputs.check_folder(self.out)
         for path in scene.films(self.out):
             outputs.require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
-        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior), character.read(self.rig))
-        with outputs.made_folder(self.out):
+        walks, interrupted = self._walk(scene, requests, priors.load(scene.prior), character.read_character(self.rig))
+        with outputs.make_folder(self.out):
             self._write(scene, walks, films=() if interrupted else scene.films(self.out))
-        return INTERRUPTED if interrupted else 0
+        return EXIT_INTERRUPTED if interrupted else 0
 
     def _walk(
-        self, scene: "SceneDescription", requests: Sequence["Follow"], prior: "LstmGmmDensity", person: character.Wearer
+        self,
+        scene: "SceneDescription",
+        requests: Sequence["PathRequest"],
+        prior: "LstmGmmDensity",
+        person: character.Character,
     ) -> tuple[list[Walk], bool]:
         """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
         walks: list[Walk] = []
         for actor, request in zip(scene.actors, requests, strict=True):
             try:
-                with bar(actor.name, quiet=self.quiet) as progress:
+                with show_progress(actor.name, quiet=self.quiet) as progress:
                     walks.append(walk(prior, request, seed=actor.seed, progress=progress, person=person))
             except KeyboardInterrupt:
                 if not walks:
@@ -87,7 +91,7 @@ class RunScene:
             for path in motions[actor.name]:
                 done.on_rig.save(path)
         for path in reports:
-            report.write(self._report(scene, walks), path)
+            report.write_report(self._report(scene, walks), path)
         if films:
             self._film(scene, walks, films)
         if not self.quiet:
@@ -101,14 +105,14 @@ class RunScene:
             Shot(done.solution.motion, done.request.curve, actor.colour, actor.start_seconds)
             for actor, done in zip(scene.actors, walks, strict=True)
         ]
-        with bar("filming", quiet=self.quiet) as progress:
+        with show_progress("filming", quiet=self.quiet) as progress:
             film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, progress=progress)
 
     def _report(self, scene: "SceneDescription", walks: Sequence[Walk]) -> dict[str, Any]:
         """By actor, the report of each walk that has begun."""
-        request = options.as_request("run", self) | {"title": scene.title}
+        request = options.describe_request("run", self) | {"title": scene.title}
         actors = {
-            actor.name: done.report(options.as_request("follow", actor))
+            actor.name: done.report(options.describe_request("follow", actor))
             for actor, done in zip(scene.actors, walks, strict=False)
         }
         return {"request": request, "actors": actors}

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import character, options, outputs
-from mapctl.commands.shared.path_walk import INTERRUPTED
-from mapctl.commands.shared.threads import compute_on_one
-from mapctl.intent.steering import Limits
-from mapctl.runtime.progress import bar
+from mapctl.commands.shared.path_walk import EXIT_INTERRUPTED
+from mapctl.commands.shared.threads import use_single_thread
+from mapctl.intent.steering import SteeringLimits
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
     from controllers.steering.loop import Recorder, StepRecord
     from mapctl.intent.steering import CommandTrack
     from mapctl.motion import Motion
 
-_NOT_ALL_HOLDS = 3
-_TURN_RATE = round(math.degrees(Limits.turn_rate), 1)
-_LAST_HELD = 3.0  # seconds for which a script of a single command is played
+_EXIT_NOT_SATISFIED = 3
+_TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
+_LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,11 @@ class Steer:
     or TOML file, whose joints get the canonical bones."""
     seed: options.Count = 0
     """Of the pose that it begins with."""
-    acceleration: options.Number = Limits.acceleration
+    acceleration: options.Number = SteeringLimits.acceleration
     """Most that the wanted speed rises by, m/s^2."""
-    braking: options.Number = Limits.braking
+    braking: options.Number = SteeringLimits.braking
     """Most that it falls by, m/s^2."""
-    turn_rate: options.Number = _TURN_RATE
+    turn_rate: options.Number = _TURN_RATE_DEG
     """Most that the wanted direction turns by, degrees/s."""
     report: options.MaybeFile = None
     """JSON with each command's response, timing, ledger and measures."""
@@ -61,33 +61,33 @@ class Steer:
 
     def run(self) -> int:
         """Check everything, steer, write, tell. Ctrl-C ends the script early; what was steered is written."""
-        compute_on_one()
+        use_single_thread()
         self._check()
         import priors
         from mapctl.intent.steering_csv import read_commands
 
         track = read_commands(self.commands)
-        person, prior = character.read(self.rig), priors.load(self.prior)
-        track, lowered = track.clamped(prior.abilities.fastest_asked)
+        person, prior = character.read_character(self.rig), priors.load(self.prior)
+        track, lowered = track.limit_speed(prior.abilities.max_steering_speed)
         for labels in {command.told for command in track.commands if command.told}:
             prior.told(labels)  # what it does not know is said now
-        recorder, records, frames = self._steered(prior, track, person)
+        recorder, records, frames = self._run_steering(prior, track, person)
         motion = recorder.motion(frames)
         person.on_rig(motion).save(self.out)
         report = self._report(motion, recorder, records, track, lowered, prior)
         if self.report is not None:
             from mapctl import report as reports
 
-            reports.write(report, self.report)
+            reports.write_report(report, self.report)
         if self.plot is not None:
             from scenes.plots.steering import plot
 
             plot(motion, track, self.plot)
         if not self.quiet:
-            print("\n".join(_summary(report, options.given(self.out, self.report, self.plot))))
+            print("\n".join(_format_summary(report, options.collect_paths(self.out, self.report, self.plot))))
         if motion.num_frames < frames:
-            return INTERRUPTED
-        return _NOT_ALL_HOLDS if self.strict and (lowered or report["timing"]["late_frames"]) else 0
+            return EXIT_INTERRUPTED
+        return _EXIT_NOT_SATISFIED if self.strict and (lowered or report["timing"]["late_frames"]) else 0
 
     def _check(self) -> None:
         from mapctl import formats
@@ -95,24 +95,24 @@ class Steer:
         options.check_seed(self.seed)
         self._limits()
         formats.check_ending(self.out)
-        outputs.check_files(options.given(self.out, self.report, self.plot))
+        outputs.check_files(options.collect_paths(self.out, self.report, self.plot))
         outputs.check_plot(self.plot)
 
-    def _limits(self) -> Limits:
-        return Limits(self.acceleration, self.braking, math.radians(self.turn_rate))
+    def _limits(self) -> SteeringLimits:
+        return SteeringLimits(self.acceleration, self.braking, math.radians(self.turn_rate))
 
-    def _steered(
-        self, prior: Any, track: "CommandTrack", person: character.Wearer
+    def _run_steering(
+        self, prior: Any, track: "CommandTrack", person: character.Character
     ) -> tuple["Recorder", list["StepRecord"], int]:
         import torch
 
         from controllers.steering import steer
         from controllers.steering.loop import Recorder, StreamClock, WallClock, drive
-        from mapctl.terms import Footing
+        from mapctl.terms import FootContact
 
         first, recorder = track.commands[0], Recorder()
-        frames = options.frames_of(track.times[-1] + (_LAST_HELD if len(track.times) == 1 else 0.0))
-        footing = Footing(rest_height=person.toe_rest_height)
+        frames = options.count_frames(track.times[-1] + (_LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0))
+        footing = FootContact(rest_height=person.toe_rest_height)
         settings = steer.SteerSettings(limits=self._limits(), footing=footing)
         generator = torch.Generator().manual_seed(self.seed)
         state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=person.skeleton)
@@ -120,8 +120,8 @@ class Steer:
         for command in (first, *{command.told: command for command in track.commands}.values()):
             steer.step(state, command)  # what is compiled, loaded or told on first use must not cost frames
         clock = WallClock() if self.realtime else StreamClock()
-        with bar("steering", quiet=self.quiet) as progress:
-            displays = [recorder] if progress is None else [recorder, _Progress(progress, frames)]
+        with show_progress("steering", quiet=self.quiet) as progress:
+            displays = [recorder] if progress is None else [recorder, _ProgressDisplay(progress, frames)]
             _, records = drive(state, track, displays, frames=frames, clock=clock)
         return recorder, records, frames
 
@@ -134,28 +134,28 @@ class Steer:
         lowered: Sequence[str],
         prior: Any,
     ) -> dict[str, Any]:
-        from controllers.steering.loop import timing
+        from controllers.steering.loop import summarise_step_timing
         from mapctl import metrics, report
-        from mapctl.metrics.travel import by_command
+        from mapctl.metrics.travel import measure_commands
 
-        cost = timing(records, [time for time in track.times[1:] if time < motion.seconds])
+        cost = summarise_step_timing(records, [time for time in track.times[1:] if time < motion.seconds])
         return {
-            "request": options.as_request("steer", self),
+            "request": options.describe_request("steer", self),
             "seed": self.seed,
-            "versions": report.versions(),
+            "versions": report.package_versions(),
             "prior": {"name": prior.name, "licence": prior.card.licence},
-            "motion": report.outline(motion),
+            "motion": report.summarise_motion(motion),
             "status": {"text": "; ".join(lowered) or "done", "ok": not lowered, "notes": list(lowered)},
-            "commands": by_command(motion, track),
+            "commands": measure_commands(motion, track),
             "ledger": recorder.ledger.summary(),
             "measures": metrics.measure(motion),
-            "mocap": report.mocap_values(prior.card.quality),
+            "mocap": report.reference_measures(prior.card.quality),
             "timing": cost | {"peak_memory_mb": report.peak_memory_mb()},
         }
 
 
 @dataclass(frozen=True)
-class _Progress:
+class _ProgressDisplay:
     """A Display that moves a progress bar."""
 
     progress: Any
@@ -167,7 +167,7 @@ class _Progress:
         self.progress(min(self.frames, round(due * PRIOR_FPS) + frames.motion.num_frames), self.frames)
 
 
-def _summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
+def _format_summary(report: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
     lines = []
     for row in report["commands"][:-1]:
         reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"

@@ -10,13 +10,13 @@ from tyro.conf import arg
 from mapctl.commands.shared import options, results, tween_variations
 from mapctl.commands.shared.frame_syntax import parse_frame
 from mapctl.commands.shared.tables import print_table
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.errors import FileFormatError, RequestError
 
 if TYPE_CHECKING:
-    from controllers.inbetweening.keyframe_poses import Keyed
-    from controllers.inbetweening.keyframe_timing import Interval
-    from controllers.inbetweening.pipeline import Infilled
+    from controllers.inbetweening.keyframe_poses import KeyframeClip
+    from controllers.inbetweening.keyframe_timing import KeyInterval
+    from controllers.inbetweening.pipeline import InfillResult
     from mapctl.intent.keyframe_toml import KeyRequest
     from mapctl.retarget.rigs import Rig
 
@@ -69,28 +69,28 @@ class Tween:
 
     def run(self) -> int:
         """Check everything, make, write, tell."""
-        compute_on_one()
-        request = self._key_request()
+        use_single_thread()
+        request = self._read_key_request()
         self._check([self.source] if request is None else [self.source, *map(Path, request.files)])
         asked = self._asked(request)
         if self.variations > 1:
-            tween_variations.run(self, asked)
+            tween_variations.run_variations(self, asked)
             return 0
         intervals = self._timing(asked)
-        done = self._made(asked)
+        done = self._run_tweening(asked)
         from mapctl import formats
 
         formats.save(done.motion, self.out)
         if self.report is not None:
             from mapctl import report
 
-            report.write(self._as_report(done, asked, intervals), self.report)
-        results.film(asked.motion, done.motion, self.video, rig=asked.rig, quiet=self.quiet)
+            report.write_report(self._build_report(done, asked, intervals), self.report)
+        results.film_comparison(asked.motion, done.motion, self.video, rig=asked.rig, quiet=self.quiet)
         if not self.quiet:
             self._tell(done, asked, intervals)
         return 0
 
-    def _tell(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> None:
+    def _tell(self, done: "InfillResult", asked: "KeyframeClip", intervals: "Sequence[KeyInterval]") -> None:
         ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
         print(f"{self.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
         for note in (*done.notes, *done.gap_notes):
@@ -99,18 +99,18 @@ class Tween:
             rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
             print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
 
-    def _timing(self, asked: "Keyed") -> "list[Interval]":
-        from controllers.inbetweening.keyframe_timing import suggest
+    def _timing(self, asked: "KeyframeClip") -> "list[KeyInterval]":
+        from controllers.inbetweening.keyframe_timing import suggest_intervals
 
-        return suggest(asked.motion, asked.keys, asked.rig) if self.suggest_timing else []
+        return suggest_intervals(asked.motion, asked.keys, asked.rig) if self.suggest_timing else []
 
     @property
-    def _of_file(self) -> bool:
+    def _is_key_file(self) -> bool:
         """Whether the keys are those of a TOML file."""
         return self.source.suffix.lower() == ".toml"
 
-    def _key_request(self) -> "KeyRequest | None":
-        if not self._of_file:
+    def _read_key_request(self) -> "KeyRequest | None":
+        if not self._is_key_file:
             return None
         from mapctl.intent.keyframe_toml import read_keys
 
@@ -129,24 +129,24 @@ class Tween:
             )
             if value is not None
         ]
-        if self._of_file and idle:
+        if self._is_key_file and idle:
             raise RequestError(f"{idle[0]} is for motion files; {self.source} says itself what its keys are")
-        if not self._of_file and self.keyframes is None:
+        if not self._is_key_file and self.keyframes is None:
             raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-        tween_variations.check(self, given)
+        tween_variations.check_answers(self, given)
         # Variations are rolled by a density whatever the method.
         prior = self.prior if self.variations == self.best_of == 1 else None
         results.check_method(self.method, prior=prior, infiller=self.infiller)
 
-    def _asked(self, request: "KeyRequest | None") -> "Keyed":
+    def _asked(self, request: "KeyRequest | None") -> "KeyframeClip":
         """The motion that holds the keys, these, and its rig where it is known."""
-        from controllers.inbetweening.keyframe_poses import Keyed
-        from controllers.inbetweening.keyframes import check_limbs
+        from controllers.inbetweening.keyframe_poses import KeyframeClip
+        from controllers.inbetweening.keyframes import check_effectors
         from mapctl.intent.keyframes import Keys
 
         rig = options.read_rig(self.rig)
         if request is not None:
-            return self._of_key_file(request, rig)
+            return self._load_key_file(request, rig)
         motion = options.read_motion(self.source, rig)
         frames = [parse_frame(word, fps=float(motion.fps)) for word in (self.keyframes or "").split(",")]
         if len(set(frames)) == 2 and (self.root_only or self.joints is not None):
@@ -154,18 +154,18 @@ class Tween:
             raise RequestError(f"{name} is about keys between the first and the last, and --keyframes has none there")
         limbs = () if self.joints is None else tuple(name.strip() for name in self.joints.split(","))
         if limbs:  # also where there is no key between the first and the last
-            check_limbs(limbs, motion, rig)
-        return Keyed(motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig)
+            check_effectors(limbs, motion, rig)
+        return KeyframeClip(motion, Keys.of(frames, limbs=limbs, root_only=self.root_only), rig)
 
-    def _of_key_file(self, request: "KeyRequest", rig: "Rig | None") -> "Keyed":
-        from controllers.inbetweening.keyframe_poses import keyed
+    def _load_key_file(self, request: "KeyRequest", rig: "Rig | None") -> "KeyframeClip":
+        from controllers.inbetweening.keyframe_poses import build_keyframe_clip
 
         try:
-            return keyed(request, rig)
+            return build_keyframe_clip(request, rig)
         except RequestError as error:
             raise FileFormatError(self.source, str(error)) from error
 
-    def _made(self, asked: "Keyed") -> "Infilled":
+    def _run_tweening(self, asked: "KeyframeClip") -> "InfillResult":
         import priors
         from controllers.inbetweening.pipeline import InfillSettings
         from controllers.inbetweening.tween import tween
@@ -175,15 +175,17 @@ class Tween:
         densities = priors.load_choice(self.prior)
         settings = InfillSettings(method=method)
         if self.best_of > 1 and infiller is not None:
-            return tween_variations.best(self, asked, infiller, settings)
+            return tween_variations.tween_lowest_energy(self, asked, infiller, settings)
         rollable = () if method != "map" else priors.load_choice(self.prior or "auto")
         return tween(
             asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig, rollable=rollable
         )
 
-    def _as_report(self, done: "Infilled", asked: "Keyed", intervals: "Sequence[Interval]") -> dict[str, object]:
-        from controllers.inbetweening.tween import key_errors
+    def _build_report(
+        self, done: "InfillResult", asked: "KeyframeClip", intervals: "Sequence[KeyInterval]"
+    ) -> dict[str, object]:
+        from controllers.inbetweening.tween import measure_keyframe_errors
 
-        missed = key_errors(done.motion, asked.motion, asked.keys, asked.rig)
+        missed = measure_keyframe_errors(done.motion, asked.motion, asked.keys, asked.rig)
         timing = {"timing": [interval.summary() for interval in intervals]} if self.suggest_timing else {}
-        return results.report("tween", self, done.motion, {"keys": missed, **timing, **done.summary()})
+        return results.build_report("tween", self, done.motion, {"keys": missed, **timing, **done.summary()})

@@ -12,11 +12,11 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from mapctl.curves.curve import Curve
-from mapctl.curves.polyline import dense_polyline
-from mapctl.curves.shapes import SHAPES, parse_sizes, shape_points
+from mapctl.curves.polyline import build_dense_polyline
+from mapctl.curves.shapes import SHAPES, parse_shape, sample_shape
 from mapctl.errors import FileFormatError, RequestError
 
-_FINE = 0.02  # metres between the points that a spline is drawn with
+_SPLINE_SPACING = 0.02  # metres between the points that a spline is drawn with
 _FILE_ENDINGS = (".csv", ".tsv", ".txt", ".svg")
 
 
@@ -27,7 +27,7 @@ def from_points(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool 
     for fewer than 2 distinct points, more than a million, values that are not finite, or lengths that are not
     1 cm to 100 km.
     """
-    return Curve(*dense_polyline(points, closed))
+    return Curve(*build_dense_polyline(points, closed))
 
 
 def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
@@ -43,37 +43,37 @@ def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
     if kept.sum() < 3:
         return whole
     at = np.r_[0.0, np.cumsum(spans[kept[1:]])]
-    fine = np.linspace(0.0, at[-1], max(2, round(whole.length / _FINE)))
+    fine = np.linspace(0.0, at[-1], max(2, round(whole.length / _SPLINE_SPACING)))
     return from_points(CubicSpline(at, given[kept], bc_type="natural")(fine), closed=False)
 
 
 def circle(*, radius: float) -> Curve:
     """A circle to the left of its start, the origin, heading +Z; radius in metres (0.01 to 10,000)."""
-    return _shape("circle", {"radius": radius})
+    return _build_shape("circle", {"radius": radius})
 
 
 def figure8(*, radius: float) -> Curve:
     """Two circles that touch at the origin, the left one first, both along +Z there; radius in metres."""
-    return _shape("figure8", {"radius": radius})
+    return _build_shape("figure8", {"radius": radius})
 
 
 def s(*, length: float) -> Curve:
     """An S: a half circle to the left, then one to the right; `length` metres from end to end, along +X."""
-    return _shape("s", {"length": length})
+    return _build_shape("s", {"length": length})
 
 
 def line(*, length: float) -> Curve:
     """A straight line along +Z; length in metres."""
-    return _shape("line", {"length": length})
+    return _build_shape("line", {"length": length})
 
 
 def wave(*, amplitude: float, length: float) -> Curve:
     """One period of a sine along +Z, first to the left; `amplitude` is half of peak to peak; metres."""
-    return _shape("wave", {"amplitude": amplitude, "length": length})
+    return _build_shape("wave", {"amplitude": amplitude, "length": length})
 
 
-def _shape(name: str, sizes: dict[str, float]) -> Curve:
-    return Curve(torch.from_numpy(shape_points(name, sizes)), SHAPES[name].closed)
+def _build_shape(name: str, sizes: dict[str, float]) -> Curve:
+    return Curve(torch.from_numpy(sample_shape(name, sizes)), SHAPES[name].closed)
 
 
 def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -> Curve:
@@ -89,7 +89,7 @@ def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -
         return _read_file(text, metres_per_unit)
     if metres_per_unit is not None:
         raise RequestError(f"metres per unit is for files; the curve {text!r} is in metres")
-    return _shape(*parse_sizes(text))
+    return _build_shape(*parse_shape(text))
 
 
 def _read_file(path: str, metres_per_unit: float | None) -> Curve:

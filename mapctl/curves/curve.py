@@ -21,7 +21,7 @@ Arc = Float[Tensor, "*batch"] | float
 _NEIGHBOURS = 16  # vertices looked at around a point: enough to hold an end of the nearest segment (1 cm apart)
 _SEARCH_STEP = 0.04  # metres between the arcs that a local search tries first
 _REFINEMENT = 10  # a local search's second grid is this much finer
-_RUN_ON = 1.0  # metres of straight extension in the tables; beyond them the line goes on all the same
+_END_EXTENSION = 1.0  # metres of straight extension in the tables; beyond them the line goes on all the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class Curve:
             base = min(TANGENT_BASE, self.length / 2)
             inside = torch.searchsorted(arcs, arcs.new_tensor([base, self.length - base])).tolist()
             ahead, behind = max(1, inside[0]), min(len(points) - 2, inside[1])
-            before = points[0] - _RUN_ON * _unit(points[ahead] - points[0])
-            beyond = points[-1] + _RUN_ON * _unit(points[-1] - points[behind])
+            before = points[0] - _END_EXTENSION * _normalise(points[ahead] - points[0])
+            beyond = points[-1] + _END_EXTENSION * _normalise(points[-1] - points[behind])
             points = torch.cat([before[None], points, beyond[None]])
-            arcs = torch.cat([arcs[:1] - _RUN_ON, arcs, arcs[-1:] + _RUN_ON])
+            arcs = torch.cat([arcs[:1] - _END_EXTENSION, arcs, arcs[-1:] + _END_EXTENSION])
         return arcs, points, points.diff(dim=0) / arcs.diff().unsqueeze(-1)
 
     @cached_property
@@ -76,7 +76,7 @@ class Curve:
         """Direction of travel at the start, radians: 0 is +Z, +pi/2 is +X; what lies behind it has no say."""
         # Chords centred a little ahead see only what follows; extrapolating is exact on circular arcs.
         ahead = self._half_base * torch.tensor([1.0, 2.0], dtype=torch.float64)
-        near, far = unwrap_angle(_heading(self.tangent(ahead))).tolist()
+        near, far = unwrap_angle(_direction_heading(self.tangent(ahead))).tolist()
         return math.remainder(2 * near - far, 2 * math.pi)
 
     @property
@@ -86,26 +86,26 @@ class Curve:
     def _segment(self, arc: Tensor) -> tuple[Tensor, Int[Tensor, "*batch"]]:
         """The arc within the tables, float64, and the segment it lies on."""
         arc = torch.remainder(arc.double(), self.length) if self.closed else arc.double()
-        return arc, _piece(self._tables[0], arc)
+        return arc, _find_segment(self._tables[0], arc)
 
-    def _at(self, arc: Tensor) -> Tensor:
+    def _point_at(self, arc: Tensor) -> Tensor:
         knots, points, directions = self._tables
         arc, segment = self._segment(arc)
         return points[segment] + (arc - knots[segment]).unsqueeze(-1) * directions[segment]
 
     def point(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
         """The place on the curve at an arc, metres."""
-        arc = _tensor(arc)
-        return self._at(arc).to(arc.dtype)
+        arc = _to_tensor(arc)
+        return self._point_at(arc).to(arc.dtype)
 
     def tangent(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
         """Unit direction of travel: a chord of 5 cm, so that the jitter of a drawing does not flip it."""
-        arc = _tensor(arc)
-        chord = self._at(arc.double() + self._half_base) - self._at(arc.double() - self._half_base)
+        arc = _to_tensor(arc)
+        chord = self._point_at(arc.double() + self._half_base) - self._point_at(arc.double() - self._half_base)
         # At the tip of a way back on itself the chord vanishes; the segment still has a direction.
         gone = chord.detach().norm(dim=-1, keepdim=True) < 1e-6
         chord = torch.where(gone, self._tables[2][self._segment(arc)[1]], chord)
-        return _unit(chord).to(arc.dtype)
+        return _normalise(chord).to(arc.dtype)
 
     def left(self, arc: Arc) -> Float[Tensor, "*batch 2"]:
         """Unit ground vector (x, z) to the left of travel."""
@@ -114,16 +114,16 @@ class Curve:
         return across / across.norm(dim=-1, keepdim=True).clamp_min(1e-9)
 
     @cached_property
-    def _turning(self) -> tuple[Tensor, Tensor]:
+    def _vertex_heading(self) -> tuple[Tensor, Tensor]:
         """Unwrapped heading at every vertex, and its slope to the next."""
-        heading = unwrap_angle(_heading(self.tangent(self._arcs)))
+        heading = unwrap_angle(_direction_heading(self.tangent(self._arcs)))
         return heading, heading.diff() / self._arcs.diff()
 
     def _heading_at(self, arc: Tensor) -> Tensor:
-        heading, slope = self._turning
+        heading, slope = self._vertex_heading
         laps = torch.floor(arc.detach() / self.length) if self.closed else torch.zeros_like(arc)
         within = torch.remainder(arc, self.length) if self.closed else arc.clamp(0, self.length)
-        vertex = _piece(self._arcs, within)
+        vertex = _find_segment(self._arcs, within)
         return heading[vertex] + (within - self._arcs[vertex]) * slope[vertex] + laps * (heading[-1] - heading[0])
 
     def curvature(self, arc: Arc, *, base: float = 0.3) -> Float[Tensor, "*batch"]:
@@ -132,7 +132,7 @@ class Curve:
         The base spans a few vertices of a coarse drawing, whose heading changes at vertices only, and gives a
         sharp corner the finite curvature that a stride through it has.
         """
-        arc = _tensor(arc)
+        arc = _to_tensor(arc)
         ahead, behind = self._heading_at(arc.double() + base / 2), self._heading_at(arc.double() - base / 2)
         return ((ahead - behind) / base).to(arc.dtype)
 
@@ -154,8 +154,8 @@ class Curve:
             return self._nearest_anywhere(points)
         with torch.no_grad():
             step = min(_SEARCH_STEP, reach / 4)
-            guess = self._closest_of(points, _tensor(around).double().expand(points.shape[:-1]), reach, step)
-            guess = self._closest_of(points, guess, step, step / _REFINEMENT)
+            guess = self._search_closest(points, _to_tensor(around).double().expand(points.shape[:-1]), reach, step)
+            guess = self._search_closest(points, guess, step, step / _REFINEMENT)
             within, segment = self._segment(guess)
         segments = segment.unsqueeze(-1) + torch.tensor([-1, 0, 1])
         return (guess + self._project(points, segments, within)).to(points.dtype)
@@ -177,11 +177,11 @@ class Curve:
         step = (knots[segments] + along).gather(-1, best).squeeze(-1) - within
         return torch.remainder(step + self.length / 2, self.length) - self.length / 2 if self.closed else step
 
-    def _closest_of(self, points: Tensor, around: Tensor, reach: float, step: float) -> Tensor:
+    def _search_closest(self, points: Tensor, around: Tensor, reach: float, step: float) -> Tensor:
         """The closest to each point of the arcs `around` - reach ... + reach, `step` apart."""
         count = math.ceil(reach / step)
         arcs = around.unsqueeze(-1) + torch.arange(-count, count + 1, dtype=torch.float64) * (reach / count)
-        best = (self._at(arcs) - points.unsqueeze(-2)).square().sum(-1).argmin(-1, keepdim=True)
+        best = (self._point_at(arcs) - points.unsqueeze(-2)).square().sum(-1).argmin(-1, keepdim=True)
         return arcs.gather(-1, best).squeeze(-1)
 
     @cached_property
@@ -215,21 +215,21 @@ class Curve:
         points = self._of_curve(points_world).detach().double()
         if start is None and bool((points[0] - self.start).norm() <= reach):
             start = 0.0
-        return tracking.track(self, points, start=start, reach=reach)
+        return tracking.track_arcs(self, points, start=start, reach=reach)
 
 
-def _tensor(arc: Arc) -> Tensor:
+def _to_tensor(arc: Arc) -> Tensor:
     return arc if torch.is_tensor(arc) else torch.tensor(arc, dtype=torch.float64)
 
 
-def _piece(knots: Tensor, arc: Tensor) -> Int[Tensor, "*batch"]:
+def _find_segment(knots: Tensor, arc: Tensor) -> Int[Tensor, "*batch"]:
     """Index of the knot before each arc; the first or the last but one for arcs outside."""
     return torch.searchsorted(knots, arc.detach().contiguous(), right=True).sub(1).clamp(0, len(knots) - 2)
 
 
-def _unit(vector: Tensor) -> Tensor:
+def _normalise(vector: Tensor) -> Tensor:
     return vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-12)
 
 
-def _heading(direction: Tensor) -> Tensor:
+def _direction_heading(direction: Tensor) -> Tensor:
     return torch.atan2(direction[..., 0], direction[..., -1])

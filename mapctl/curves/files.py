@@ -31,24 +31,24 @@ def read_csv(path: str | PathLike[str]) -> ndarray:
     may order the columns; blank lines and lines from `#` on are skipped. FileFormatError names file and line.
     """
     rows, order = [], None
-    for number, line in enumerate(_text(path, MAX_CSV_BYTES).splitlines(), start=1):
-        words = _words(line)
+    for number, line in enumerate(_read_text(path, MAX_CSV_BYTES).splitlines(), start=1):
+        words = _split_line(line)
         if not words:
             continue
         if order is None:
-            order = _header(path, words, number)
+            order = _parse_header(path, words, number)
             if order is not None:
                 continue
-            order = _plain_order(path, words, number)
+            order = _default_column_order(path, words, number)
         if len(rows) == MAX_POINTS:
             raise FileFormatError(path, f"more than {MAX_POINTS} points", number)
-        rows.append(_row(path, words, number, len(order)))
+        rows.append(_parse_row(path, words, number, len(order)))
     if not rows:
         raise FileFormatError(path, f"holds no points; {_EXPECTED}")
     return np.array(rows)[:, order]
 
 
-def _text(path: str | PathLike[str], limit: int) -> str:
+def _read_text(path: str | PathLike[str], limit: int) -> str:
     if Path(path).is_file() and Path(path).stat().st_size > limit:
         raise FileFormatError(path, f"is larger than {limit // 2**20} MiB, too large for a curve")
     try:
@@ -60,7 +60,7 @@ def _text(path: str | PathLike[str], limit: int) -> str:
     return text
 
 
-def _words(line: str) -> list[str]:
+def _split_line(line: str) -> list[str]:
     line = line.partition("#")[0].strip()
     if ";" in line:
         words = line.replace(",", ".").split(";")
@@ -71,7 +71,7 @@ def _words(line: str) -> list[str]:
     return [word.strip().strip('"') for word in words] if line else []
 
 
-def _header(path: str | PathLike[str], words: list[str], number: int) -> list[int] | None:
+def _parse_header(path: str | PathLike[str], words: list[str], number: int) -> list[int] | None:
     """Where the header says that x, (y,) z are; None if the line is no header."""
     if any(_is_number(word) for word in words):
         return None
@@ -82,13 +82,13 @@ def _header(path: str | PathLike[str], words: list[str], number: int) -> list[in
     raise FileFormatError(path, f"found the columns {shorten(','.join(words))}, {_EXPECTED}", number)
 
 
-def _plain_order(path: str | PathLike[str], words: list[str], number: int) -> list[int]:
+def _default_column_order(path: str | PathLike[str], words: list[str], number: int) -> list[int]:
     if len(words) not in map(len, _COLUMNS):
         raise FileFormatError(path, f"found {len(words)} column{'s' * (len(words) != 1)}, {_EXPECTED}", number)
     return list(range(len(words)))
 
 
-def _row(path: str | PathLike[str], words: list[str], number: int, columns: int) -> list[float]:
+def _parse_row(path: str | PathLike[str], words: list[str], number: int, columns: int) -> list[float]:
     if len(words) != columns:
         raise FileFormatError(path, f"found {len(words)} values where {columns} belong", number)
     values = [float(word) if _is_number(word) else math.nan for word in words]
@@ -115,16 +115,16 @@ def read_svg(path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_
     curve is the drawing's paths, which must touch end to start; without any <path>, its lines, polylines,
     circles and the like. Transforms are applied. FileFormatError for a file that is no such drawing.
     """
-    pieces = [_sampled(path, segment, metres_per_unit) for segment in _segments(path, metres_per_unit)]
+    pieces = [_sample_segment(path, segment, metres_per_unit) for segment in _read_segments(path, metres_per_unit)]
     points = np.concatenate(pieces)
     if len(points) > MAX_POINTS:
         raise FileFormatError(path, f"needs more than {MAX_POINTS} points; is --metres-per-unit right?")
     return points
 
 
-def _segments(path: str | PathLike[str], metres_per_unit: float) -> list:
+def _read_segments(path: str | PathLike[str], metres_per_unit: float) -> list:
     """Path segments in drawing order, each of which starts where the one before ended."""
-    segments = [segment for drawn in _drawn_paths(path) for segment in drawn]
+    segments = [segment for drawn in _read_svg_paths(path) for segment in drawn]
     if not segments:
         raise FileFormatError(path, "holds no drawn path")
     if len(segments) > MAX_SVG_SEGMENTS:
@@ -138,10 +138,10 @@ def _segments(path: str | PathLike[str], metres_per_unit: float) -> list:
     return segments
 
 
-def _drawn_paths(path: str | PathLike[str]) -> list:
+def _read_svg_paths(path: str | PathLike[str]) -> list:
     from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document
 
-    text = _text(path, MAX_SVG_BYTES)
+    text = _read_text(path, MAX_SVG_BYTES)
     try:
         document = Document.from_svg_string(text)
         for element in document.tree.iter():
@@ -156,7 +156,7 @@ def _drawn_paths(path: str | PathLike[str]) -> list:
         raise FileFormatError(path, f"cannot be read as an SVG drawing ({reason})") from error
 
 
-def _sampled(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
+def _sample_segment(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
     """A straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
     from svgpathtools import Line
 

@@ -16,18 +16,18 @@ from mapctl.curves import Curve
 
 
 @dataclass(frozen=True, eq=False)
-class CurveAxes:
+class LocalFrame:
     """The curve near each point; constants, without gradient."""
 
     place: Float[Tensor, "batch frames dims"]
     """The nearest place, metres."""
     axes: Float[Tensor, "batch frames dims dims"]
     """Unit rows: left on the ground, forward; in space a third, upward less what of it lies along the slope."""
-    straightened: Float[Tensor, "batch frames dims"]
+    tangent_extension: Float[Tensor, "batch frames dims"]
     """Where the arc looked around would lie if the curve went straight on from the nearest place, metres."""
 
 
-class _Tables(NamedTuple):
+class _CurveTables(NamedTuple):
     knots: np.ndarray
     corners: np.ndarray
     directions: np.ndarray
@@ -36,9 +36,9 @@ class _Tables(NamedTuple):
     half_base: float
 
 
-def axes_near(
+def find_local_frames(
     curve: Curve, points: Float[Tensor, "batch frames dims"], around: Float[Tensor, " frames"], *, reach: float
-) -> CurveAxes:
+) -> LocalFrame:
     """The nearest places within `reach` metres of the arcs `around`; results have the points' dtype.
 
     Points have the curve's dimensions. Arcs that are not finite give NaN.
@@ -47,12 +47,12 @@ def axes_near(
 
     arcs = around.detach().double().contiguous().numpy()
     known = points.detach().contiguous()
-    near = CurveAxes(torch.empty_like(known), known.new_empty(*known.shape, curve.dims), torch.empty_like(known))
-    filled = (near.place.numpy(), near.axes.numpy(), near.straightened.numpy())
-    local_frame_kernels.axes_near(_tables(curve), known.numpy(), arcs, reach, *filled)
+    near = LocalFrame(torch.empty_like(known), known.new_empty(*known.shape, curve.dims), torch.empty_like(known))
+    filled = (near.place.numpy(), near.axes.numpy(), near.tangent_extension.numpy())
+    local_frame_kernels.fill_local_frames(_build_tables(curve), known.numpy(), arcs, reach, *filled)
     return near
 
 
-def _tables(curve: Curve) -> _Tables:
+def _build_tables(curve: Curve) -> _CurveTables:
     knots, corners, directions = (table.numpy() for table in curve._tables)
-    return _Tables(knots, corners, directions, curve.closed, curve.length, curve._half_base)
+    return _CurveTables(knots, corners, directions, curve.closed, curve.length, curve._half_base)

@@ -4,15 +4,15 @@ import math
 
 import numpy as np
 
-from mapctl.numerics.jit import compilers
+from mapctl.numerics.jit import make_jit_decorators
 
-entry, inner = compilers("contract", "nsz")
+entry, inner = make_jit_decorators("contract", "nsz")
 
-_FAR = 1e9  # metres; beyond it, and for arcs that are no numbers, there is no segment to count
+_ARC_LIMIT = 1e9  # metres; beyond it, and for arcs that are no numbers, there is no segment to count
 
 
 @inner
-def segment_of(curve, arc):
+def find_segment(curve, arc):
     """The segment that an arc lies on, counted on through the laps of a closed curve, and the lap's first arc."""
     count, lap = len(curve.directions), 0.0
     if curve.closed:
@@ -22,9 +22,9 @@ def segment_of(curve, arc):
 
 
 @inner
-def place_at(curve, arc, place):
+def evaluate_position(curve, arc, place):
     """The place on the curve at an arc: straight on beyond open ends."""
-    segment = segment_of(curve, arc)
+    segment = find_segment(curve, arc)
     lap, index = segment // len(curve.directions), segment % len(curve.directions)
     along = arc - lap * curve.length - curve.knots[index]
     for k in range(len(place)):
@@ -32,10 +32,10 @@ def place_at(curve, arc, place):
 
 
 @inner
-def nearest_arc(curve, point, around, reach):
+def find_nearest_arc(curve, point, around, reach):
     """Arc of the place nearest to a point on the segments within reach of `around`; NaN if the point is."""
     best, found, count = math.inf, math.nan, len(curve.directions)
-    for segment in range(segment_of(curve, around - reach), segment_of(curve, around + reach) + 1):
+    for segment in range(find_segment(curve, around - reach), find_segment(curve, around + reach) + 1):
         lap, index = segment // count, segment % count
         along, apart = 0.0, 0.0
         for k in range(len(point)):
@@ -52,15 +52,15 @@ def nearest_arc(curve, point, around, reach):
 
 
 @inner
-def axes_at(curve, arc, axes):
+def evaluate_axes(curve, arc, axes):
     """Rows: left on the ground, forward (a chord's direction), and in space upward but for what lies forward."""
     ahead, behind, last = np.empty(axes.shape[1]), np.empty(axes.shape[1]), axes.shape[1] - 1
-    place_at(curve, arc + curve.half_base, ahead)
-    place_at(curve, arc - curve.half_base, behind)
+    evaluate_position(curve, arc + curve.half_base, ahead)
+    evaluate_position(curve, arc - curve.half_base, behind)
     ahead -= behind
     length = math.sqrt((ahead * ahead).sum())
     if length < 1e-6:  # at the tip of a way back on itself the chord vanishes
-        ahead[:] = curve.directions[segment_of(curve, arc) % len(curve.directions)]
+        ahead[:] = curve.directions[find_segment(curve, arc) % len(curve.directions)]
         length = math.sqrt((ahead * ahead).sum())
     ahead /= length
     ground = max(math.sqrt(ahead[0] * ahead[0] + ahead[last] * ahead[last]), 1e-9)
@@ -73,7 +73,7 @@ def axes_at(curve, arc, axes):
 
 
 @entry
-def axes_near(curve, points, around, reach, places, axes, straightened):
+def fill_local_frames(curve, points, around, reach, places, axes, straightened):
     """For points (batch, frames, dims) and arcs `around` (frames), see `curve_axes.CurveAxes`."""
     if curve.closed:
         reach = min(reach, 0.5 * curve.length)  # a lap holds every place once
@@ -81,12 +81,12 @@ def axes_near(curve, points, around, reach, places, axes, straightened):
     place, frame = np.empty(dims), np.empty((dims, dims))
     for b in range(len(points)):
         for t in range(len(around)):
-            if not abs(around[t]) < _FAR:
+            if not abs(around[t]) < _ARC_LIMIT:
                 places[b, t], axes[b, t], straightened[b, t] = math.nan, math.nan, math.nan
                 continue
-            arc = nearest_arc(curve, points[b, t], around[t], reach)
+            arc = find_nearest_arc(curve, points[b, t], around[t], reach)
             arc = arc if math.isfinite(arc) else around[t]
-            place_at(curve, arc, place)
-            axes_at(curve, arc, frame)
+            evaluate_position(curve, arc, place)
+            evaluate_axes(curve, arc, frame)
             places[b, t], axes[b, t] = place, frame
             straightened[b, t] = place + (around[t] - arc) * frame[1]

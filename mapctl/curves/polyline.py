@@ -17,11 +17,13 @@ MIN_LENGTH, MAX_LENGTH = 0.01, 100_000.0
 MAX_POINTS = 1_000_000
 """Most points that a curve may be given with, and has."""
 
-_SAME_PLACE = 1e-6  # metres; nearer neighbours are one point
+_COINCIDENT = 1e-6  # metres; nearer neighbours are one point
 _CLOSED_GAP = 1e-3  # metres; ends nearer than this meet
 
 
-def dense_polyline(points: ndarray | Tensor, closed: bool | None = None) -> tuple[Float[Tensor, "dense dims"], bool]:
+def build_dense_polyline(
+    points: ndarray | Tensor, closed: bool | None = None
+) -> tuple[Float[Tensor, "dense dims"], bool]:
     """The polyline through `points` (n, 2 or 3; metres), vertices about 1 cm apart, and whether it is closed.
 
     Straight pieces are divided evenly; of points denser than 1 cm the one that bends the curve most is kept
@@ -29,21 +31,21 @@ def dense_polyline(points: ndarray | Tensor, closed: bool | None = None) -> tupl
     the points' usual spacing, of each other; a closed polyline repeats its first point at the end. Raises
     RequestError with the reason where points make no curve.
     """
-    given = _checked(points)
-    distinct = given[np.r_[True, _spans(given) > _SAME_PLACE]]
+    given = _check_points(points)
+    distinct = given[np.r_[True, _span_lengths(given) > _COINCIDENT]]
     if len(distinct) < 2:
         raise RequestError("a curve needs at least 2 distinct points, got 1")
     closed = _ends_meet(distinct) if closed is None else closed
     if closed:
-        distinct = _closed(distinct)
-    length = _spans(distinct).sum()
+        distinct = _close_polyline(distinct)
+    length = _span_lengths(distinct).sum()
     if not MIN_LENGTH <= length <= MAX_LENGTH:
         raise RequestError(f"the curve is {length:.6g} m long, allowed are {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
     spacing = max(SPACING, length / MAX_POINTS)
-    return torch.from_numpy(_divided(_thinned(distinct, spacing), spacing)), closed
+    return torch.from_numpy(_subdivide(_thin_points(distinct, spacing), spacing)), closed
 
 
-def _checked(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
+def _check_points(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
     given = np.asarray(points, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] not in (2, 3):
         raise RequestError(f"a curve's points have the shape (n, 2) or (n, 3), got {given.shape}")
@@ -57,25 +59,25 @@ def _checked(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
     return given
 
 
-def _spans(points: ndarray) -> ndarray:
+def _span_lengths(points: ndarray) -> ndarray:
     return np.linalg.norm(np.diff(points, axis=0), axis=1)
 
 
 def _ends_meet(points: ndarray) -> bool:
     gap = np.linalg.norm(points[-1] - points[0])
-    return len(points) > 2 and bool(gap <= max(_CLOSED_GAP, 0.5 * np.median(_spans(points))))
+    return len(points) > 2 and bool(gap <= max(_CLOSED_GAP, 0.5 * np.median(_span_lengths(points))))
 
 
-def _closed(points: ndarray) -> ndarray:
+def _close_polyline(points: ndarray) -> ndarray:
     """With the first point repeated at the end, exactly."""
     if np.linalg.norm(points[-1] - points[0]) <= _CLOSED_GAP:
         points = points[:-1]
     return np.concatenate([points, points[:1]])
 
 
-def _thinned(points: ndarray, spacing: float) -> ndarray:
+def _thin_points(points: ndarray, spacing: float) -> ndarray:
     """Both ends, and of the points in each piece of `spacing` metres the one farthest from its chord."""
-    arcs = np.r_[0.0, np.cumsum(_spans(points))]
+    arcs = np.r_[0.0, np.cumsum(_span_lengths(points))]
 
     def place(at: ndarray) -> ndarray:
         return np.stack([np.interp(at, arcs, axis) for axis in points.T], axis=1)
@@ -89,9 +91,9 @@ def _thinned(points: ndarray, spacing: float) -> ndarray:
     return points[np.sort(best)]
 
 
-def _divided(points: ndarray, spacing: float) -> ndarray:
+def _subdivide(points: ndarray, spacing: float) -> ndarray:
     """Every straight piece cut into equal parts of at most `spacing` metres."""
-    parts = np.maximum(1, np.ceil(_spans(points) / spacing - 1e-9)).astype(np.int64)
+    parts = np.maximum(1, np.ceil(_span_lengths(points) / spacing - 1e-9)).astype(np.int64)
     piece = np.repeat(np.arange(len(parts)), parts)
     step = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)
     inner = points[piece] + (step / parts[piece])[:, None] * np.diff(points, axis=0)[piece]

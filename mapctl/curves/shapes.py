@@ -28,7 +28,7 @@ class Shape:
     """As typed."""
 
 
-def _turns(*arcs: tuple[float, float]) -> ndarray:
+def _join_circular_arcs(*arcs: tuple[float, float]) -> ndarray:
     """Circular arcs (signed radius, left positive; angle), joined smoothly, from the origin along +Z."""
     place, heading, pieces = np.zeros(2), 0.0, [np.zeros((1, 2))]
     for radius, angle in arcs:
@@ -42,15 +42,15 @@ def _turns(*arcs: tuple[float, float]) -> ndarray:
 
 
 def _circle(radius: float) -> ndarray:
-    return _turns((radius, 2 * math.pi))
+    return _join_circular_arcs((radius, 2 * math.pi))
 
 
 def _figure8(radius: float) -> ndarray:
-    return _turns((radius, 2 * math.pi), (-radius, 2 * math.pi))
+    return _join_circular_arcs((radius, 2 * math.pi), (-radius, 2 * math.pi))
 
 
 def _s(length: float) -> ndarray:
-    return _turns((length / 4, math.pi), (-length / 4, math.pi))
+    return _join_circular_arcs((length / 4, math.pi), (-length / 4, math.pi))
 
 
 def _line(length: float) -> ndarray:
@@ -72,11 +72,11 @@ SHAPES: Mapping[str, Shape] = {
     "line": Shape(("length",), _line, False, "line:10"),
     "wave": Shape(("amplitude", "length"), _wave, False, "wave:1x8"),
 }
-ALLOWED = ", ".join(shape.example for shape in SHAPES.values())
+SHAPE_EXAMPLES = ", ".join(shape.example for shape in SHAPES.values())
 """What may be typed, for messages."""
 
 
-def shape_points(name: str, sizes: Mapping[str, float]) -> ndarray:
+def sample_shape(name: str, sizes: Mapping[str, float]) -> ndarray:
     """Points of a built-in curve. RequestError for a size that is not from 1 cm to 10 km."""
     for size, value in sizes.items():
         if not MIN_SIZE <= value <= MAX_SIZE:
@@ -87,12 +87,12 @@ def shape_points(name: str, sizes: Mapping[str, float]) -> ndarray:
     return points
 
 
-def parse_sizes(text: str) -> tuple[str, dict[str, float]]:
+def parse_shape(text: str) -> tuple[str, dict[str, float]]:
     """Name and sizes of a shape as typed: `wave:1x8`. RequestError says what may be typed."""
     name, _, numbers = text.partition(":")
     shape = SHAPES.get(name.strip().lower())
     if shape is None:
-        raise RequestError(f"unknown curve {text!r}: expected {ALLOWED}, or a CSV or SVG file")
+        raise RequestError(f"unknown curve {text!r}: expected {SHAPE_EXAMPLES}, or a CSV or SVG file")
     words = numbers.lower().split("x")
     try:
         values = [float(word) for word in words]

@@ -20,14 +20,17 @@ if TYPE_CHECKING:
     from mapctl.curves.curve import Curve
 
 _STEP = 0.02  # metres between neighbouring arcs, and between the walk's places that are looked at
-_MOST = 10_000  # places and arcs: of long walks both lie farther apart
-_FASTEST = 3  # times the walk's own way: how fast the arc goes where a bend or a corner is cut
-_BACKWARD = 0.3**2  # square metres: going back must explain the walk better than going on or staying by 0.3 m
-_HOPELESS = 3.0 / _STEP  # squared metres, summed: what explains the walk so much worse is given up
-_ROOM, _TIE = 0.04, 0.01  # metres between refined arcs; of two equally near the one nearer to the tracked arc is taken
+_MAX_ARCS = 10_000  # places and arcs: of long walks both lie farther apart
+_MAX_PACE_RATIO = 3  # times the walk's own way: how fast the arc goes where a bend or a corner is cut
+_BACKWARD_COST = 0.3**2  # square metres: going back must explain the walk better than going on or staying by 0.3 m
+_PRUNING_MARGIN = 3.0 / _STEP  # squared metres, summed: what explains the walk so much worse is given up
+_REFINED_STEP, _TIE_BREAK = (
+    0.04,
+    0.01,
+)  # metres between refined arcs; of two equally near the one nearer to the tracked arc is taken
 
 
-def track(
+def track_arcs(
     curve: "Curve", points: Float[Tensor, "frames dims"], *, start: float | None, reach: float
 ) -> Float[Tensor, " frames"]:
     """Arcs of a walk, metres, not wrapped; beyond open ends the curve goes on straight.
@@ -36,7 +39,7 @@ def track(
     `reach` metres of the tracked one.
     """
     walked = torch.cat([points.new_zeros(1), points.diff(dim=0).norm(dim=-1).cumsum(0)])
-    grid = _Grid.of(curve, float(walked[-1]) + reach)
+    grid = _ArcGrid.of(curve, float(walked[-1]) + reach)
     count = 1 + math.ceil(float(walked[-1]) / grid.step)
     at = np.linspace(0, float(walked[-1]), count)
     places = np.stack([np.interp(at, walked.numpy(), column) for column in points.numpy().T], axis=-1)
@@ -44,12 +47,12 @@ def track(
         first, last = 0, grid.lap
     else:
         first, last = math.floor((start - reach) / grid.step), math.ceil((start + reach) / grid.step)
-    arcs = np.interp(walked.numpy(), at, grid.step * _best_way(grid, places, first, last + 1))
-    return _refined(curve, points, torch.from_numpy(arcs), reach)
+    arcs = np.interp(walked.numpy(), at, grid.step * _find_best_arcs(grid, places, first, last + 1))
+    return _refine_arcs(curve, points, torch.from_numpy(arcs), reach)
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
+class _ArcGrid:
     """Evenly spaced arcs; number n lies n steps from the curve's start."""
 
     step: float
@@ -64,14 +67,14 @@ class _Grid:
     """Whether the numbers go round."""
 
     @staticmethod
-    def of(curve: "Curve", beyond: float) -> "_Grid":
+    def of(curve: "Curve", beyond: float) -> "_ArcGrid":
         """Over the whole curve, and `beyond` metres straight on from open ends."""
-        step = max(_STEP, (curve.length + beyond) / _MOST)
+        step = max(_STEP, (curve.length + beyond) / _MAX_ARCS)
         lap = max(8, math.ceil(curve.length / step))
         step = curve.length / lap
         more = 0 if curve.closed else math.ceil(beyond / step) + 1
         numbers = torch.arange(-more, lap + more + (not curve.closed), dtype=torch.float64)
-        return _Grid(step, curve.point(numbers * step).numpy(), -more, lap, curve.closed)
+        return _ArcGrid(step, curve.point(numbers * step).numpy(), -more, lap, curve.closed)
 
     def within(self, first: int, stop: int) -> tuple[int, int]:
         """The numbers of a range that there are."""
@@ -84,17 +87,19 @@ class _Grid:
         return np.square(near - point).sum(-1)
 
 
-def _best_way(grid: _Grid, places: Float[ndarray, "count dims"], first: int, stop: int) -> Float[ndarray, " count"]:
+def _find_best_arcs(
+    grid: _ArcGrid, places: Float[ndarray, "count dims"], first: int, stop: int
+) -> Float[ndarray, " count"]:
     """Numbers of the arcs at the walk's places; the first is one of first to stop."""
-    most = _FASTEST + 1
+    most = _MAX_PACE_RATIO + 1
     # Columns: from how many arcs ahead (going back) to how many behind (going on); of equal ways the slowest.
     moves = np.arange(most, -most - 1, -1)
-    price = np.where(moves > 0, _BACKWARD * moves, 0.0) + 1e-9 * abs(moves)
+    price = np.where(moves > 0, _BACKWARD_COST * moves, 0.0) + 1e-9 * abs(moves)
     first, stop = grid.within(first, stop)
     cost = grid.squared_distances(places[0], first, stop)
     cameby: list[tuple[int, ndarray]] = []
     for place in places[1:]:
-        first, stop, cost = _promising(first, cost)
+        first, stop, cost = _prune_arcs(first, cost)
         low, high = grid.within(first - most, stop + most)
         padded = np.pad(cost, 2 * most, constant_values=np.inf)[low - first + most : high - first + 3 * most]
         around = np.lib.stride_tricks.sliding_window_view(padded, 2 * most + 1)[:, ::-1] + price
@@ -109,22 +114,25 @@ def _best_way(grid: _Grid, places: Float[ndarray, "count dims"], first: int, sto
     return np.array(found[::-1], dtype=float)
 
 
-def _promising(first: int, cost: Float[ndarray, " arcs"]) -> tuple[int, int, Float[ndarray, " fewer"]]:
+def _prune_arcs(first: int, cost: Float[ndarray, " arcs"]) -> tuple[int, int, Float[ndarray, " fewer"]]:
     """The range of arcs outside of which none may still turn out best."""
-    alive = np.flatnonzero(cost <= cost.min() + _HOPELESS)
+    alive = np.flatnonzero(cost <= cost.min() + _PRUNING_MARGIN)
     low, high = int(alive[0]), int(alive[-1]) + 1
     return first + low, first + high, cost[low:high]
 
 
-def _refined(
+def _refine_arcs(
     curve: "Curve", points: Float[Tensor, "frames dims"], arcs: Float[Tensor, " frames"], reach: float
 ) -> Float[Tensor, " frames"]:
     """The nearest arcs on the branch that was found."""
-    room = torch.arange(-math.ceil(reach / _ROOM), math.ceil(reach / _ROOM) + 1, dtype=torch.float64) * _ROOM
+    room = (
+        torch.arange(-math.ceil(reach / _REFINED_STEP), math.ceil(reach / _REFINED_STEP) + 1, dtype=torch.float64)
+        * _REFINED_STEP
+    )
     found = []
     for some, around in zip(points.split(4096), arcs.split(4096), strict=True):  # keeps memory small
         tried = around[:, None] + room
-        apart = (curve.point(tried) - some[:, None]).square().sum(-1) + _TIE * room.abs()
+        apart = (curve.point(tried) - some[:, None]).square().sum(-1) + _TIE_BREAK * room.abs()
         near = tried.gather(1, apart.argmin(-1, keepdim=True))[:, 0]
-        found.append(curve.nearest(some, around=near, reach=_ROOM))
+        found.append(curve.nearest(some, around=near, reach=_REFINED_STEP))
     return torch.cat(found)

@@ -7,7 +7,7 @@ from pathlib import PurePath
 
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import acclaim, bvh, npz
-from mapctl.formats.missing import Missing
+from mapctl.formats.missing import MissingValues
 from mapctl.motion import Motion
 
 
@@ -24,10 +24,10 @@ def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load}
-_LOSSY_READERS: dict[str, Callable[[str | PathLike[str]], tuple[Motion, Missing]]] = {
-    ".bvh": bvh.load_lossy,
+_READERS_WITH_MISSING: dict[str, Callable[[str | PathLike[str]], tuple[Motion, MissingValues]]] = {
+    ".bvh": bvh.load_with_missing,
     ".npz": npz.load_lossy,
-    ".amc": acclaim.load_lossy,
+    ".amc": acclaim.load_with_missing,
 }
 WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
     ".bvh": bvh.save,
@@ -38,7 +38,7 @@ WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
     ".usd": _save_usd,
 }
 _USD = (".usda", ".usdc", ".usd")
-_WHY_NOT = {
+_UNREADABLE_REASONS = {
     ".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
     ".glb": "can be written but not read",
     **dict.fromkeys(_USD, "can be written but not read"),
@@ -52,30 +52,32 @@ def load(
 
     `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit`
     wins over what is found by the size of the body, in formats whose unit is not fixed. FileFormatError says what is
-    wrong with the file, and where: NaN in place of a number, too, which `load_lossy` takes.
+    wrong with the file, and where: NaN in place of a number, too, which `load_with_missing` takes.
     """
-    ending = _readable(path)
+    ending = _check_readable(path)
     if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
     motion = READERS[ending](path) if fps is None else acclaim.load(path, fps=fps)
-    return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit)
+    return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit)
 
 
-def load_lossy(path: str | PathLike[str], *, metres_per_unit: float | None = None) -> tuple[Motion, Missing]:
+def load_with_missing(
+    path: str | PathLike[str], *, metres_per_unit: float | None = None
+) -> tuple[Motion, MissingValues]:
     """Read a motion as `load` does, from a file that may have NaN where something was lost, and what was.
 
     The motion is finite: joints stay as they were last known, places go straight from one known place to the next.
     FileFormatError where nothing is known.
     """
-    motion, missing = _LOSSY_READERS[_readable(path)](path)
-    return motion if metres_per_unit is None else bvh.in_unit(motion, metres_per_unit), missing
+    motion, missing = _READERS_WITH_MISSING[_check_readable(path)](path)
+    return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit), missing
 
 
-def _readable(path: str | PathLike[str]) -> str:
+def _check_readable(path: str | PathLike[str]) -> str:
     """The ending; FileFormatError unless it is one of `READERS`."""
     ending = PurePath(path).suffix.lower()
     if ending not in READERS:
-        why = _WHY_NOT.get(ending, f"cannot read the ending {ending!r}")
+        why = _UNREADABLE_REASONS.get(ending, f"cannot read the ending {ending!r}")
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
     return ending
 

@@ -24,16 +24,18 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     scratch = target.with_name(f".{secrets.token_hex(4)}{target.suffix}")
     try:
-        _check_place(path, target)
+        _check_target(path, target)
         scratch.touch(exist_ok=False)
-        mode = _mode(target if target.exists() else scratch)
-        _permit(scratch, mode | stat.S_IWUSR)  # from the beginning: what nobody may read is not shown in the meantime
+        mode = _permissions(target if target.exists() else scratch)
+        _set_permissions(
+            scratch, mode | stat.S_IWUSR
+        )  # from the beginning: what nobody may read is not shown in the meantime
         yield scratch
         _flush_to_disk(scratch)
-        _permit(scratch, mode)
+        _set_permissions(scratch, mode)
         scratch.replace(target)
     except OSError as error:
-        raise _refusal(path, error) from error
+        raise _write_error(path, error) from error
     finally:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
@@ -54,11 +56,11 @@ def check_writable(path: str | PathLike[str]) -> None:
     """WriteError if `path` cannot be written; leaves no trace. For use before long work."""
     target = Path(os.path.realpath(path))
     try:
-        _check_place(path, target)
+        _check_target(path, target)
         with tempfile.NamedTemporaryFile(dir=target.parent):
             pass
     except OSError as error:
-        raise _refusal(path, error) from error
+        raise _write_error(path, error) from error
 
 
 def check_folder(folder: str | PathLike[str]) -> None:
@@ -71,12 +73,12 @@ def check_folder(folder: str | PathLike[str]) -> None:
     check_writable(place / ".mapctl")
 
 
-def _refusal(path: str | PathLike[str], error: OSError) -> WriteError:
+def _write_error(path: str | PathLike[str], error: OSError) -> WriteError:
     kind = DiskFullError if error.errno in (errno.ENOSPC, errno.EDQUOT) else WriteError
     return kind(f"cannot write {path}: {error.strerror or error}")
 
 
-def _check_place(path: str | PathLike[str], target: Path) -> None:
+def _check_target(path: str | PathLike[str], target: Path) -> None:
     """Renaming onto a folder or a device (/dev/null) would fail late or replace it, so refuse both early."""
     if not os.fspath(path):
         raise WriteError("cannot write a file with an empty name")
@@ -88,13 +90,13 @@ def _check_place(path: str | PathLike[str], target: Path) -> None:
         raise WriteError(f"cannot write {path}: it is not a regular file")
 
 
-def _mode(path: Path) -> int:
+def _permissions(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def _permit(scratch: Path, mode: int) -> None:
+def _set_permissions(scratch: Path, mode: int) -> None:
     """Libraries that write a file of their own and rename it (safetensors) leave it readable by nobody else."""
-    if _mode(scratch) != mode:
+    if _permissions(scratch) != mode:
         with suppress(PermissionError):  # file systems that know no permissions
             scratch.chmod(mode)
 

@@ -12,9 +12,9 @@ import pygltflib
 from mapctl import __version__
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_bytes
-from mapctl.formats.skinned import SkinnedBody, skinned
+from mapctl.formats.skinned import SkinnedBody, build_skinned_body
 from mapctl.motion import Motion
-from mapctl.rotations import sign_continuous
+from mapctl.rotations import make_sign_continuous
 
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENT = {"float32": pygltflib.FLOAT, "uint16": pygltflib.UNSIGNED_SHORT, "uint32": pygltflib.UNSIGNED_INT}
@@ -58,9 +58,9 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}"))
     buffer = _Buffer(document)
     joints = motion.num_joints
-    document.nodes = _nodes(motion)
-    body = skinned(motion)
-    document.meshes = [_mesh(body, buffer)]
+    document.nodes = _build_nodes(motion)
+    body = build_skinned_body(motion)
+    document.meshes = [_build_mesh(body, buffer)]
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
     document.skins = [
@@ -71,7 +71,7 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     document.nodes.append(pygltflib.Node(name="mannequin", mesh=0, skin=0))
     document.scenes = [pygltflib.Scene(nodes=[0, len(document.nodes) - 1])]
     document.scene = 0
-    document.animations = [_animation(motion, buffer)]
+    document.animations = [_build_animation(motion, buffer)]
     document.materials = [
         pygltflib.Material(
             name="mannequin",
@@ -85,7 +85,7 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     return b"".join(document.save_to_bytes())
 
 
-def _nodes(motion: Motion) -> list[pygltflib.Node]:
+def _build_nodes(motion: Motion) -> list[pygltflib.Node]:
     """A node a joint, in file order, then one for each End Site."""
     skeleton, offsets = motion.skeleton, motion.skeleton.offsets.clone()
     offsets[0] = motion.root_position[0]
@@ -102,7 +102,7 @@ def _nodes(motion: Motion) -> list[pygltflib.Node]:
     return [*joints, *ends]
 
 
-def _mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
+def _build_mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
     carrier = np.zeros((len(body.joint), 4), np.uint16)
     carrier[:, 0] = body.joint
     weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(carrier), 1))
@@ -119,11 +119,11 @@ def _mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
     )
 
 
-def _animation(motion: Motion, buffer: _Buffer) -> pygltflib.Animation:
+def _build_animation(motion: Motion, buffer: _Buffer) -> pygltflib.Animation:
     times = buffer.add((np.arange(motion.num_frames) / float(motion.fps)).astype(np.float32))
     animation = pygltflib.Animation(name="motion", channels=[], samplers=[])
     travelling = {0: motion.root_position, **motion.moving_offsets}
-    quats = sign_continuous(motion.local_quat_xyzw)
+    quats = make_sign_continuous(motion.local_quat_xyzw)
     tracks = [(joint, "translation", values) for joint, values in travelling.items()]
     tracks += [(joint, "rotation", quats[:, joint]) for joint in range(motion.num_joints)]
     for joint, path, values in tracks:

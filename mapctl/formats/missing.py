@@ -14,7 +14,7 @@ _FORMS = re.compile(r"(?<!\S)[+-]?(?:nan(?:\([^\s)]*\))?|1\.#(?:ind|qnan|snan)\S
 
 
 @dataclass(frozen=True, eq=False)
-class Missing:
+class MissingValues:
     """Where the numbers of a motion stand for nothing: the file has NaN there."""
 
     rotations: Bool[Tensor, "frames joints"]
@@ -28,23 +28,23 @@ def is_nan(word: str) -> bool:
     return _FORMS.fullmatch(word) is not None
 
 
-def plain(text: str) -> str:
+def normalise_nan(text: str) -> str:
     """The text with such words in the one form that numpy reads."""
     return _FORMS.sub("nan", text) if "#" in text else text
 
 
-def hint(word: str) -> str:
+def missing_hint(word: str) -> str:
     """What to add to the refusal of a word."""
     return "; `mapctl infill` fills in what is lost" if is_nan(word) else ""
 
 
-def check_any(path: str | PathLike[str], lost: np.ndarray) -> None:
+def check_any_known(path: str | PathLike[str], lost: np.ndarray) -> None:
     """FileFormatError where nothing is known."""
     if lost.size and lost.all():
         raise FileFormatError(path, "every value is nan: nothing is known of the motion")
 
 
-def held(values: np.ndarray) -> np.ndarray:
+def hold_last(values: np.ndarray) -> np.ndarray:
     """Columns (frames, width) with the last known number in place of NaN, at first the first; 0 where none is known."""
     known = ~np.isnan(values)
     if known.all():
@@ -54,7 +54,7 @@ def held(values: np.ndarray) -> np.ndarray:
     return np.where(known.any(axis=0), np.take_along_axis(values, nearest, axis=0), 0.0)
 
 
-def bridged(values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+def interpolate_nan(values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     """Columns (frames, width) straight between the known numbers around NaN; `otherwise` (width,) where none is."""
     done, frame = values.copy(), np.arange(len(values))
     for column in np.flatnonzero(np.isnan(values).any(axis=0)):

@@ -28,7 +28,7 @@ from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
-from mapctl.formats.missing import Missing
+from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, read_bytes, shorten
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
@@ -76,24 +76,24 @@ def load(path: str | PathLike[str]) -> Motion:
     return _read(path, lossy=False)[0]
 
 
-def load_lossy(path: str | PathLike[str]) -> tuple[Motion, Missing]:
+def load_lossy(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
     """Read an archive in which rotations and places of some frames are NaN, and which they are; FileFormatError where
     all of them are.
     """
     return _read(path, lossy=True)
 
 
-def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, Missing]:
+def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
     arrays = _read_arrays(path, read_bytes(path))
     _check_shapes(path, arrays, lossy=lossy)
-    lost = _missing(path, arrays)
+    lost = _replace_missing(path, arrays)
     if (found := str(arrays["format"])) != FORMAT:
         raise FileFormatError(path, f"format is {found[:40]!r}, expected {FORMAT!r}")
     _check_rotations(path, arrays["local_quat_xyzw"])
     try:
-        return _motion(arrays), lost
+        return _build_motion(arrays), lost
     except (MapctlError, ZeroDivisionError, ValueError, IndexError) as error:
-        raise FileFormatError(path, f"does not hold a motion: {_reason(error)}") from error
+        raise FileFormatError(path, f"does not hold a motion: {_shorten_reason(error)}") from error
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
@@ -125,7 +125,7 @@ def _arrays(motion: Motion) -> dict[str, np.ndarray]:
     }
 
 
-def _motion(arrays: dict[str, np.ndarray]) -> Motion:
+def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
     names, parents = arrays["names"].tolist(), arrays["parents"].tolist()
     end_names, moving = arrays["end_names"].tolist(), arrays["moving_joints"].tolist()
     if not set(end_names) <= set(names) or not set(moving) <= set(range(1, len(names))):
@@ -156,14 +156,14 @@ def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]
             _check_members(path, archive)
             return {key: _read_array(archive, key) for key in _KEYS}
     except _UNSOUND as error:
-        raise FileFormatError(path, f"is not a sound .npz archive: {_reason(error)}") from error
+        raise FileFormatError(path, f"is not a sound .npz archive: {_shorten_reason(error)}") from error
 
 
 def _read_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
     return np.lib.format.read_array(io.BytesIO(archive.read(f"{key}.npy")), allow_pickle=False)
 
 
-def _reason(error: Exception) -> str:
+def _shorten_reason(error: Exception) -> str:
     """In one short line: zipfile quotes pieces of the file, and a name may be a megabyte."""
     text = " ".join(str(error).split())
     return text if text.isprintable() and len(text) <= 200 else shorten(text, 160)
@@ -192,14 +192,14 @@ def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray], *, l
             small = small | np.isnan(values)
         if not small.all():
             place = np.argwhere(~small)[0].tolist()
-            hint = missing.hint(str(values[tuple(place)])) if key in _TRACKS else ""
+            hint = missing.missing_hint(str(values[tuple(place)])) if key in _TRACKS else ""
             raise FileFormatError(path, f"{key} at {place}: expected {NUMBER}{hint}")
 
 
-def _missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> Missing:
+def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> MissingValues:
     """What is NaN, which is replaced in the arrays."""
     lost: list[np.ndarray] = [np.isnan(arrays[key]) for key in _TRACKS]
-    missing.check_any(path, np.concatenate([part.ravel() for part in lost]))
+    missing.check_any_known(path, np.concatenate([part.ravel() for part in lost]))
     root, turns, moving = lost
     places = np.zeros_like(turns[:, :, 0])
     places[:, 0] = root.any(axis=-1)
@@ -208,16 +208,16 @@ def _missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> Missin
             places[:, joint] = moving[track].any(axis=-1)
     if any(part.any() for part in lost):
         whole = np.where(turns.any(axis=-1, keepdims=True), np.nan, arrays["local_quat_xyzw"])
-        held = missing.held(whole.reshape(len(whole), -1)).reshape(whole.shape)
+        held = missing.hold_last(whole.reshape(len(whole), -1)).reshape(whole.shape)
         never = ~held.any(axis=-1)
         held[never] = (0.0, 0.0, 0.0, 1.0)
-        tracks = [missing.bridged(track, np.zeros(3)) for track in arrays["moving_offsets"]]
+        tracks = [missing.interpolate_nan(track, np.zeros(3)) for track in arrays["moving_offsets"]]
         arrays |= {
             "local_quat_xyzw": held,
             "moving_offsets": np.array(tracks).reshape(moving.shape),
-            "root_position_world": missing.bridged(arrays["root_position_world"], np.zeros(3)),
+            "root_position_world": missing.interpolate_nan(arrays["root_position_world"], np.zeros(3)),
         }
-    return Missing(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(places))
+    return MissingValues(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(places))
 
 
 def _check_rotations(path: str | PathLike[str], quat_xyzw: np.ndarray) -> None:

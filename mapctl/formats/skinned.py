@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapctl.mesh.primitives import Array
-from mapctl.mesh.skinning import skin
+from mapctl.mesh.skinning import build_skin
 from mapctl.motion import Motion
 
 
@@ -29,14 +29,14 @@ class SkinnedBody:
     """(n,) index of the joint that moves a vertex."""
 
 
-def skinned(motion: Motion) -> SkinnedBody:
+def build_skinned_body(motion: Motion) -> SkinnedBody:
     """The mannequin of a motion."""
-    body, rest = skin(motion), _rest(motion)
+    body, rest = build_skin(motion), _rest_positions(motion)
     linear = np.where(body.rgb <= 0.04045, body.rgb / 12.92, ((body.rgb + 0.055) / 1.055) ** 2.4)
     return SkinnedBody(rest, body.vertices + rest[body.joint], body.normals, body.faces, linear, body.joint)
 
 
-def _rest(motion: Motion) -> Array:
+def _rest_positions(motion: Motion) -> Array:
     """(joints, 3) joints with all rotations zero and the root at the origin, metres."""
     offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
     for joint, parent in enumerate(motion.skeleton.parents):

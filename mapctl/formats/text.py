@@ -46,7 +46,7 @@ def shorten(word: str, limit: int = 40) -> str:
 
 
 @lru_cache(maxsize=256)
-def tell(message: str) -> None:
+def warn_once(message: str) -> None:
     """One line on standard error of what was read otherwise than it stands in a file; said once."""
     print(f"mapctl: {message}", file=sys.stderr)
 

@@ -13,7 +13,7 @@ from mapctl.errors import FileFormatError
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Of dataclasses that are read: no key but their fields, and finite numbers."""
-_LONGEST = 60  # characters of a wrong value that are shown
+_MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 T = TypeVar("T")
 
@@ -23,16 +23,16 @@ def read(path: str | PathLike[str], kind: type[T], *, what: str, unknown: Callab
     `key[1].facing_deg: ...`, in one line; `unknown` tells which keys there are where one is not known. What `kind`
     itself raises passes.
     """
-    table = json.dumps(_table(path, what), default=str)
+    table = json.dumps(_parse_toml(path, what), default=str)
     try:
         return TypeAdapter(kind).validate_json(table, strict=True)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in fault["loc"]).lstrip(".")
-        raise FileFormatError(path, f"{where}: {_words(fault, unknown)}") from error
+        raise FileFormatError(path, f"{where}: {_describe_fault(fault, unknown)}") from error
 
 
-def _table(path: str | PathLike[str], what: str) -> Mapping[str, Any]:
+def _parse_toml(path: str | PathLike[str], what: str) -> Mapping[str, Any]:
     try:
         return tomllib.loads(Path(path).read_bytes().decode("utf-8"))
     except OSError as error:
@@ -43,11 +43,11 @@ def _table(path: str | PathLike[str], what: str) -> Mapping[str, Any]:
         raise FileFormatError(path, f"not TOML: {error}") from error
 
 
-def _words(fault: Mapping[str, Any], unknown: Callable[[Sequence[int | str]], str]) -> str:
+def _describe_fault(fault: Mapping[str, Any], unknown: Callable[[Sequence[int | str]], str]) -> str:
     if fault["type"] == "unexpected_keyword_argument":
         return f"there is no such key; {unknown(fault['loc'])}"
     if fault["type"] == "missing":
         return "this key is needed"
     came, message = json.dumps(fault["input"], default=str), str(fault["msg"])
-    shown = came if len(came) <= _LONGEST else came[: _LONGEST - 3] + "..."
+    shown = came if len(came) <= _MAX_SHOWN else came[: _MAX_SHOWN - 3] + "..."
     return f"{message[0].lower()}{message[1:]}, got {shown}"

@@ -33,7 +33,7 @@ def metres_per_unit(
     ends = {joint: float(np.linalg.norm(offset)) for joint, offset in end_offsets.items()}
     size, fits = leg_length(names, parents, lengths, ends, moving), LEG_METRES
     if size == 0:
-        size, fits = reach(parents, lengths, ends), REACH_METRES
+        size, fits = longest_chain_length(parents, lengths, ends), REACH_METRES
     if size == 0:
         return 0.01
     for unit in UNITS_IN_METRES:
@@ -51,8 +51,8 @@ def leg_length(
     moving: Collection[int] = (),
 ) -> float:
     """Hips to toes along the bones, or to the foot's End Site if there are no toes; 0 if no foot is named."""
-    plain = [_plain(name) for name in names]
-    joint = _first(_TOES, plain) or _first(_FEET, plain)
+    plain = [_normalise_name(name) for name in names]
+    joint = _first_named(_TOES, plain) or _first_named(_FEET, plain)
     if joint is None:
         return 0.0
     length = 0.0 if _any_in(_TOES, plain[joint]) else ends.get(joint, 0.0)
@@ -61,7 +61,7 @@ def leg_length(
     return length
 
 
-def reach(parents: Sequence[int], lengths: np.ndarray, ends: Mapping[int, float]) -> float:
+def longest_chain_length(parents: Sequence[int], lengths: np.ndarray, ends: Mapping[int, float]) -> float:
     """The longest way from the root to a leaf or End Site along the bones, in the unit of `lengths`."""
     way = np.zeros(len(parents))
     for joint in range(1, len(parents)):
@@ -69,12 +69,12 @@ def reach(parents: Sequence[int], lengths: np.ndarray, ends: Mapping[int, float]
     return float(max(way[joint] + ends.get(joint, 0.0) for joint in range(len(parents))))
 
 
-def _plain(name: str) -> str:
+def _normalise_name(name: str) -> str:
     """`mixamorig:LeftToe_Base` as `lefttoebase`."""
     return "".join(filter(str.isalnum, name.rpartition(":")[2])).lower()
 
 
-def _first(words: Sequence[str], names: Sequence[str]) -> int | None:
+def _first_named(words: Sequence[str], names: Sequence[str]) -> int | None:
     return next((joint for joint, name in enumerate(names) if _any_in(words, name)), None)
 
 

@@ -22,9 +22,9 @@ import numpy as np
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
 from mapctl.formats.bvh import all_translations, as_array, check_finite
-from mapctl.formats.skinned import SkinnedBody, skinned
+from mapctl.formats.skinned import SkinnedBody, build_skinned_body
 from mapctl.motion import Motion
-from mapctl.rotations import sign_continuous
+from mapctl.rotations import make_sign_continuous
 from mapctl.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write the motion with its skinned mannequin. RequestError where it holds a NaN or USD is not installed."""
     check_installed(path)
     check_finite(motion, path)
-    stage = _stage(motion)
+    stage = _build_stage(motion)
     with atomic_path(path) as scratch:
         _export(stage, scratch)
 
@@ -67,7 +67,7 @@ def _export(stage: "Usd.Stage", scratch: Path) -> None:
         raise OSError("USD does not say why")
 
 
-def _stage(motion: Motion) -> "Usd.Stage":
+def _build_stage(motion: Motion) -> "Usd.Stage":
     from pxr import Usd, UsdGeom, UsdSkel
 
     stage, rate = Usd.Stage.CreateInMemory(), float(motion.fps)
@@ -79,13 +79,13 @@ def _stage(motion: Motion) -> "Usd.Stage":
     stage.SetEndTimeCode(motion.num_frames - 1)
     top = UsdSkel.Root.Define(stage, _ROOT)
     stage.SetDefaultPrim(top.GetPrim())
-    body, joints = skinned(motion), joint_paths(motion.skeleton)
-    skeleton = _skeleton(stage, motion.skeleton, joints, body.rest)
-    animation = _animation(stage, motion, joints)
+    body, joints = build_skinned_body(motion), joint_paths(motion.skeleton)
+    skeleton = _define_skeleton(stage, motion.skeleton, joints, body.rest)
+    animation = _define_animation(stage, motion, joints)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    mesh = _mesh(stage, body)
+    mesh = _define_mesh(stage, body)
     UsdSkel.BindingAPI.Apply(mesh).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    _extent(top, motion)
+    _set_extent(top, motion)
     return stage
 
 
@@ -102,34 +102,36 @@ def joint_paths(skeleton: Skeleton) -> list[str]:
     return found
 
 
-def _skeleton(stage: "Usd.Stage", skeleton: Skeleton, joints: Sequence[str], rest: np.ndarray) -> "UsdSkel.Skeleton":
+def _define_skeleton(
+    stage: "Usd.Stage", skeleton: Skeleton, joints: Sequence[str], rest: np.ndarray
+) -> "UsdSkel.Skeleton":
     from pxr import UsdSkel, Vt
 
     made = UsdSkel.Skeleton.Define(stage, f"{_ROOT}/skeleton")
     made.CreateJointsAttr(joints)
     made.CreateJointNamesAttr(list(skeleton.names))
-    made.CreateBindTransformsAttr(Vt.Matrix4dArray.FromNumpy(_moves(rest)))
+    made.CreateBindTransformsAttr(Vt.Matrix4dArray.FromNumpy(_translation_matrices(rest)))
     offsets = skeleton.offsets.numpy().copy()
     offsets[0] = 0.0
-    made.CreateRestTransformsAttr(Vt.Matrix4dArray.FromNumpy(_moves(offsets)))
+    made.CreateRestTransformsAttr(Vt.Matrix4dArray.FromNumpy(_translation_matrices(offsets)))
     return made
 
 
-def _moves(places: np.ndarray) -> np.ndarray:
+def _translation_matrices(places: np.ndarray) -> np.ndarray:
     """(n, 4, 4) matrices that only move; USD's vectors are rows, so the way is the last row."""
     matrices = np.tile(np.eye(4), (len(places), 1, 1))
     matrices[:, 3, :3] = places
     return matrices
 
 
-def _animation(stage: "Usd.Stage", motion: Motion, joints: Sequence[str]) -> "UsdSkel.Animation":
+def _define_animation(stage: "Usd.Stage", motion: Motion, joints: Sequence[str]) -> "UsdSkel.Animation":
     from pxr import UsdSkel, Vt
 
     made = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
     made.CreateJointsAttr(joints)
     made.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
     places = all_translations(motion).astype(np.float32)
-    turns = as_array(sign_continuous(motion.local_quat_xyzw)).astype(np.float32)
+    turns = as_array(make_sign_continuous(motion.local_quat_xyzw)).astype(np.float32)
     moved, turned = made.CreateTranslationsAttr(), made.CreateRotationsAttr()
     if not motion.moving_offsets and (places[:, 0] == places[0, 0]).all():
         moved.Set(Vt.Vec3fArray.FromNumpy(places[0]))
@@ -141,7 +143,7 @@ def _animation(stage: "Usd.Stage", motion: Motion, joints: Sequence[str]) -> "Us
     return made
 
 
-def _mesh(stage: "Usd.Stage", body: SkinnedBody):
+def _define_mesh(stage: "Usd.Stage", body: SkinnedBody):
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
     made = UsdGeom.Mesh.Define(stage, f"{_ROOT}/mannequin")
@@ -161,7 +163,7 @@ def _mesh(stage: "Usd.Stage", body: SkinnedBody):
     return made.GetPrim()
 
 
-def _extent(top: "UsdSkel.Root", motion: Motion) -> None:
+def _set_extent(top: "UsdSkel.Root", motion: Motion) -> None:
     """The box of the whole way, an arm's length around the joints; viewers frame the character by it."""
     from pxr import Gf
 

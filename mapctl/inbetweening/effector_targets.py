@@ -21,13 +21,13 @@ LIMBS = {
     for side in ("left", "right")
 }
 """Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
-_REACH = 0.15  # seconds over which a limb goes to its place and back, at least
-_CALM = 15.0  # m/s^2 at which it goes farther
-_NOTHING = 1e-12  # metres
+_MIN_REACH_SECONDS = 0.15  # seconds over which a limb goes to its place and back, at least
+_REACH_ACCELERATION = 15.0  # m/s^2 at which it goes farther
+_NEGLIGIBLE = 1e-12  # metres
 
 
 @dataclass(frozen=True, eq=False)
-class Targets:
+class EffectorTargets:
     """Wanted places, by frame and canonical joint; limbs bend to those of `LIMBS`."""
 
     places: Float[Tensor, "frames joints 3"]
@@ -35,7 +35,7 @@ class Targets:
     wanted: Bool[Tensor, "frames joints"]
     """Whether a place is."""
 
-    def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "Targets":
+    def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
         """At other moments, rising: every wanted place is one of the moment that is nearest to its own."""
         own = torch.arange(len(self.places), dtype=seconds.dtype) / fps
         after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
@@ -46,10 +46,10 @@ class Targets:
         for frame, joint in self.wanted.nonzero().tolist():
             places[nearest[frame], joint] = self.places[frame, joint]
             wanted[nearest[frame], joint] = True
-        return Targets(places, wanted)
+        return EffectorTargets(places, wanted)
 
 
-def check_limbs(targets: Targets) -> None:
+def check_limbs(targets: EffectorTargets) -> None:
     """RequestError unless only ends of limbs, which can be brought to a place, are wanted somewhere."""
     other = [
         name
@@ -60,13 +60,15 @@ def check_limbs(targets: Targets) -> None:
         raise RequestError(f"places are for {', '.join(LIMBS)}; {other[0]} has none")
 
 
-def missed(places: Float[Tensor, "frames joints 3"], targets: Targets) -> Float[Tensor, " frames"]:
+def compute_target_errors(
+    places: Float[Tensor, "frames joints 3"], targets: EffectorTargets
+) -> Float[Tensor, " frames"]:
     """By frame, how far the worst joint is from its place, metres."""
     away = (places - targets.places).norm(dim=-1)
     return (away * targets.wanted).amax(dim=1)
 
 
-def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> Motion:
+def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[Tensor, " frames"]) -> Motion:
     """A canonical motion with limbs bent so that they are at their places, if these are in reach; they go there and
     back smoothly within frames that are `free`. RequestError for wanted places of joints that end no limb.
     """
@@ -77,12 +79,14 @@ def reached(motion: Motion, targets: Targets, free: Bool[Tensor, " frames"]) -> 
             continue
         places = motion.joint_positions().clone()
         away = torch.where(wanted[:, None], targets.places[:, limb.end] - places[:, limb.end], 0.0)
-        seconds = max(_REACH, math.sqrt(float(away.norm(dim=-1).max()) / _CALM))
-        offset = smooth_offsets.spread(away, wanted | ~free, seconds=seconds, fps=float(motion.fps))
+        seconds = max(_MIN_REACH_SECONDS, math.sqrt(float(away.norm(dim=-1).max()) / _REACH_ACCELERATION))
+        offset = smooth_offsets.interpolate_offsets(away, wanted | ~free, seconds=seconds, fps=float(motion.fps))
         offset = torch.where(free[:, None], offset, 0.0)
         places[:, limb.end] += offset
         turning = torch.zeros(places.shape[:2], dtype=torch.bool)
-        turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NOTHING)[:, None]
-        quats = inverse.solve(places, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,))
+        turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NEGLIGIBLE)[:, None]
+        quats = inverse.solve_inverse_kinematics(
+            places, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,)
+        )
         motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
     return motion

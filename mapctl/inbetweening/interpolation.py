@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.numerics.intervals import filled, filled_angle, last_seen, next_seen
+from mapctl.numerics.intervals import fill_missing, fill_missing_angle, last_observed, next_observed
 from mapctl.skeleton import CANONICAL
 
 
-def slerped(
+def interpolate_positions(
     places_world: Float[Tensor, "batch frames joints 3"],
     local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
     known: Bool[Tensor, "batch frames joints"],
@@ -26,7 +26,7 @@ def slerped(
             shown[..., parent] &= known[..., joint]
     batch, _, joints = shown.shape
     columns = shown.transpose(1, 2).flatten(0, 1)
-    before, after = last_seen(columns), next_seen(columns)
+    before, after = last_observed(columns), next_observed(columns)
     weight = (torch.arange(columns.shape[1]) - before).to(places_world) / (after - before).clamp_min(1)
     quats = local_quat_xyzw.transpose(1, 2).flatten(0, 1)
     lost = ~columns
@@ -34,11 +34,11 @@ def slerped(
     between = rotations.slerp(quats[row, before[lost]], quats[row, after[lost]], weight[row, frame].clamp(0, 1))
     quats = quats.index_put((row, frame), between)
     turns = rotations.to_matrix(quats.unflatten(0, (batch, joints)).transpose(1, 2))
-    root = filled(places_world[:, :, 0], known[..., 0])
+    root = fill_missing(places_world[:, :, 0], known[..., 0])
     guess = kinematics.positions_from_matrices(CANONICAL, turns) + root[:, :, None]
     return torch.where(known[..., None], places_world, guess)
 
 
-def led(heading: Float[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
+def interpolate_heading(heading: Float[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
     """Headings, radians, straight and the short way between frames whose root is known."""
-    return filled_angle(heading, known[..., 0])
+    return fill_missing_angle(heading, known[..., 0])

@@ -10,14 +10,14 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import filled, last_seen, next_seen
-from mapctl.recording.masks import Mask, hidden
+from mapctl.numerics.intervals import fill_missing, last_observed, next_observed
+from mapctl.recording.masks import Mask, expand_masks
 from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL
 
 
 @dataclass(frozen=True, eq=False)
-class Lost:
+class MissingMask:
     """What of a motion's frames counts for nothing."""
 
     joints: Bool[Tensor, "frames joints"]
@@ -26,7 +26,7 @@ class Lost:
     """Where the body is."""
 
     @staticmethod
-    def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap) -> "Lost":
+    def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap) -> "MissingMask":
         """By masks. A joint whose place is lost takes the rotation that put it there along: its parent's, unless others
         show that too. RequestError for joints and frames that the motion has not, and where nothing is left of it.
         """
@@ -35,7 +35,7 @@ class Lost:
                 raise RequestError(
                     f"the gap {mask.start}:{mask.stop} ends after the motion's {motion.num_frames} frames"
                 )
-        joints, root = hidden(motion, masks)
+        joints, root = expand_masks(motion, masks)
         joints = joints.clone()
         for child, parent in enumerate(CANONICAL.parents):
             own, above = rigmap.joint_of[child], rigmap.joint_of[parent] if parent >= 0 else None
@@ -43,24 +43,24 @@ class Lost:
                 joints[:, above] |= joints[:, own]
         if root.all() or bool(joints.all()):
             raise RequestError(f"the gaps leave nothing of the motion's {motion.num_frames} frames to go by")
-        return Lost(joints, root)
+        return MissingMask(joints, root)
 
     @property
     def frames(self) -> Bool[Tensor, " frames"]:
         """In which anything is lost."""
         return self.root | self.joints.any(dim=1)
 
-    def slice(self, start: int, stop: int) -> "Lost":
+    def slice(self, start: int, stop: int) -> "MissingMask":
         """Frames start to stop."""
-        return Lost(self.joints[start:stop], self.root[start:stop])
+        return MissingMask(self.joints[start:stop], self.root[start:stop])
 
 
-def straight(motion: Motion, lost: Lost) -> Motion:
+def interpolate_missing(motion: Motion, lost: MissingMask) -> Motion:
     """What is lost, from the nearest known frames on both sides: joints by slerp, places by straight lines; beyond the
     first and the last known frame they hold, and joints that are never known rest.
     """
     known = ~lost.joints.T
-    before, after = last_seen(known).T, next_seen(known).T
+    before, after = last_observed(known).T, next_observed(known).T
     quats = motion.local_quat_xyzw
     start, stop = (torch.take_along_dim(quats, frame[..., None], dim=0) for frame in (before, after))
     frame = torch.arange(motion.num_frames)[:, None]
@@ -68,16 +68,16 @@ def straight(motion: Motion, lost: Lost) -> Motion:
     between = rotations.slerp(start, stop, weight)
     rest = quats.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quats)
     between = torch.where(known.any(dim=1)[None, :, None], between, rest)
-    moving = {joint: _held(values, lost.root) for joint, values in motion.moving_offsets.items()}
+    moving = {joint: _interpolate_root(values, lost.root) for joint, values in motion.moving_offsets.items()}
     return replace(
         motion,
         local_quat_xyzw=torch.where(lost.joints[..., None], between, quats),
-        root_position=_held(motion.root_position, lost.root),
+        root_position=_interpolate_root(motion.root_position, lost.root),
         moving_offsets=moving,
     )
 
 
-def put_back(motion: Motion, original: Motion, lost: Lost) -> Motion:
+def restore_observed(motion: Motion, original: Motion, lost: MissingMask) -> Motion:
     """The original with what it lacks from `motion`, of the same rig and length; all else to the bit."""
     moving = {
         joint: torch.where(lost.root[:, None], motion.moving_offsets[joint], values)
@@ -91,5 +91,5 @@ def put_back(motion: Motion, original: Motion, lost: Lost) -> Motion:
     )
 
 
-def _held(values: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
-    return torch.where(lost[:, None], filled(values[None], ~lost[None])[0], values)
+def _interpolate_root(values: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
+    return torch.where(lost[:, None], fill_missing(values[None], ~lost[None])[0], values)

@@ -57,18 +57,18 @@ class PositionImage:
     def from_world(self, places_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
         """World positions seen from the reference."""
         ground = places_world[..., ::2] - self.ground[..., None, :]
-        return _with_ground(places_world, rotations.rotate_ground(ground, -self.heading[..., None]))
+        return _replace_ground(places_world, rotations.rotate_ground(ground, -self.heading[..., None]))
 
     def to_world(self, places: Float[Tensor, "batch frames joints 3"]) -> Tensor:
         """Inverse of `from_world`."""
         ground = rotations.rotate_ground(places[..., ::2], self.heading[..., None])
-        return _with_ground(places, ground + self.ground[..., None, :])
+        return _replace_ground(places, ground + self.ground[..., None, :])
 
     def mirrored(self) -> "PositionImage":
         """Left and right exchanged."""
         flip = self.ground.new_tensor([-1.0, 1.0])
         return PositionImage(
-            mirrored_places(self.places),
+            mirror_positions(self.places),
             self.contacts.flip(-1),
             self.known[..., _PARTNERS],
             self.present,
@@ -83,7 +83,7 @@ class PositionImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Proposed:
+class ProposedPositions:
     """What an in-betweener makes of an image."""
 
     places: Float[Tensor, "batch frames joints 3"]
@@ -92,11 +92,11 @@ class Proposed:
     """Log odds that the left and the right toe are planted."""
 
 
-def mirrored_places(places: Float[Tensor, "*batch joints 3"]) -> Float[Tensor, "*batch joints 3"]:
+def mirror_positions(places: Float[Tensor, "*batch joints 3"]) -> Float[Tensor, "*batch joints 3"]:
     """Seen in a mirror that stands along the reference's way."""
     return places[..., _PARTNERS, :] * places.new_tensor([-1.0, 1.0, 1.0])
 
 
-def _with_ground(places: Float[Tensor, "batch frames joints 3"], ground: Float[Tensor, "batch frames joints 2"]):
+def _replace_ground(places: Float[Tensor, "batch frames joints 3"], ground: Float[Tensor, "batch frames joints 2"]):
     """The same heights over other places on the ground."""
     return torch.stack([ground[..., 0], places[..., 1], ground[..., 1]], dim=-1)

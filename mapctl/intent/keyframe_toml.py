@@ -16,7 +16,7 @@ from mapctl.formats.toml import STRICT
 _MOST_SECONDS = 3600.0
 _MOST_FRAMES = 100_000
 
-_OF_A_POSE = ("pose", "pose_frame", "pose_seconds", "place", "height", "facing_deg")
+_POSE_FIELDS = ("pose", "pose_frame", "pose_seconds", "place", "height", "facing_deg")
 
 Metres = Annotated[float, Field(ge=-1000, le=1000)]
 Frame = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
@@ -25,7 +25,7 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 @dataclass(frozen=True)
-class PlacedKey:
+class KeyEntry:
     """One key: when, which pose, where, and what of it counts."""
 
     __pydantic_config__ = STRICT
@@ -65,7 +65,7 @@ class KeyRequest:
 
     __pydantic_config__ = STRICT
 
-    key: Annotated[tuple[PlacedKey, ...], Field(max_length=10_000)]
+    key: Annotated[tuple[KeyEntry, ...], Field(max_length=10_000)]
     """One [[key]] table each, in any order."""
     body: Name | None = None
     """The motion file whose skeleton moves; the first pose's if not given."""
@@ -76,7 +76,7 @@ class KeyRequest:
         if len(self.key) < 2:
             raise RequestError(f"in-betweening needs at least two keys, got {len(self.key)}")
         for number, key in enumerate(self.key):
-            fault = _fault(key, self.body)
+            fault = _find_fault(key, self.body)
             if fault is not None:
                 raise RequestError(f"key[{number}].{fault}")
         frames = [self.frame_of(key) for key in self.key]
@@ -103,7 +103,7 @@ class KeyRequest:
         named = (self.body, *(key.pose for key in self.key))
         return tuple(dict.fromkeys(name for name in named if name is not None))
 
-    def frame_of(self, key: PlacedKey) -> int:
+    def frame_of(self, key: KeyEntry) -> int:
         """When a key is, in frames."""
         return key.frame if key.frame is not None else round((key.seconds or 0.0) * self.fps)
 
@@ -111,7 +111,7 @@ class KeyRequest:
 def read_keys(path: str | PathLike[str]) -> KeyRequest:
     """The request of a file, the files that it names relative to its folder. FileFormatError names file and key."""
     try:
-        request = toml.read(path, KeyRequest, what="key file", unknown=_nearest)
+        request = toml.read(path, KeyRequest, what="key file", unknown=_suggest_key)
     except RequestError as error:
         raise FileFormatError(path, str(error)) from error
     folder = Path(path).parent
@@ -124,7 +124,7 @@ def read_keys(path: str | PathLike[str]) -> KeyRequest:
     )
 
 
-def _fault(key: PlacedKey, body: str | None) -> str | None:
+def _find_fault(key: KeyEntry, body: str | None) -> str | None:
     """What the types cannot say."""
     if (key.frame is None) == (key.seconds is None):
         return "frame: a key is at a frame or at seconds, one of them"
@@ -132,7 +132,7 @@ def _fault(key: PlacedKey, body: str | None) -> str | None:
         return "pose_frame: a pose is told by pose_frame or by pose_seconds, not by both"
     if key.root_only and (key.joints or key.reach):
         return "root_only: a key tells the root or some joints; choose one"
-    idle = [name for name in _OF_A_POSE if getattr(key, name) is not None]
+    idle = [name for name in _POSE_FIELDS if getattr(key, name) is not None]
     if idle and not key.needs_pose:
         return f"{idle[0]}: of a key that only reaches, no pose counts; leave it out"
     if key.needs_pose and key.pose is None and body is None:
@@ -140,7 +140,7 @@ def _fault(key: PlacedKey, body: str | None) -> str | None:
     return None
 
 
-def _nearest(key: Sequence[int | str]) -> str:
-    names = [item.name for item in fields(PlacedKey if len(key) > 1 else KeyRequest)]
+def _suggest_key(key: Sequence[int | str]) -> str:
+    names = [item.name for item in fields(KeyEntry if len(key) > 1 else KeyRequest)]
     near = get_close_matches(str(key[-1]), names, n=1, cutoff=0)
     return f"the nearest is {near[0]}; allowed: {', '.join(names)}"

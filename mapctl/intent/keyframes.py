@@ -8,7 +8,7 @@ from typing import Literal
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 
-Place = tuple[float, float, float]
+WorldPosition = tuple[float, float, float]
 """In a world that stands along Y, metres."""
 
 
@@ -20,7 +20,7 @@ class Key:
     """Of the motion."""
     limbs: tuple[str, ...] = ()
     """Joints of the rig, hands and feet, whose places are all that counts."""
-    places: Mapping[str, Place] = field(default_factory=dict)
+    places: Mapping[str, WorldPosition] = field(default_factory=dict)
     """Of such joints, where they are to be, if that is not where the motion has them."""
     root_only: bool = False
     """Only the place and the rotation of the hips counts."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 
-_FINE = 10  # integration steps a frame
+_SUBSTEPS = 10  # integration steps a frame
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class SpeedProfile:
 
 
 @dataclass(frozen=True, eq=False)
-class Follow:
+class PathRequest:
     """Walk a curve from its first point at given speeds."""
 
     curve: Curve
@@ -79,14 +79,14 @@ class Follow:
         if self.seconds is not None:
             count = self.seconds * fps
         else:
-            count = 1 + _steps_until(self.profile, self.curve.length, fps, most=most)
+            count = 1 + _count_frames(self.profile, self.curve.length, fps, most=most)
         if count > most:
             raise RequestError(
                 f"{count:.3g} frames are more than the {most} allowed; ask for fewer seconds or more speed"
             )
         return max(2, round(count))
 
-    def fitted(self, fps: float, *, slowest_share: float = 0.6) -> tuple["Follow", str | None]:
+    def fitted(self, fps: float, *, slowest_share: float = 0.6) -> tuple["PathRequest", str | None]:
         """The request with speeds lowered so that an open curve lasts for the whole duration, and a sentence if so.
 
         Speeds are lowered to `slowest_share` of the wanted ones at most; what is then left goes on straight.
@@ -102,23 +102,23 @@ class Follow:
             f"the wanted speed would go {wanted:.1f} m in {self.seconds:.1f} s but the curve is "
             f"{self.curve.length:.1f} m long, so the speed was lowered to {100 * share:.0f} % of it"
         )
-        return Follow(self.curve, slower, self.seconds), note
+        return PathRequest(self.curve, slower, self.seconds), note
 
     def arcs(self, frames: int, fps: float) -> Float[Tensor, " frames"]:
         """Wanted arc at each frame, metres, the first 0: the integral of speed."""
         arcs = [0.0]
         for _ in range(frames - 1):
-            arcs.append(_advance(self.profile, arcs[-1], 1 / fps))
+            arcs.append(_advance_arc(self.profile, arcs[-1], 1 / fps))
         return torch.tensor(arcs, dtype=torch.float64)
 
 
-def _advance(profile: SpeedProfile, arc: float, seconds: float) -> float:
-    for _ in range(_FINE):
-        arc += profile.at(arc) * seconds / _FINE
+def _advance_arc(profile: SpeedProfile, arc: float, seconds: float) -> float:
+    for _ in range(_SUBSTEPS):
+        arc += profile.at(arc) * seconds / _SUBSTEPS
     return arc
 
 
-def _steps_until(profile: SpeedProfile, length: float, fps: float, *, most: int) -> float:
+def _count_frames(profile: SpeedProfile, length: float, fps: float, *, most: int) -> float:
     """Frames until the arc is the curve's length; counts to `most` at most where speeds differ."""
     if len(profile.speeds) == 1:
         return max(1, length / profile.speeds[0] * fps)
@@ -126,5 +126,5 @@ def _steps_until(profile: SpeedProfile, length: float, fps: float, *, most: int)
         return math.inf
     arc, steps = 0.0, 0
     while arc < length and steps <= most:
-        arc, steps = _advance(profile, arc, 1 / fps), steps + 1
+        arc, steps = _advance_arc(profile, arc, 1 / fps), steps + 1
     return steps

@@ -57,7 +57,7 @@ class Command:
                 f"steps can be {shortest:g} to {longest:g} m long"
             )
             step = held
-        turned = {name: _wrapped(getattr(self, name)) for name in ("heading", "facing")}
+        turned = {name: _wrap_whole_turns(getattr(self, name)) for name in ("heading", "facing")}
         return replace(self, speed=speed, step_length=step, **turned), said
 
 
@@ -85,7 +85,7 @@ class CommandTrack:
         """Times in (before, upto] at which a command came."""
         return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
 
-    def clamped(self, fastest: float) -> tuple["CommandTrack", list[str]]:
+    def limit_speed(self, fastest: float) -> tuple["CommandTrack", list[str]]:
         """The track with every command within what can be held, and a sentence for each number that was changed."""
         found = [
             command.within(fastest, when=f" at {time:g} s")
@@ -97,7 +97,7 @@ class CommandTrack:
 
 
 @dataclass(frozen=True)
-class Limits:
+class SteeringLimits:
     """How fast a wish may change; a jump in the command becomes the fastest change that these allow."""
 
     acceleration: float = 2.0
@@ -106,7 +106,7 @@ class Limits:
     """Of the speed, m/s^2, falling."""
     turn_rate: float = 2.5
     """Of the direction, radians/s. More than the one-second means of a walk's data show
-    (`Abilities.turn_rate`): a reversal has to be faster."""
+    (`DataLimits.turn_rate`): a reversal has to be faster."""
 
     def __post_init__(self):
         for name in ("acceleration", "braking", "turn_rate"):
@@ -115,7 +115,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Wish:
+class SteeringTarget:
     """What is wanted in one frame: a command that has come as far as the limits allow."""
 
     speed: float
@@ -130,32 +130,32 @@ class Wish:
         """x and z over the ground, m/s."""
         return self.speed * math.sin(self.heading), self.speed * math.cos(self.heading)
 
-    def toward(self, command: Command, limits: Limits, seconds: float) -> "Wish":
+    def step_toward(self, command: Command, limits: SteeringLimits, seconds: float) -> "SteeringTarget":
         """The wish after so many seconds, as near the command as the limits allow."""
         rise = min(limits.acceleration * seconds, max(-limits.braking * seconds, command.speed - self.speed))
         most = limits.turn_rate * seconds
         if command.turning is None:
-            turn = _toward(self.heading, command.heading, most)
+            turn = _step_angle_toward(self.heading, command.heading, most)
         else:
             turn = self.heading + min(most, max(-most, command.turning * seconds))
         facing = turn if command.facing is None else command.facing
-        return Wish(self.speed + rise, turn, _toward(self.facing, facing, most))
+        return SteeringTarget(self.speed + rise, turn, _step_angle_toward(self.facing, facing, most))
 
-    def ahead(self, command: Command, limits: Limits, *, frames: int, fps: float) -> "list[Wish]":
+    def ahead(self, command: Command, limits: SteeringLimits, *, frames: int, fps: float) -> "list[SteeringTarget]":
         """The wishes of the next frames if nothing else is asked."""
         wishes, wish = [], self
         for _ in range(frames):
-            wish = wish.toward(command, limits, 1 / fps)
+            wish = wish.step_toward(command, limits, 1 / fps)
             wishes.append(wish)
         return wishes
 
 
-def _wrapped(angle: float | None) -> float | None:
+def _wrap_whole_turns(angle: float | None) -> float | None:
     """Of a full turn or more what is left of it; other angles to the bit."""
     return angle if angle is None or abs(angle) <= 2 * math.pi else math.remainder(angle, 2 * math.pi)
 
 
-def _toward(angle: float, wanted: float, most: float) -> float:
+def _step_angle_toward(angle: float, wanted: float, most: float) -> float:
     """The angle turned toward another by at most so much, the short way."""
     apart = math.remainder(wanted - angle, 2 * math.pi)
     return angle + min(most, max(-most, apart))

@@ -13,23 +13,27 @@ from mapctl.errors import FileFormatError
 from mapctl.formats.text import finite_number, read_table, shorten
 from mapctl.intent.steering import Command, CommandTrack
 
-_NEEDED = ("time_s", "speed_mps", "heading_deg")
-_LABELS = ("gait", "style")
-_ALLOWED = (*_NEEDED, "facing_deg", "turn_deg_s", "step_m", *_LABELS)
-_MOST_SPEED, _MOST_TIME, _MOST = 1000.0, 1e6, 1e6
+_REQUIRED_COLUMNS = ("time_s", "speed_mps", "heading_deg")
+_LABEL_COLUMNS = ("gait", "style")
+_ALLOWED_COLUMNS = (*_REQUIRED_COLUMNS, "facing_deg", "turn_deg_s", "step_m", *_LABEL_COLUMNS)
+_MAX_SPEED, _MAX_TIME, _MAX_VALUE = 1000.0, 1e6, 1e6
 
 
 def read_commands(path: str | PathLike[str]) -> CommandTrack:
     """The commands of a file. FileFormatError names file and line, and what was expected there."""
-    lines = read_table(path, f"a CSV of the columns {','.join(_NEEDED)}")
+    lines = read_table(path, f"a CSV of the columns {','.join(_REQUIRED_COLUMNS)}")
     header, names = (lines[0][0], [word.lower() for word in lines[0][1]]) if lines else (1, [])
-    missing = [name for name in _NEEDED if name not in names]
+    missing = [name for name in _REQUIRED_COLUMNS if name not in names]
     if missing:
-        raise FileFormatError(path, f"has no column {', '.join(missing)}; expected {','.join(_NEEDED)}", header)
-    unknown = [name for name in names if name not in _ALLOWED]
+        raise FileFormatError(
+            path, f"has no column {', '.join(missing)}; expected {','.join(_REQUIRED_COLUMNS)}", header
+        )
+    unknown = [name for name in names if name not in _ALLOWED_COLUMNS]
     if unknown or len(set(names)) < len(names):
         found = shorten(",".join(names))
-        raise FileFormatError(path, f"found the columns {found}, expected {','.join(_ALLOWED)}, each once", header)
+        raise FileFormatError(
+            path, f"found the columns {found}, expected {','.join(_ALLOWED_COLUMNS)}, each once", header
+        )
     if len(lines) < 2:
         raise FileFormatError(path, "holds no commands")
     times: list[float] = []
@@ -38,7 +42,7 @@ def read_commands(path: str | PathLike[str]) -> CommandTrack:
         if len(words) != len(names):
             raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
         line = _Line(path, number, dict(zip(names, words, strict=True)))
-        time = line.within("time_s", 0, _MOST_TIME)
+        time = line.within("time_s", 0, _MAX_TIME)
         if times and time <= times[-1]:
             raise FileFormatError(path, f"time_s must rise, got {time:g} after {times[-1]:g}", number)
         times.append(time)
@@ -55,8 +59,8 @@ class _Line:
     words: dict[str, str]
 
     def command(self) -> Command:
-        told = tuple(self.words[name] for name in _LABELS if self.words.get(name))
-        speed = self.within("speed_mps", 0, _MOST_SPEED)
+        told = tuple(self.words[name] for name in _LABEL_COLUMNS if self.words.get(name))
+        speed = self.within("speed_mps", 0, _MAX_SPEED)
         return Command(
             speed,
             math.radians(self.value("heading_deg")),
@@ -79,6 +83,6 @@ class _Line:
 
     def value(self, name: str) -> float:
         value = finite_number(self.words[name])
-        if value is None or abs(value) > _MOST:
+        if value is None or abs(value) > _MAX_VALUE:
             raise FileFormatError(self.path, f"{name} must be a number, got {shorten(self.words[name])}", self.number)
         return value

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mapctl.features import LAYOUT, Place
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.skeleton import Skeleton
 
 
-class Columns(NamedTuple):
+class FeatureColumns(NamedTuple):
     """Where a feature vector holds what kinematics needs."""
 
     dx: int
@@ -30,19 +30,19 @@ class Columns(NamedTuple):
     joints: int
 
 
-def _columns() -> Columns:
+def _find_columns() -> FeatureColumns:
     first = {block: places.start for block, places in LAYOUT.slices.items()}
     step, tilt = first["root_displacement_heading"], first["root_tilt"]
-    return Columns(
+    return FeatureColumns(
         step, step + 1, first["heading_change"], first["root_height"], tilt, tilt + 1, first["joint_rotations"]
     )
 
 
-_COLUMNS = _columns()
+_COLUMNS = _find_columns()
 _JOINTS = 1 + (LAYOUT.slices["joint_rotations"].stop - LAYOUT.slices["joint_rotations"].start) // 3
 
 
-def serves(features: Tensor, start: Place, skeleton: Skeleton) -> bool:
+def is_supported(features: Tensor, start: GroundPose, skeleton: Skeleton) -> bool:
     """Whether the kernels take these: float32 batches on the CPU, and gradients to the features alone."""
     known = (features, start.position_xz, start.heading)
     plain = all(values.dtype == torch.float32 and values.device.type == "cpu" for values in known)
@@ -52,8 +52,8 @@ def serves(features: Tensor, start: Place, skeleton: Skeleton) -> bool:
     return plain and constant and fits and skeleton.num_joints == _JOINTS
 
 
-def root_places(
-    features: Float[Tensor, "batch frames size"], start: Place
+def integrate_root_fast(
+    features: Float[Tensor, "batch frames size"], start: GroundPose
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
     """Root ground positions (metres) and headings (radians, not wrapped) by Eq. 4."""
     batch = len(features)
@@ -62,25 +62,25 @@ def root_places(
     )
 
 
-def joints_world(
+def compute_joints_world(
     features: Float[Tensor, "batch frames size"],
     root_xz_world: Float[Tensor, "batch frames 2"],
     heading: Float[Tensor, "batch frames"],
     skeleton: Skeleton,
 ) -> Float[Tensor, "batch frames joints 3"]:
-    """World joint positions, metres, of the root where `root_places` puts it."""
+    """World joint positions, metres, of the root where `integrate_root_fast` puts it."""
     return _Body.apply(features, root_xz_world, heading, skeleton)
 
 
 @cache
-def _kernels() -> ModuleType:
+def _load_kernels() -> ModuleType:
     """Late: the compiler takes a while to import, and what never solves does not need it."""
     from mapctl.kinematics import fast_kernels
 
     return fast_kernels
 
 
-def _array(tensor: Tensor) -> np.ndarray:
+def _contiguous_array(tensor: Tensor) -> np.ndarray:
     """Contiguous, so that every kernel is compiled once."""
     return tensor.detach().contiguous().numpy()
 
@@ -89,8 +89,8 @@ class _Root(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, start_xz: Tensor, start_heading: Tensor):
         ground, heading = features.new_empty(*features.shape[:2], 2), features.new_empty(features.shape[:2])
-        known, at = _array(features), start_heading.numpy()
-        _kernels().root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
+        known, at = _contiguous_array(features), start_heading.numpy()
+        _load_kernels().root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
         ctx.known = known, at
         return ground, heading
 
@@ -99,7 +99,7 @@ class _Root(torch.autograd.Function):
     def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         features, start_heading = ctx.known
         gradient = np.zeros(features.shape, np.float32)
-        _kernels().root_backward(features, _COLUMNS, start_heading, *map(_array, pulled), gradient)
+        _load_kernels().root_backward(features, _COLUMNS, start_heading, *map(_contiguous_array, pulled), gradient)
         return torch.from_numpy(gradient), None, None
 
 
@@ -109,9 +109,16 @@ class _Body(torch.autograd.Function):
         parents, offsets = np.array(skeleton.parents), skeleton.offsets.double().numpy()
         places = features.new_empty(*features.shape[:2], len(parents), 3)
         world = np.empty((*places.shape, 3), np.float32)
-        known = _array(features)
-        _kernels().body_forward(
-            known, _COLUMNS, _array(ground), _array(heading), parents, offsets, places.numpy(), world
+        known = _contiguous_array(features)
+        _load_kernels().body_forward(
+            known,
+            _COLUMNS,
+            _contiguous_array(ground),
+            _contiguous_array(heading),
+            parents,
+            offsets,
+            places.numpy(),
+            world,
         )
         ctx.known = known, parents, offsets, world
         return places
@@ -122,5 +129,7 @@ class _Body(torch.autograd.Function):
         features, parents, offsets, world = ctx.known
         gradient, shape = np.zeros(features.shape, np.float32), features.shape[:2]
         ground, heading = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
-        _kernels().body_backward(features, _COLUMNS, parents, offsets, world, _array(pulled), gradient, ground, heading)
+        _load_kernels().body_backward(
+            features, _COLUMNS, parents, offsets, world, _contiguous_array(pulled), gradient, ground, heading
+        )
         return *map(torch.from_numpy, (gradient, ground, heading)), None

@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from mapctl.numerics.jit import compilers
+from mapctl.numerics.jit import make_jit_decorators
 
-entry, inner = compilers("contract", "nsz")
+entry, inner = make_jit_decorators("contract", "nsz")
 
-_SMALL = 1e-2  # squared radians below which the series are exact to 1e-10 and the quotients begin to cancel
+_SERIES_THRESHOLD = 1e-2  # squared radians below which the series are exact to 1e-10 and the quotients begin to cancel
 
 
 @entry
@@ -51,7 +51,7 @@ def root_backward(features, columns, start_heading, d_ground, d_headings, d_feat
 @inner
 def rotation_series(square):
     """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of an angle a, from its square; smooth at 0."""
-    if square < _SMALL:
+    if square < _SERIES_THRESHOLD:
         first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
         second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
         third = 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
@@ -62,7 +62,7 @@ def rotation_series(square):
 
 
 @inner
-def turn_by(world, above, x, y, z):
+def compose_rotation(world, above, x, y, z):
     """world = above exp([x y z]): a frame turned by a rotation vector given in it (Rodrigues)."""
     first, second, _ = rotation_series(x * x + y * y + z * z)
     r00, r11, r22 = 1.0 - second * (y * y + z * z), 1.0 - second * (x * x + z * z), 1.0 - second * (x * x + y * y)
@@ -77,7 +77,7 @@ def turn_by(world, above, x, y, z):
 
 
 @inner
-def about_y(turn, heading):
+def fill_rotation_about_y(turn, heading):
     """Rotation matrix of a turn about +Y."""
     sine, cosine = math.sin(heading), math.cos(heading)
     turn[0, 0], turn[0, 1], turn[0, 2] = cosine, 0.0, sine
@@ -92,15 +92,17 @@ def body_forward(features, columns, ground, headings, parents, offsets, places, 
     for b in range(len(features)):
         for t in range(features.shape[1]):
             now, at, frames = features[b, t], places[b, t], world[b, t]
-            about_y(heading_frame, np.float64(headings[b, t]))
-            turn_by(frames[0], heading_frame, np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z]))
+            fill_rotation_about_y(heading_frame, np.float64(headings[b, t]))
+            compose_rotation(
+                frames[0], heading_frame, np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
+            )
             at[0, 0], at[0, 1], at[0, 2] = ground[b, t, 0], now[columns.height], ground[b, t, 1]
             for joint in range(1, len(parents)):
                 above, bone, vector = frames[parents[joint]], offsets[joint], columns.joints + 3 * (joint - 1)
                 for i in range(3):
                     step = above[i, 0] * bone[0] + above[i, 1] * bone[1] + above[i, 2] * bone[2]
                     at[joint, i] = at[parents[joint], i] + step
-                turn_by(
+                compose_rotation(
                     frames[joint],
                     above,
                     np.float64(now[vector]),
@@ -110,7 +112,7 @@ def body_forward(features, columns, ground, headings, parents, offsets, places, 
 
 
 @inner
-def vector_gradient(world, torque, x, y, z):
+def rotation_vector_gradient(world, torque, x, y, z):
     """Gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose, in its frame."""
     ux = world[0, 0] * torque[0] + world[1, 0] * torque[1] + world[2, 0] * torque[2]
     uy = world[0, 1] * torque[0] + world[1, 1] * torque[1] + world[2, 1] * torque[2]
@@ -139,10 +141,10 @@ def body_backward(features, columns, parents, offsets, world, d_places, d_featur
             force[:], torque[:] = d_places[b, t], 0.0
             for joint in range(len(parents) - 1, 0, -1):
                 v = columns.joints + 3 * (joint - 1)
-                out[v], out[v + 1], out[v + 2] = vector_gradient(
+                out[v], out[v + 1], out[v + 2] = rotation_vector_gradient(
                     frames[joint], torque[joint], np.float64(now[v]), np.float64(now[v + 1]), np.float64(now[v + 2])
                 )
-                hand_up(
+                accumulate_to_parent(
                     frames[parents[joint]],
                     offsets[joint],
                     force[joint],
@@ -150,7 +152,7 @@ def body_backward(features, columns, parents, offsets, world, d_places, d_featur
                     force[parents[joint]],
                     torque[parents[joint]],
                 )
-            out[columns.tilt_x], _, out[columns.tilt_z] = vector_gradient(
+            out[columns.tilt_x], _, out[columns.tilt_z] = rotation_vector_gradient(
                 frames[0], torque[0], np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
             )
             out[columns.height] = force[0, 1]
@@ -158,7 +160,7 @@ def body_backward(features, columns, parents, offsets, world, d_places, d_featur
 
 
 @inner
-def hand_up(above, bone, force, torque, force_above, torque_above):
+def accumulate_to_parent(above, bone, force, torque, force_above, torque_above):
     """Add a joint's force and torque to its parent's; the force's lever is the bone between them."""
     x = above[0, 0] * bone[0] + above[0, 1] * bone[1] + above[0, 2] * bone[2]
     y = above[1, 0] * bone[0] + above[1, 1] * bone[1] + above[1, 2] * bone[2]

@@ -16,11 +16,11 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.skeleton import Skeleton
 
-_BENT = 0.15  # sine of a limb's bend from which its plane is believed rather than not
+_BEND_THRESHOLD = 0.15  # sine of a limb's bend from which its plane is believed rather than not
 _TINY = 1e-9
-_STRAIGHT = 1e-4  # metres that a limb is kept from being straight
-_SIDE = 0.003  # metres that an elbow or a knee is off the line before it shows where the limb bends to
-_TRUST = 8  # power of a bone's share of its length: nine tenths of it are half a reason to believe it
+_STRAIGHT_MARGIN = 1e-4  # metres that a limb is kept from being straight
+_BEND_OFFSET = 0.003  # metres that an elbow or a knee is off the line before it shows where the limb bends to
+_TRUST_POWER = 8  # power of a bone's share of its length: nine tenths of it are half a reason to believe it
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Limb:
     """Elbow or knee, the only child of `upper`."""
     end: int
     """Hand or foot, the only child of `lower`."""
-    bends: tuple[float, float, float]
+    bend_direction: tuple[float, float, float]
     """Which way the elbow or the knee of a straight limb would go, seen from `upper`."""
     shown: bool = True
     """Whether the motion that one starts from shows how it bends; if not, only the proposed elbow or knee tells."""
 
 
-def solve(
+def solve_inverse_kinematics(
     places_world: Float[Tensor, "frames joints 3"],
     start_quat_xyzw: Float[Tensor, "frames joints 4"],
     skeleton: Skeleton,
@@ -73,20 +73,20 @@ def solve(
         if joint in bending and bending[joint].shown:
             lower = bending[joint].lower
             ends = torch.tensor([lower, bending[joint].end])
-            reached = _reached(bending[joint], turn, start[:, lower], at[joint], places_world, offsets)
+            reached = _solve_two_bones(bending[joint], turn, start[:, lower], at[joint], places_world, offsets)
             places_world = places_world.index_copy(1, ends, reached)
         if children:
             aims = [places_world[:, child] - at[joint] for child in children]
-            found = _turned(turn, [offsets[child] for child in children], aims)
+            found = _align_bones(turn, [offsets[child] for child in children], aims)
             if joint in bending:
-                found = _in_plane(found, start, skeleton, children[0], places_world, at[joint])
+                found = _align_bend_plane(found, start, skeleton, children[0], places_world, at[joint])
             turn = found if free is None else torch.where(free[:, joint, None], found, turn)
         world.append(turn)
         local.append(turn if above is None else rotations.multiply(rotations.inverse(above), turn))
-    return rotations.sign_continuous(torch.stack(local, dim=1))
+    return rotations.make_sign_continuous(torch.stack(local, dim=1))
 
 
-def _reached(
+def _solve_two_bones(
     limb: Limb,
     turn: Float[Tensor, "frames 4"],
     bent: Float[Tensor, "frames 4"],
@@ -106,24 +106,26 @@ def _reached(
     way = places[:, limb.end] - at
     far = way.norm(dim=-1, keepdim=True).clamp_min(_TINY)
     axis = way / far
-    reach = far.clamp((long - short).abs() + _STRAIGHT, long + short - _STRAIGHT)
+    reach = far.clamp((long - short).abs() + _STRAIGHT_MARGIN, long + short - _STRAIGHT_MARGIN)
     knee = rotations.rotate(turn, upper.expand(len(turn), 3))
     foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(len(turn), 3))
     towards = _shortest(foot, way)
-    usual = rotations.rotate(rotations.multiply(towards, turn), offsets.new_tensor(limb.bends).expand(len(turn), 3))
+    usual = rotations.rotate(
+        rotations.multiply(towards, turn), offsets.new_tensor(limb.bend_direction).expand(len(turn), 3)
+    )
     proposed = torch.stack(
         [places[:, limb.lower] - places[:, limb.upper], places[:, limb.end] - places[:, limb.lower]], dim=1
     )
     whole = (proposed.norm(dim=-1) / torch.stack([long, short])).amin(dim=1, keepdim=True).clamp(max=1)
-    trust = whole**_TRUST
-    side = trust * (places[:, limb.lower] - at) + (1 - trust) * rotations.rotate(towards, knee) + _SIDE * usual
+    trust = whole**_TRUST_POWER
+    side = trust * (places[:, limb.lower] - at) + (1 - trust) * rotations.rotate(towards, knee) + _BEND_OFFSET * usual
     side = torch.nn.functional.normalize(side - (side * axis).sum(-1, keepdim=True) * axis, dim=-1)
     along = (long.square() - short.square() + reach.square()) / (2 * reach)
     between = at + along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side
     return torch.stack([between, at + reach * axis], dim=1)
 
 
-def _turned(
+def _align_bones(
     turn: Float[Tensor, "frames 4"], bones: Sequence[Float[Tensor, "3"]], aims: Sequence[Float[Tensor, "frames 3"]]
 ) -> Float[Tensor, "frames 4"]:
     """`turn`, turned on so that the bones point along the aims: one bone exactly, several in the least squares."""
@@ -139,7 +141,7 @@ def _turned(
     return rotations.multiply(rotations.from_matrix(left @ flip @ right), turn)
 
 
-def _in_plane(
+def _align_bend_plane(
     turn: Float[Tensor, "frames 4"],
     start: Float[Tensor, "frames joints 4"],
     skeleton: Skeleton,
@@ -163,7 +165,7 @@ def _in_plane(
     angle = torch.atan2((torch.linalg.cross(would, wanted) * axis).sum(-1), (would * wanted).sum(-1) + _TINY)
     # A straight limb has no plane: the smaller of the two bends says how much is believed.
     bend = torch.minimum(would.norm(dim=-1), wanted.norm(dim=-1))
-    believed = bend.square() / (bend.square() + _BENT**2)
+    believed = bend.square() / (bend.square() + _BEND_THRESHOLD**2)
     return rotations.multiply(rotations.from_rotation_vector(axis * (angle * believed)[:, None]), turn)
 
 

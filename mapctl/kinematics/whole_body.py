@@ -14,32 +14,32 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import LIMBS, Targets, check_limbs
+from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets, check_limbs
 from mapctl.kinematics import forward_kinematics, inverse
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
-_TURNING = tuple(CANONICAL.index(name) for name in ("hips", "spine", "chest", "leftShoulder", "rightShoulder"))
-_SIGMA_TURN = math.radians(12.0)
+_TRUNK_JOINTS = tuple(CANONICAL.index(name) for name in ("hips", "spine", "chest", "leftShoulder", "rightShoulder"))
+_SIGMA_ROTATION = math.radians(12.0)
 _SIGMA_LEAN = 0.08
 """Metres that hips go from where they are over feet that stay."""
 _SIGMA_REACH, _SIGMA_BALANCE = 0.004, 0.06  # metres
 _IS_FOOT = torch.tensor([float(name.endswith("Foot")) for name in LIMBS])
-_STRETCHED = torch.where(_IS_FOOT > 0, 0.985, 0.9).double()
+_STRETCH_LIMIT = torch.where(_IS_FOOT > 0, 0.985, 0.9).double()
 """Share of a limb's length from which on it asks the body to come nearer."""
-_FOLDED = 0.3
+_FOLD_LIMIT = 0.3
 """Share of a limb's length below which it asks the body to make room."""
-_SOFT = 0.015  # metres over which either begins
-_STEPS, _DAMPING, _CONVERGED = 40, 0.1, 1e-3  # the last in sigmas of an offset
-_DIFFERENCE = 1e-6  # metres and radians
+_SOFTPLUS_WIDTH = 0.015  # metres over which either begins
+_MAX_STEPS, _DAMPING, _TOLERANCE = 40, 0.1, 1e-3  # the last in sigmas of an offset
+_DIFFERENCE_STEP = 1e-6  # metres and radians
 _MASS_JOINTS, _MASSES = [CANONICAL.index(name) for name in ("head", "chest", "hips")], torch.tensor([0.1, 0.4, 0.5])
 """Roughly where the weight is that has to stay over the feet (Winter 2009, table 4.1)."""
 _UPPER, _ENDS = ([getattr(limb, end) for limb in LIMBS.values()] for end in ("upper", "end"))
 
 
-def reach_with_body(
+def reach_targets(
     body: Motion,
-    targets: Targets,
+    targets: EffectorTargets,
     *,
     turning: Bool[Tensor, "frames joints"],
     moving: Bool[Tensor, " frames"],
@@ -58,11 +58,11 @@ def reach_with_body(
     shifts = torch.zeros_like(body.root_position)
     if not len(frames):
         return body, shifts
-    part = _frames_of(body, frames)
+    part = _select_frames(body, frames)
     goals, wanted = targets.places[frames], targets.wanted[frames]
-    sigma = _offset_sigmas(turning[frames], moving[frames], stray[frames].double())
-    offsets = _least_offsets(part, goals[:, _ENDS], wanted[:, _ENDS], sigma)
-    posed, shift = _with_offsets(part, offsets)
+    sigma = _compute_offset_sigmas(turning[frames], moving[frames], stray[frames].double())
+    offsets = _minimise_offsets(part, goals[:, _ENDS], wanted[:, _ENDS], sigma)
+    posed, shift = _apply_offsets_to_motion(part, offsets)
     before = part.joint_positions()
     ends = torch.where(wanted[..., None], goals, before + shift[:, None])
     bent = bend_limbs(posed, part, ends, wanted, turning[frames])
@@ -72,20 +72,20 @@ def reach_with_body(
     return replace(body, root_position=root, local_quat_xyzw=quats), shifts
 
 
-def _frames_of(motion: Motion, frames: Tensor) -> Motion:
+def _select_frames(motion: Motion, frames: Tensor) -> Motion:
     return replace(motion, root_position=motion.root_position[frames], local_quat_xyzw=motion.local_quat_xyzw[frames])
 
 
-def _offset_sigmas(
+def _compute_offset_sigmas(
     turning: Bool[Tensor, "poses joints"], moving: Bool[Tensor, " poses"], stray: Float[Tensor, " poses"]
 ) -> Float[Tensor, "poses offsets"]:
     """Of shift (x, z), lean (x, y, z) and the turns of `_TURNING`; nothing for what may not move."""
     step, lean = stray[:, None].expand(-1, 2), stray.new_full((len(stray), 3), _SIGMA_LEAN)
-    turn = _SIGMA_TURN * turning[:, _TURNING].to(stray).repeat_interleave(3, dim=1)
+    turn = _SIGMA_ROTATION * turning[:, _TRUNK_JOINTS].to(stray).repeat_interleave(3, dim=1)
     return torch.cat([torch.cat([step, lean], dim=1) * moving[:, None], turn], dim=1)
 
 
-def _least_offsets(
+def _minimise_offsets(
     part: Motion,
     goals: Float[Tensor, "poses limbs 3"],
     wanted: Bool[Tensor, "poses limbs"],
@@ -94,12 +94,12 @@ def _least_offsets(
     """The mode of  |x / sigma|^2 + |r(x)|^2,  r what limbs and balance ask for; Levenberg-Marquardt in its small dual
     form, pose by pose: steps that do not help are damped more.
     """
-    ask = _Ask.of(part, goals, wanted)
+    ask = _ReachResidual.of(part, goals, wanted)
     unit, damping = torch.zeros_like(sigma), sigma.new_full((len(sigma), 1, 1), _DAMPING)
     now = ask.residual(unit * sigma)
     cost = unit.square().sum(1) + now.square().sum(1)
     identity = torch.eye(now.shape[1], dtype=now.dtype)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         jacobian = ask.jacobian(unit * sigma, now) * sigma[:, None]
         # Woodbury: (1 + damping) I + J'J is inverted by way of the few residuals.
         gradient = unit + (jacobian.transpose(1, 2) @ now[..., None])[..., 0]
@@ -114,13 +114,13 @@ def _least_offsets(
         unit, now = torch.where(better[:, None], unit + step, unit), torch.where(better[:, None], tried, now)
         cost = torch.where(better, tried_cost, cost)
         damping = torch.where(better[:, None, None], damping / 4, damping * 4).clamp(1e-3, 1e6)
-        if float(step.abs().max()) < _CONVERGED:
+        if float(step.abs().max()) < _TOLERANCE:
             break
     return unit * sigma
 
 
 @dataclass(frozen=True, eq=False)
-class _Ask:
+class _ReachResidual:
     """What is asked of poses: limbs that reach, legs that reach the ground, weight over the feet."""
 
     part: Motion
@@ -132,51 +132,51 @@ class _Ask:
     """Metres."""
 
     @staticmethod
-    def of(part: Motion, goals: Tensor, wanted: Tensor) -> "_Ask":
+    def of(part: Motion, goals: Tensor, wanted: Tensor) -> "_ReachResidual":
         lengths = [part.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum() for limb in LIMBS.values()]
-        return _Ask(part, part.joint_positions(), goals, wanted.to(goals), torch.stack(lengths))
+        return _ReachResidual(part, part.joint_positions(), goals, wanted.to(goals), torch.stack(lengths))
 
     def jacobian(
         self, x: Float[Tensor, "poses offsets"], now: Float[Tensor, "poses residuals"]
     ) -> Float[Tensor, "poses residuals offsets"]:
         """By differences: in double precision good to six digits, and all of them are one batch."""
-        shifted = x[None] + _DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)[:, None]
-        return ((self.residual(shifted) - now) / _DIFFERENCE).permute(1, 2, 0)
+        shifted = x[None] + _DIFFERENCE_STEP * torch.eye(x.shape[1], dtype=x.dtype)[:, None]
+        return ((self.residual(shifted) - now) / _DIFFERENCE_STEP).permute(1, 2, 0)
 
     def residual(self, x: Float[Tensor, "*more poses offsets"]) -> Float[Tensor, "*more poses residuals"]:
         """By limb, how much too far and too near its place is for it; and how far the weight has left the feet."""
-        root, quats, shift = _offset_pose(x, self.part.root_position, self.part.local_quat_xyzw)
+        root, quats, shift = _apply_offsets(x, self.part.root_position, self.part.local_quat_xyzw)
         skeleton = self.part.skeleton
         places = forward_kinematics(skeleton.offsets.to(root), skeleton.parents, root, quats)[0]
         goals = torch.where(self.wanted[..., None] > 0, self.goals, self.before[:, _ENDS] + shift[..., None, :])
         far = (goals - places[..., _UPPER, :]).norm(dim=-1)
         was = (self.before[:, _ENDS] - self.before[:, _UPPER]).norm(dim=-1)
-        limit = _STRETCHED * self.lengths
+        limit = _STRETCH_LIMIT * self.lengths
         # A leg that was stretched before may stay so.
-        over = _softly_above(far - limit) - (1 - self.wanted) * _softly_above(was - limit)
+        over = _soft_excess(far - limit) - (1 - self.wanted) * _soft_excess(was - limit)
         counts = torch.maximum(self.wanted, _IS_FOOT)
-        near = counts * self.wanted * _softly_above(_FOLDED * self.lengths - far)
+        near = counts * self.wanted * _soft_excess(_FOLD_LIMIT * self.lengths - far)
         weight = ((places - self.before)[..., _MASS_JOINTS, :] * _MASSES[:, None]).sum(dim=-2) - shift
         return torch.cat([counts * over / _SIGMA_REACH, near / _SIGMA_REACH, weight[..., ::2] / _SIGMA_BALANCE], dim=-1)
 
 
-def _softly_above(value: Tensor) -> Tensor:
-    return _SOFT * torch.nn.functional.softplus(value / _SOFT)
+def _soft_excess(value: Tensor) -> Tensor:
+    return _SOFTPLUS_WIDTH * torch.nn.functional.softplus(value / _SOFTPLUS_WIDTH)
 
 
-def _offset_pose(
+def _apply_offsets(
     x: Float[Tensor, "*more poses offsets"], root: Float[Tensor, "poses 3"], quats: Float[Tensor, "poses joints 4"]
 ) -> tuple[Tensor, Tensor, Float[Tensor, "*more poses 3"]]:
     """Root and rotations with their offsets, and the shift of the whole body."""
     shift = torch.stack([x[..., 0], torch.zeros_like(x[..., 0]), x[..., 1]], dim=-1)
     turns = rotations.from_rotation_vector(x[..., 5:].unflatten(-1, (-1, 3)))
     quats = quats.expand(*x.shape[:-1], *quats.shape[-2:]).clone()
-    quats[..., _TURNING, :] = rotations.multiply(quats[..., _TURNING, :], turns)
+    quats[..., _TRUNK_JOINTS, :] = rotations.multiply(quats[..., _TRUNK_JOINTS, :], turns)
     return root + shift + x[..., 2:5], quats, shift
 
 
-def _with_offsets(part: Motion, offsets: Tensor) -> tuple[Motion, Float[Tensor, "poses 3"]]:
-    root, quats, shift = _offset_pose(offsets, part.root_position, part.local_quat_xyzw)
+def _apply_offsets_to_motion(part: Motion, offsets: Tensor) -> tuple[Motion, Float[Tensor, "poses 3"]]:
+    root, quats, shift = _apply_offsets(offsets, part.root_position, part.local_quat_xyzw)
     return replace(part, root_position=root, local_quat_xyzw=quats), shift
 
 
@@ -192,7 +192,7 @@ def bend_limbs(
     Feet lie as they lay `before`, and arms of which nothing is wanted hang as they hung; joints that are not `turning`
     stay.
     """
-    lay = _world(before)
+    lay = _world_rotations(before)
     for name, limb in LIMBS.items():
         told = wanted[:, limb.end] | name.endswith("Foot")
         # Limbs hang from a trunk that leans as they hung before: carried along, knees would end up behind.
@@ -201,7 +201,7 @@ def bend_limbs(
         places[:, limb.end] = torch.where(told[:, None], ends[:, limb.end], places[:, limb.end])
         free = torch.zeros_like(turning)
         free[:, [limb.upper, limb.lower]] = (turning[:, [limb.upper, limb.lower]].all(dim=1) & told)[:, None]
-        quats = inverse.solve(
+        quats = inverse.solve_inverse_kinematics(
             places, posed.local_quat_xyzw, posed.skeleton, free=free, limbs=(limb,), root_position=posed.root_position
         )
         posed = replace(posed, local_quat_xyzw=torch.where(free[..., None], quats, posed.local_quat_xyzw))
@@ -210,7 +210,7 @@ def bend_limbs(
     return posed
 
 
-def _world(motion: Motion) -> Float[Tensor, "poses joints 4"]:
+def _world_rotations(motion: Motion) -> Float[Tensor, "poses joints 4"]:
     skeleton = motion.skeleton
     return forward_kinematics(skeleton.offsets, skeleton.parents, motion.root_position, motion.local_quat_xyzw)[1]
 
@@ -219,7 +219,7 @@ def _keep_orientation(
     motion: Motion, joint: int, orientation: Float[Tensor, "poses 4"], chosen: Bool[Tensor, " poses"]
 ) -> Motion:
     """The motion with a joint oriented so in the world, in the chosen poses."""
-    above = _world(motion)[:, motion.skeleton.parents[joint]]
+    above = _world_rotations(motion)[:, motion.skeleton.parents[joint]]
     local = rotations.multiply(rotations.inverse(above), orientation)
     quats = motion.local_quat_xyzw.clone()
     quats[:, joint] = torch.where(chosen[:, None], local, quats[:, joint])

@@ -9,13 +9,13 @@ import numpy as np
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.joint_names import Part, Role, Side
-from mapctl.joint_roles import find_hips, roles
+from mapctl.joint_roles import classify_joints, find_hips
 from mapctl.mesh.primitives import Array, frame_along, unit
 from mapctl.motion import Motion
 
-_LEG = 0.80
+_STANDARD_LEG = 0.80
 """Hip to ankle of the person whose measures this package is written for, metres."""
-_TIP = {Part.HEAD: 0.17, Part.HAND: 0.14, Part.TOES: 0.07, Part.FOOT: 0.12, Part.FINGER: 0.02}
+_TIP_LENGTHS = {Part.HEAD: 0.17, Part.HAND: 0.14, Part.TOES: 0.07, Part.FOOT: 0.12, Part.FINGER: 0.02}
 """How far a last bone reaches where the file does not say, metres."""
 _UP = np.array([0.0, 1.0, 0.0])
 
@@ -58,9 +58,9 @@ class Anatomy:
         self.joints = motion.num_joints
         self.rotations = rotations.to_matrix(motion.joint_rotations()).numpy()
         joints, parents = motion.joint_positions().numpy(), motion.skeleton.parents
-        self.scale = _leg_length(joints[0], parents, roles(motion.skeleton)) / _LEG
-        self.points = _with_tips(motion, joints, self.rotations, self.scale)
-        self.hips = _hips(motion)
+        self.scale = _leg_length(joints[0], parents, classify_joints(motion.skeleton)) / _STANDARD_LEG
+        self.points = _add_tips(motion, joints, self.rotations, self.scale)
+        self.hips = _hips_joint(motion)
 
     @property
     def hips_world(self) -> Array:
@@ -100,8 +100,8 @@ class Anatomy:
         if head is None:
             return np.eye(3)
         tip = next((k for k in self.children(head) if k >= self.joints), head)
-        crown = self._local(head, self.points.world[:, tip] - self.points.world[:, head])
-        return _axes(up=crown.mean(0), forward=self._local(head, self.forward).mean(0))
+        crown = self._to_joint_frame(head, self.points.world[:, tip] - self.points.world[:, head])
+        return _axes_from(up=crown.mean(0), forward=self._to_joint_frame(head, self.forward).mean(0))
 
     @cached_property
     def feet(self) -> tuple[Foot, ...]:
@@ -116,18 +116,22 @@ class Anatomy:
             return None
         ball = next((k for k in below if self.points.roles[k].part is Part.TOES), below[0])
         tip = next(self.children(ball), None) if ball < self.joints else None
-        flat = self._flat(ankle, ball)
+        flat = self._flat_frames(ankle, ball)
         along = self.points.world[:, ball] - self.points.world[:, ankle]
-        axes = _axes(up=self._local(ankle, _UP)[flat].mean(0), forward=self._local(ankle, along)[flat].mean(0))
+        axes = _axes_from(
+            up=self._to_joint_frame(ankle, _UP)[flat].mean(0), forward=self._to_joint_frame(ankle, along)[flat].mean(0)
+        )
         toe = ball if ball < self.joints else ankle
         level = np.einsum("fij,j->fi", self.rotations[:, ankle], axes[:, 2])
-        toe_axes = _axes(up=self._local(toe, _UP)[flat].mean(0), forward=self._local(toe, level)[flat].mean(0))
+        toe_axes = _axes_from(
+            up=self._to_joint_frame(toe, _UP)[flat].mean(0), forward=self._to_joint_frame(toe, level)[flat].mean(0)
+        )
         heights = tuple(self._height(point, flat) for point in (ankle, ball))
         return Foot(
             side, ankle, ball, tip, axes, toe_axes, (max(heights[0], heights[1] + 0.02 * self.scale), heights[1])
         )
 
-    def _flat(self, ankle: int, ball: int) -> Array:
+    def _flat_frames(self, ankle: int, ball: int) -> Array:
         """Frames in which the foot most likely stands flat: ankle and ball together at their lowest."""
         height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
         return height <= np.quantile(height, 0.1)
@@ -137,13 +141,13 @@ class Anatomy:
         low, high = 0.02 * self.scale, 0.14 * self.scale
         return float(np.clip(np.median(self.points.world[flat, point, 1]), low, high))
 
-    def _local(self, joint: int, vector: Array) -> Array:
+    def _to_joint_frame(self, joint: int, vector: Array) -> Array:
         """World vectors (frames, 3) or (3,) in a joint's frame."""
         every = np.broadcast_to(vector, (len(self.rotations), 3))
         return np.einsum("fji,fj->fi", self.rotations[:, joint], every)
 
 
-def _axes(*, up: Array, forward: Array) -> Array:
+def _axes_from(*, up: Array, forward: Array) -> Array:
     """Columns left, up, forward; up is kept."""
     across = np.cross(up, forward)
     if np.linalg.norm(across) < 1e-6 * np.linalg.norm(forward) + 1e-12:
@@ -151,7 +155,7 @@ def _axes(*, up: Array, forward: Array) -> Array:
     return frame_along(up, across)
 
 
-def _hips(motion: Motion) -> int:
+def _hips_joint(motion: Motion) -> int:
     try:
         return find_hips(motion.skeleton)
     except RequestError:
@@ -164,20 +168,20 @@ def _leg_length(rest: Array, parents: tuple[int, ...], found: tuple[Role, ...]) 
         if role.part is Part.FOOT:
             knee = parents[foot]
             length = np.linalg.norm(rest[foot] - rest[knee]) + np.linalg.norm(rest[knee] - rest[parents[knee]])
-            return float(length) if length > 0.05 else _LEG
-    return _LEG
+            return float(length) if length > 0.05 else _STANDARD_LEG
+    return _STANDARD_LEG
 
 
-def _with_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Points:
-    found, parents = list(roles(motion.skeleton)), list(motion.skeleton.parents)
+def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Points:
+    found, parents = list(classify_joints(motion.skeleton)), list(motion.skeleton.parents)
     extra = []
     for joint, name in enumerate(motion.skeleton.names):
         leaf, part = joint not in parents[: len(motion.skeleton.names)], found[joint].part
         offset = np.array(motion.skeleton.end_offsets.get(name, (0.0, 0.0, 0.0)))
         if np.linalg.norm(offset) > 0.01 * scale:
             extra.append((joint, joints[:, joint] + turns[:, joint] @ offset))
-        elif part in _TIP and (leaf or part is Part.HEAD):  # eyes and the like say nothing of the crown
+        elif part in _TIP_LENGTHS and (leaf or part is Part.HEAD):  # eyes and the like say nothing of the crown
             along = unit(joints[:, joint] - joints[:, parents[joint]])
-            extra.append((joint, joints[:, joint] + along * _TIP[part] * scale))
+            extra.append((joint, joints[:, joint] + along * _TIP_LENGTHS[part] * scale))
     world = np.concatenate([joints, *(place[:, None] for _, place in extra)], axis=1)
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)

@@ -22,7 +22,7 @@ ACTORS: Mapping[str, str] = {
 
 LEFT = "#2f7fe0"
 RIGHT = "#f0862b"
-WISH = "#e0413a"
+TARGET = "#e0413a"
 TRAIL = "#f2b71f"
 VISOR = "#2b3038"
 BACKGROUND = "#eef1f5"
@@ -42,11 +42,11 @@ def rgb(colour: str) -> np.ndarray:
         raise RequestError(f"colour must be #rrggbb or one of {', '.join(ACTORS)}; got {colour!r}") from None
 
 
-def default(actor: int) -> str:
+def default_colour(actor: int) -> str:
     """The colour of the n-th actor that asked for none."""
     return list(ACTORS)[actor % len(ACTORS)]
 
 
-def mix(colour: np.ndarray, other: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+def blend_colours(colour: np.ndarray, other: np.ndarray, share: float | np.ndarray) -> np.ndarray:
     """`share` of the other colour in the first."""
     return colour + (other - colour) * share

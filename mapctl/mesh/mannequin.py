@@ -62,13 +62,13 @@ class Bones:
     """(bones,) share of the way from hips to shoulders; decides which way a flattened bone lies."""
 
 
-class Body:
+class Mannequin:
     """The body of one actor over a whole motion."""
 
     def __init__(self, motion: Motion, colour: Array):
         self.anatomy = Anatomy(motion)
         self.colour = colour
-        self.bones = _bones(self.anatomy, colour)
+        self.bones = _build_bones(self.anatomy, colour)
         self._left = self.anatomy.left(Part.UPPER_LEG), self.anatomy.left(Part.UPPER_ARM)
 
     @property
@@ -88,7 +88,7 @@ class Body:
         anatomy = self.anatomy
         head = anatomy.find(Part.HEAD)
         skull = [] if head is None else [np.array([head, head])]
-        return [self.bones.ends[:, 0], *skull, *(np.array(_carriers(anatomy, foot)) for foot in anatomy.feet)]
+        return [self.bones.ends[:, 0], *skull, *(np.array(_carrier_joints(anatomy, foot)) for foot in anatomy.feet)]
 
     def surface(self, frame: int) -> Surface:
         """The whole body in one frame."""
@@ -104,12 +104,12 @@ class Body:
     @cached_property
     def _sticks(self) -> tuple[Array, Array, Array]:
         anatomy, bones = self.anatomy, self.bones
-        shoes = [(joints, foot) for foot in anatomy.feet for joints in _bones_of(foot)]
+        shoes = [(joints, foot) for foot in anatomy.feet for joints in _foot_bones(foot)]
         head = anatomy.find(Part.HEAD)
         crown = [(head, tip) for tip in anatomy.children(head) if tip >= anatomy.joints][:1] if head is not None else []
         ends = np.array([*map(tuple, bones.ends), *(joints for joints, _ in shoes), *crown]).reshape(-1, 2)
         wide = np.array([0.045] * len(shoes) + [0.09] * len(crown)) * anatomy.scale
-        rgb = [*bones.rgb, *(_limb(foot.side) for _, foot in shoes), *(self.colour for _ in crown)]
+        rgb = [*bones.rgb, *(_limb_colour(foot.side) for _, foot in shoes), *(self.colour for _ in crown)]
         return (
             ends,
             np.concatenate([bones.radius.mean(axis=1) * bones.squash[:, 0], wide]),
@@ -133,11 +133,11 @@ class Body:
         )
 
 
-def _bones(anatomy: Anatomy, colour: Array) -> Bones:
+def _build_bones(anatomy: Anatomy, colour: Array) -> Bones:
     parents = anatomy.points.parents
-    pairs = [(parent, child) for child, parent in enumerate(parents) if _drawn(anatomy, child, parent)]
+    pairs = [(parent, child) for child, parent in enumerate(parents) if _is_drawn(anatomy, child, parent)]
     ends = pairs or [(anatomy.hips, anatomy.hips)]  # a lone joint is a ball
-    shares = _heights(anatomy)
+    shares = _trunk_shares(anatomy)
     return Bones(
         ends=np.array(ends),
         radius=np.array([_radii(anatomy, child, parent, shares) for parent, child in ends]) * anatomy.scale,
@@ -147,7 +147,7 @@ def _bones(anatomy: Anatomy, colour: Array) -> Bones:
     )
 
 
-def _drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
+def _is_drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
     """Not what leads from a floor root to the hips, not what skull and shoes show, nothing without length."""
     if parent < 0 or child <= anatomy.hips or anatomy.points.roles[parent].part in _BOXED:
         return False
@@ -155,7 +155,7 @@ def _drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
     return parent >= anatomy.hips and bool(length > 0.005 * anatomy.scale)
 
 
-def _heights(anatomy: Anatomy) -> Array:
+def _trunk_shares(anatomy: Anatomy) -> Array:
     """Every point's share of the way from hips to neck along the bones; 0 for legs, 1 for arms and head."""
     points, top = anatomy.points, anatomy.find(Part.NECK)
     top = anatomy.find(Part.HEAD) if top is None else top
@@ -197,11 +197,11 @@ def _squash(anatomy: Anatomy, child: int, parent: int) -> tuple[float, float, fl
 def _colour(anatomy: Anatomy, parent: int, colour: Array) -> Array:
     role = anatomy.points.roles[parent]
     if role.part in (*_TRUNK_PARTS, Part.SHOULDER) or role.side is Side.MIDDLE:
-        return _pale(colour) if role.part is Part.NECK else colour
-    return _limb(role.side)
+        return _lighten(colour) if role.part is Part.NECK else colour
+    return _limb_colour(role.side)
 
 
-def _limb(side: Side) -> Array:
+def _limb_colour(side: Side) -> Array:
     return colours.rgb(colours.LEFT if side is Side.LEFT else colours.RIGHT)
 
 
@@ -216,33 +216,33 @@ def _skull(anatomy: Anatomy, head: int, frame: int, colour: Array) -> RoundedBox
         half=np.zeros((2, 3)),
         radius=np.full((2, 2), scale),
         squash=np.array([_SKULL, _VISOR]),
-        rgb=np.stack([_pale(colour), colours.rgb(colours.VISOR)]),
+        rgb=np.stack([_lighten(colour), colours.rgb(colours.VISOR)]),
     )
 
 
-def _pale(colour: Array) -> Array:
+def _lighten(colour: Array) -> Array:
     """Of the head and neck, a little lighter than the trunk."""
-    return colours.mix(colour, np.ones(3), 0.18)
+    return colours.blend_colours(colour, np.ones(3), 0.18)
 
 
 def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
     """Heel to ball and, where there are toes, ball to tip; soles on the ground when the foot is flat."""
     world, scale = anatomy.points.world[frame], anatomy.scale
     turn, boxes = anatomy.rotations[frame, foot.ankle] @ foot.axes, []
-    reach = _ahead(turn, world[foot.ball] - world[foot.ankle]) + (0.03 if foot.tip is None else 0.01) * scale
+    reach = _forward_reach(turn, world[foot.ball] - world[foot.ankle]) + (0.03 if foot.tip is None else 0.01) * scale
     boxes.append(_sole(world[foot.ankle], turn, -foot.heights[0], (-0.055 * scale, reach), 0.085, scale))
     if foot.tip is not None:
         turn = anatomy.rotations[frame, foot.ball] @ foot.toe_axes
-        reach = max(_ahead(turn, world[foot.tip] - world[foot.ball]), 0.04 * scale)
+        reach = max(_forward_reach(turn, world[foot.tip] - world[foot.ball]), 0.04 * scale)
         boxes.append(_sole(world[foot.ball], turn, -foot.heights[1], (-0.035 * scale, reach), 0.055, scale))
     centre, frames, half = (np.stack(values) for values in zip(*boxes, strict=True))
-    many, leather = len(boxes), colours.mix(_limb(foot.side), np.zeros(3), 0.28)
+    many, leather = len(boxes), colours.blend_colours(_limb_colour(foot.side), np.zeros(3), 0.28)
     return RoundedBoxes(
         centre, frames, half, np.full((many, 2), _EDGE * scale), np.ones((many, 3)), np.tile(leather, (many, 1))
     )
 
 
-def _ahead(turn: Array, vector: Array) -> float:
+def _forward_reach(turn: Array, vector: Array) -> float:
     """How far a vector reaches along the foot, metres."""
     return float(turn[:, 2] @ vector)
 
@@ -254,11 +254,11 @@ def _sole(joint: Array, turn: Array, floor: float, along: tuple[float, float], t
     return joint + turn @ middle, turn, np.maximum(half - _EDGE * scale, 0.0)
 
 
-def _carriers(anatomy: Anatomy, foot: Foot) -> list[int]:
+def _carrier_joints(anatomy: Anatomy, foot: Foot) -> list[int]:
     """The joints that carry the boxes of a shoe: ankle, and the toes if the rig has them."""
     return [foot.ankle] if foot.tip is None else [foot.ankle, foot.ball if foot.ball < anatomy.joints else foot.ankle]
 
 
-def _bones_of(foot: Foot) -> list[tuple[int, int]]:
+def _foot_bones(foot: Foot) -> list[tuple[int, int]]:
     """Ankle to ball, and ball to tip if the rig has toes."""
     return [(foot.ankle, foot.ball)] + ([] if foot.tip is None else [(foot.ball, foot.tip)])

@@ -28,7 +28,7 @@ class Surface:
     """(n, 3) unit normals of a lit surface; None for flat colour."""
 
 
-def merge(surfaces: Sequence[Surface]) -> Surface:
+def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
     """One surface of all, faces in the order given. All are lit or none is."""
     counts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     lit = surfaces[0].normals is not None
@@ -41,7 +41,7 @@ def merge(surfaces: Sequence[Surface]) -> Surface:
 
 
 @cache
-def ball(around: int = 16, up: int = 10) -> tuple[Array, Array]:
+def unit_sphere(around: int = 16, up: int = 10) -> tuple[Array, Array]:
     """Unit sphere (n, 3) and its triangles; no vertex lies on a coordinate plane, so that each has an octant.
 
     `around` must be divisible by 4 and `up` even. The axis is y.
@@ -79,7 +79,7 @@ class RoundedBoxes:
 
     def surface(self) -> Surface:
         """All boxes as one lit surface."""
-        sphere, faces = ball()
+        sphere, faces = unit_sphere()
         octant = np.sign(sphere)
         radius = np.where(sphere[:, 1] < 0, self.radius[:, :1], self.radius[:, 1:])[..., None]
         local = octant * self.half[:, None] + sphere * self.squash[:, None] * radius

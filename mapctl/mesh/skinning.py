@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from mapctl.mesh import colours
-from mapctl.mesh.mannequin import Body
+from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
@@ -29,12 +29,12 @@ class Skin:
     """(n,) index of the joint."""
 
 
-def skin(motion: Motion, colour: str = "slate") -> Skin:
+def build_skin(motion: Motion, colour: str = "slate") -> Skin:
     """The body of a motion; feet are told flat by its frames, so it should hold more than one step.
 
     `colour` is the torso's: a name of `colours.ACTORS` or `#rrggbb`; RequestError otherwise.
     """
-    body = Body(motion, colours.rgb(colour))
+    body = Mannequin(motion, colours.rgb(colour))
     boxes, joint_of_box = body.boxes(0), body.joints()
     surfaces = [box.surface() for box in boxes]
     counts = [len(surface.vertices) // len(box.centre) for surface, box in zip(surfaces, boxes, strict=True)]

@@ -34,27 +34,27 @@ def measure(
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
     positions, fps, hips = motion.joint_positions(), float(motion.fps), find_hips(motion.skeleton)
-    measures = _feet(positions[:, list(find_feet(motion.skeleton))], fps)
-    measures |= _body(positions, hips, find_upper_legs(motion.skeleton), fps)
+    measures = _measure_feet(positions[:, list(find_feet(motion.skeleton))], fps)
+    measures |= _measure_body(positions, hips, find_upper_legs(motion.skeleton), fps)
     if curve is None:
         return measures | {"sway_cm": path.sway(path.straight_offset(positions[:, hips, ::2]), fps) * _CM}
     follower = hips if joint is None else motion.skeleton.index(joint)
-    return measures | _path(positions[:, follower], curve, speed, fps)
+    return measures | _measure_path(positions[:, follower], curve, speed, fps)
 
 
-def _feet(toe_positions: Float[Tensor, "frames 2 3"], fps: float) -> dict[str, float]:
-    toes = feet.Toes.of(toe_positions, fps)
+def _measure_feet(toe_positions: Float[Tensor, "frames 2 3"], fps: float) -> dict[str, float]:
+    toes = feet.ToeMeasurements.of(toe_positions, fps)
     return {
         "skate_cm_s": feet.skate(toes) * _CM,
         "skate_ratio": feet.skate_ratio(toes),
         "contact_speed_cm_s": feet.contact_speed(toes) * _CM,
         "planted_share": feet.planted_share(toes),
         "penetration_cm": feet.penetration(toes) * _CM,
-        "float_cm": feet.floating(toes) * _CM,
+        "float_cm": feet.float_height(toes) * _CM,
     }
 
 
-def _body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float) -> dict[str, float]:
+def _measure_body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float) -> dict[str, float]:
     left, right = upper_legs
     angle = body.facing(positions[:, left], positions[:, right])
     return {
@@ -67,11 +67,11 @@ def _body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float)
     }
 
 
-def _path(places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float) -> dict[str, float]:
+def _measure_path(places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float) -> dict[str, float]:
     arcs = curve.track(places)
     travelled = float(arcs[-1] - arcs[0])
-    measures = _spread("path_error_{}_cm", path.path_error(places, curve, arcs))
-    measures |= _spread("path_error_low_passed_{}_cm", path.low_passed_error(places, curve, arcs, fps))
+    measures = _summarise_errors("path_error_{}_cm", path.compute_path_error(places, curve, arcs))
+    measures |= _summarise_errors("path_error_low_passed_{}_cm", path.compute_low_pass_error(places, curve, arcs, fps))
     measures |= {"sway_cm": path.sway(curve.signed_offset(places, arcs), fps) * _CM, "travelled_m": travelled}
     if speed is not None:
         wanted = speed * (len(places) - 1) / fps
@@ -79,12 +79,12 @@ def _path(places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, 
     return measures
 
 
-def _spread(name: str, error: Float[Tensor, "frames"]) -> dict[str, float]:
+def _summarise_errors(name: str, error: Float[Tensor, "frames"]) -> dict[str, float]:
     values = {"mean": error.mean(), "p95": error.quantile(0.95), "max": error.max()}
     return {name.format(kind): float(value) * _CM for kind, value in values.items()}
 
 
-class Spread(NamedTuple):
+class MeasureStatistics(NamedTuple):
     """What a set of clips shows of one measure."""
 
     mean: float
@@ -92,7 +92,7 @@ class Spread(NamedTuple):
     p98: float
 
 
-def reference(motions: Iterable[Motion]) -> dict[str, Spread]:
+def compute_reference(motions: Iterable[Motion]) -> dict[str, MeasureStatistics]:
     """Mean, 2nd and 98th percentile of every measure over clips, to print beside ours.
 
     NaN is left out: clips that cannot give a measure. RequestError for no clips at all.
@@ -101,10 +101,10 @@ def reference(motions: Iterable[Motion]) -> dict[str, Spread]:
     if not rows:
         raise RequestError("a reference needs at least one clip")
     table = {name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]}
-    return {name: _spread_of(values[~values.isnan()]) for name, values in table.items()}
+    return {name: _summarise_values(values[~values.isnan()]) for name, values in table.items()}
 
 
-def _spread_of(values: Tensor) -> Spread:
+def _summarise_values(values: Tensor) -> MeasureStatistics:
     if len(values) == 0:
-        return Spread(float("nan"), float("nan"), float("nan"))
-    return Spread(float(values.mean()), *values.quantile(values.new_tensor([0.02, 0.98])).tolist())
+        return MeasureStatistics(float("nan"), float("nan"), float("nan"))
+    return MeasureStatistics(float(values.mean()), *values.quantile(values.new_tensor([0.02, 0.98])).tolist())

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.numerics.gaussian import slow_part
+from mapctl.numerics.gaussian import low_pass
 from mapctl.rotations import unwrap_angle
 
 TURN_SECONDS = 0.35
@@ -29,7 +29,7 @@ def facing(left_leg: Float[Tensor, "frames 3"], right_leg: Float[Tensor, "frames
 
 def turn_rate(angle: Float[Tensor, "frames"], fps: float) -> float:
     """Mean size of the turning after strides are smoothed away, rad/s; NaN for one frame."""
-    return float(slow_part(angle, seconds=TURN_SECONDS, fps=fps).diff().abs().mean() * fps)
+    return float(low_pass(angle, seconds=TURN_SECONDS, fps=fps).diff().abs().mean() * fps)
 
 
 def pose_variation(

@@ -5,9 +5,9 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
-from mapctl.retarget.upright import UNKNOWN
+from mapctl.retarget.upright import UNKNOWN_RIG_NOTE
 
-_ABOUT = 0.02  # share of the reference's rate within which measures are the same, as of 29.97 frames a second
+_RATE_TOLERANCE = 0.02  # share of the reference's rate within which measures are the same, as of 29.97 frames a second
 
 
 def make_comparable(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[str, ...]]:
@@ -21,10 +21,10 @@ def make_comparable(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tup
     try:
         motion = retarget.to_canonical(motion, rig)[0]
     except RequestError:
-        notes = (UNKNOWN,)
-    if motion.fps > PRIOR_FPS * (1 + _ABOUT):
+        notes = (UNKNOWN_RIG_NOTE,)
+    if motion.fps > PRIOR_FPS * (1 + _RATE_TOLERANCE):
         motion = motion.resample(PRIOR_FPS)
-    if motion.fps < PRIOR_FPS * (1 - _ABOUT):
+    if motion.fps < PRIOR_FPS * (1 - _RATE_TOLERANCE):
         rate = f"{float(motion.fps):.4g} frames a second"
         notes = (*notes, f"measured at {rate}; mocap's values at {PRIOR_FPS} tell of quicker changes")
     return motion, notes

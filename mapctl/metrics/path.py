@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mapctl.curves.curve import Curve
 from mapctl.numerics import gaussian
-from mapctl.numerics.gaussian import gaussian_kernel, slow_part
+from mapctl.numerics.gaussian import gaussian_kernel, low_pass
 
 LOW_PASS_SECONDS = 0.5
 """Standard deviation of the Gaussian that takes natural sway out of the path error."""
@@ -16,7 +16,7 @@ SWAY_SECONDS = 0.35
 """Standard deviation of the Gaussian whose slow part is not sway."""
 
 
-def path_error(
+def compute_path_error(
     places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames"]:
     """Distance of each place to where the walk is on the curve, between its ends, metres; without height for a ground
@@ -27,14 +27,14 @@ def path_error(
     return apart.norm(dim=-1)
 
 
-def low_passed_error(
+def compute_low_pass_error(
     places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
 ) -> Float[Tensor, "frames"]:
     """Size of the sideways offset after a Gaussian of 0.5 s, metres.
 
     The offset is smoothed and not the walk, which would shrink on every bend. `arcs` come from `track`.
     """
-    return slow_part(curve.signed_offset(places, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
+    return low_pass(curve.signed_offset(places, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
 
 
 def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECONDS) -> float:
@@ -44,7 +44,7 @@ def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECO
     if len(offset) <= 2 * reach + 4:
         return math.nan
     # Inside, where the whole kernel lies on the walk.
-    quick = (offset - gaussian.convolved(offset, kernel, "nothing"))[reach:-reach]
+    quick = (offset - gaussian.convolve(offset, kernel, "nothing"))[reach:-reach]
     return float(quick.square().mean().sqrt())
 
 

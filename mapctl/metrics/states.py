@@ -6,7 +6,7 @@ from torch import Tensor
 from mapctl.features import LAYOUT, ground_speed
 
 
-def state_summary(features: Float[Tensor, "frames size"]) -> dict[str, float]:
+def summarise_states(features: Float[Tensor, "frames size"]) -> dict[str, float]:
     """Mean speed (m/s), mean root height (m) and mean spread of the joint rotations (rad)."""
     return {
         "speed": float(ground_speed(features).mean()),

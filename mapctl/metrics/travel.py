@@ -17,12 +17,12 @@ from mapctl.motion import Motion
 
 _SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
-_HELD = 0.4  # seconds for which a wish must hold to count as reached
+_HOLD_SECONDS = 0.4  # seconds for which a wish must hold to count as reached
 _NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
 
 
 @dataclass(frozen=True, eq=False)
-class Travelled:
+class LowPassVelocity:
     """Slow velocity of the hips, frame by frame."""
 
     seconds: Float[ndarray, " frames"]
@@ -33,16 +33,16 @@ class Travelled:
     """Radians about +Y; of no meaning where the speed is near 0."""
 
 
-def travelled(motion: Motion) -> Travelled:
+def compute_low_pass_velocity(motion: Motion) -> LowPassVelocity:
     """Slow velocity of a motion's root over the ground (Gaussian of 0.25 s)."""
     fps = float(motion.fps)
     ground = motion.joint_positions()[:, 0, ::2].numpy()
     velocity = gaussian_filter1d(np.gradient(ground, axis=0) * fps, _SLOW_SECONDS * fps, axis=0, mode="nearest")
     seconds = np.arange(len(ground)) / fps
-    return Travelled(seconds, np.linalg.norm(velocity, axis=-1), np.arctan2(velocity[:, 0], velocity[:, 1]))
+    return LowPassVelocity(seconds, np.linalg.norm(velocity, axis=-1), np.arctan2(velocity[:, 0], velocity[:, 1]))
 
 
-def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
+def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
     """A row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
 
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
@@ -50,9 +50,9 @@ def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | No
     steady_turn_deg_s (None where the other, standing, or no steady part was wanted), step_m and steady_step_m (None
     unless a step length was wanted).
     """
-    way, rows = travelled(motion), []
+    way, rows = compute_low_pass_velocity(motion), []
     asked = any(command.step_length is not None for command in track.commands)
-    steps = _steps(motion) if asked else np.full(len(way.seconds), math.nan)
+    steps = _step_length_by_frame(motion) if asked else np.full(len(way.seconds), math.nan)
     ground = motion.joint_positions()[:, 0, ::2].numpy()
     ends = [*track.times[1:], float(way.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
@@ -64,32 +64,34 @@ def by_command(motion: Motion, track: CommandTrack) -> list[dict[str, float | No
             "turn_deg_s": turning,
             "heading_deg": math.degrees(command.heading),
         }
-        row["reached_s"] = _reached(way, part, began, command, float(motion.fps))
+        row["reached_s"] = _find_time_reached(way, part, began, command, float(motion.fps))
         steady = np.flatnonzero(part & (way.seconds >= began + _STEADY_AFTER))
-        row |= _steady(way, ground, steady, command, float(motion.fps))
+        row |= _measure_steady_errors(way, ground, steady, command, float(motion.fps))
         seen = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
         rows.append(row | {"step_m": command.step_length, "steady_step_m": float(np.mean(seen)) if len(seen) else None})
     return rows
 
 
-def _steps(motion: Motion) -> Float[ndarray, " frames"]:
+def _step_length_by_frame(motion: Motion) -> Float[ndarray, " frames"]:
     """Length of the step that ends in a frame, metres; NaN where none does."""
     toes = motion.joint_positions()[:, list(find_feet(motion.skeleton))]
-    return step_lengths(toes[..., ::2], contacts.planted(toes, float(motion.fps)), float(motion.fps)).numpy()
+    return step_lengths(toes[..., ::2], contacts.detect_contacts(toes, float(motion.fps)), float(motion.fps)).numpy()
 
 
-def _reached(way: Travelled, part: ndarray, began: float, command: Command, fps: float) -> float | None:
+def _find_time_reached(way: LowPassVelocity, part: ndarray, began: float, command: Command, fps: float) -> float | None:
     near = np.abs(way.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
     if command.speed > 0 and command.turning is None:
         near &= np.abs(_wrapped(way.direction - command.heading)) < _NEAR_ANGLE
     at = np.flatnonzero(part)
     for first in at:
-        if near[first : min(first + round(_HELD * fps), at[-1] + 1)].all():
+        if near[first : min(first + round(_HOLD_SECONDS * fps), at[-1] + 1)].all():
             return float(way.seconds[first] - began)
     return None
 
 
-def _steady(way: Travelled, ground: ndarray, frames: ndarray, command: Command, fps: float) -> dict[str, float | None]:
+def _measure_steady_errors(
+    way: LowPassVelocity, ground: ndarray, frames: ndarray, command: Command, fps: float
+) -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(
         ("steady_speed_mps", "steady_heading_error_deg", "steady_turn_deg_s")
     )
@@ -109,7 +111,7 @@ def _wrapped(angle):
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def wanted(track: CommandTrack, seconds: Sequence[float]) -> tuple[list[float], list[float]]:
+def sample_commands(track: CommandTrack, seconds: Sequence[float]) -> tuple[list[float], list[float]]:
     """The commanded speed (m/s) and heading (radians; NaN while it is to turn on and on) at each time."""
     commands = [track.at(time) for time in seconds]
     return [command.speed for command in commands], [

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from mapctl import contacts
 
-_NEAR = 0.05  # metres over its floor, of the lower toe: no flight
+_NEAR_FLOOR = 0.05  # metres over its floor, of the lower toe: no flight
 _LOW, _SLOW = 0.03, 0.35  # metres and m/s of a toe that carries
-_GOING = 0.3  # m/s of the hips
+_MOVING_SPEED = 0.3  # m/s of the hips
 
 
 class Peaks(NamedTuple):
@@ -25,7 +25,7 @@ class Peaks(NamedTuple):
     """Largest, m/s^2."""
 
 
-def peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"], fps: float) -> Peaks:
+def measure_peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"], fps: float) -> Peaks:
     """Of world positions in metres; 0 for what so few frames do not show."""
     seen = ends - hips[:, None]
     steps, bends = (torch.diff(seen, n=order, dim=0).norm(dim=-1) for order in (1, 2))
@@ -34,23 +34,25 @@ def peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"],
     )
 
 
-def unsupported(
+def find_unsupported(
     toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
 ) -> Bool[Tensor, " steps"]:
     """Whether, on the way to each frame but the first, the hips go over the ground while no toe is planted and the
     lower one is near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's
     own 5th percentile.
     """
-    height = (toes[..., 1] - contacts.floor_heights(toes))[1:]
+    height = (toes[..., 1] - contacts.estimate_floor_heights(toes))[1:]
     speed, pace = (torch.diff(places[..., ::2], dim=0).norm(dim=-1) * fps for places in (toes, hips))
     planted = ((height < _LOW) & (speed < _SLOW)).any(dim=1)
-    return ~planted & (height.amin(dim=1) < _NEAR) & (pace > _GOING)
+    return ~planted & (height.amin(dim=1) < _NEAR_FLOOR) & (pace > _MOVING_SPEED)
 
 
-def longest_unsupported(toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float) -> float:
+def measure_longest_unsupported(
+    toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
+) -> float:
     """Seconds of the longest stretch of `unsupported`."""
     longest = run = 0
-    for bad in unsupported(toes, hips, fps).tolist():
+    for bad in find_unsupported(toes, hips, fps).tolist():
         run = run + 1 if bad else 0
         longest = max(longest, run)
     return longest / fps

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def weights(
+def pairwise_weights(
     count: int, sigma: float, dtype: torch.dtype, device: torch.device | None = None
 ) -> Float[Tensor, "count count"]:
     """How much each frame has to do with each other: 1 with itself; `sigma` is in frames. Memory is count squared."""
@@ -15,11 +15,11 @@ def weights(
     return torch.exp(-0.5 * ((frame[:, None] - frame) / sigma).square())
 
 
-def averaging(
+def averaging_matrix(
     count: int, sigma: float, dtype: torch.dtype, device: torch.device | None = None
 ) -> Float[Tensor, "count count"]:
     """Row t averages the frames around t, normalised over the frames there are; `sigma` is in frames."""
-    weight = weights(count, sigma, dtype, device)
+    weight = pairwise_weights(count, sigma, dtype, device)
     return weight / weight.sum(dim=-1, keepdim=True)
 
 
@@ -29,7 +29,7 @@ def kernel(sigma: float, side: int) -> Float[Tensor, " taps"]:
     return weight / weight.sum()
 
 
-def convolved(
+def convolve(
     values: Float[Tensor, "frames *width"], taps: Float[Tensor, " taps"], ends: Literal["nothing", "repeated"]
 ) -> Float[Tensor, "frames *width"]:
     """Each frame as the mean of those around it that a kernel's `taps`, odd in number, say; beyond the ends there is
@@ -48,9 +48,9 @@ def gaussian_kernel(seconds: float, fps: float) -> Float[Tensor, "taps"]:
     return kernel(seconds * fps, int(3 * seconds * fps))
 
 
-def slow_part(values: Float[Tensor, "frames"], *, seconds: float, fps: float) -> Float[Tensor, "frames"]:
+def low_pass(values: Float[Tensor, "frames"], *, seconds: float, fps: float) -> Float[Tensor, "frames"]:
     """The smoothed signal, every frame of it: near the ends the weights are those of the frames there are."""
     kernel = gaussian_kernel(seconds, fps)
     both = torch.stack([values, torch.ones_like(values)], dim=-1)
-    summed, weight = convolved(both, kernel, "nothing").unbind(dim=-1)
+    summed, weight = convolve(both, kernel, "nothing").unbind(dim=-1)
     return summed / weight

@@ -9,7 +9,7 @@ from torch import Tensor
 from mapctl import rotations
 
 
-def runs(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, int, int]]:
+def true_intervals(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, int, int]]:
     """Column, first frame and one past the last of each run of true, column by column."""
     edge = torch.zeros(1, mask.shape[1], dtype=torch.int8)
     change = torch.diff(mask.to(torch.int8), dim=0, prepend=edge, append=edge).T
@@ -18,9 +18,9 @@ def runs(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, int, int]]
         yield column, start, stop
 
 
-def filled(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
+def fill_missing(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
     """Frames that were not seen, straight between those around them; beyond the first and last seen, as these are."""
-    before, after = last_seen(seen), next_seen(seen)
+    before, after = last_observed(seen), next_observed(seen)
     start = torch.take_along_dim(values, before[..., None], dim=1)
     stop = torch.take_along_dim(values, after[..., None], dim=1)
     frame = torch.arange(values.shape[1], device=values.device)
@@ -28,14 +28,14 @@ def filled(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batc
     return torch.lerp(start, stop, weight[..., None])
 
 
-def filled_angle(angle: Float[Tensor, "batch frames"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
+def fill_missing_angle(angle: Float[Tensor, "batch frames"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
     """Angles, radians, not wrapped; frames that were not seen are `filled` the short way round."""
     # Unseen frames may show anything: whole turns are counted from one seen frame to the next.
-    held = torch.take_along_dim(angle, last_seen(seen), dim=1)
-    return filled(rotations.unwrap_angle(held)[..., None], seen)[..., 0]
+    held = torch.take_along_dim(angle, last_observed(seen), dim=1)
+    return fill_missing(rotations.unwrap_angle(held)[..., None], seen)[..., 0]
 
 
-def last_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
+def last_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
     """For each frame the last one at or before it that was seen; before the first of them, that one."""
     frame = torch.arange(seen.shape[1], device=seen.device)
     last = torch.where(seen, frame, -1).cummax(dim=1).values
@@ -43,6 +43,6 @@ def last_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]
     return torch.where(last < 0, first[:, None], last)
 
 
-def next_seen(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
+def next_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
     """For each frame the first one at or after it that was seen; after the last of them, that one."""
-    return seen.shape[1] - 1 - last_seen(seen.flip(1)).flip(1)
+    return seen.shape[1] - 1 - last_observed(seen.flip(1)).flip(1)

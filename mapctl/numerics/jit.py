@@ -6,10 +6,10 @@ from typing import Any
 
 from numba import njit
 
-Compile = Callable[[Callable[..., Any]], Callable[..., Any]]
+JitDecorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def compilers(*relaxed: str) -> tuple[Compile, Compile]:
+def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
     """(entry, inner): decorators for functions that Python calls, and for those that only compiled code calls.
 
     `relaxed` names LLVM's fast-math flags; NaN and infinity keep their meaning while `nnan` and `ninf` are not among
@@ -19,14 +19,14 @@ def compilers(*relaxed: str) -> tuple[Compile, Compile]:
 
     def entry(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
-            return _forgiving(_njit(cache=True, nogil=True, **shared)(function))
+            return _tolerate_full_disk(_njit(cache=True, nogil=True, **shared)(function))
         except RuntimeError:  # numba found no folder that it may write to
             return _njit(nogil=True, **shared)(function)
 
     return entry, _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
 
 
-def _forgiving(compiled: Any) -> Any:
+def _tolerate_full_disk(compiled: Any) -> Any:
     """Where the disk is full that numba keeps compiled code on, the next start takes longer; nothing fails."""
     cache = compiled._cache
     keep = cache.save_overload
@@ -39,7 +39,7 @@ def _forgiving(compiled: Any) -> Any:
     return compiled
 
 
-def _njit(**options: Any) -> Compile:
+def _njit(**options: Any) -> JitDecorator:
     """numba's decorator, whose overloads no type checker follows."""
     compiler: Any = njit
     return compiler(**options)

@@ -7,39 +7,39 @@ from numpy import ndarray
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
-_FIRM = 1e9  # how much more a value that is told counts than smoothness
-WEIGHTS = (1.0, -2.0, 1.0)
+_CONSTRAINT_WEIGHT = 1e9  # how much more a value that is told counts than smoothness
+SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
 """Of three frames in a second difference."""
 
 
-def touching(start: int, stop: int, frames: int) -> range:
+def find_overlapping_differences(start: int, stop: int, frames: int) -> range:
     """First frames of the second differences, of a motion of so many frames, that take in some of start to stop."""
     return range(max(0, start - 2), min(frames - 2, stop))
 
 
-def fading(seconds: float, fps: float) -> float:
+def fade_weight(seconds: float, fps: float) -> float:
     """How firmly frames are held at nothing where offsets are to fade away over this time."""
     return 1.0 / max(1.0, seconds * fps) ** 4
 
 
-def solved(
+def solve_offsets(
     right: Float[ndarray, "count width"], firm: float | Float[ndarray, " count"], *, start: int, frames: int
 ) -> Float[ndarray, "count width"]:
     """Offsets o of frames from `start` on, with  (D'D + diag(firm)) o = right,  D the second differences of a motion of
     so many frames, of which all others have no offset.
     """
     count = len(right)
-    first = np.array(touching(start, start + count, frames), dtype=int) - start
+    first = np.array(find_overlapping_differences(start, start + count, frames), dtype=int) - start
     bands = np.zeros((3, count))
-    for tap, weight in enumerate(WEIGHTS):
+    for tap, weight in enumerate(SECOND_DIFFERENCE):
         for beside in range(3 - tap):
             held = first[(first + tap >= 0) & (first + tap + beside < count)] + tap + beside
-            bands[2 - beside, held] += weight * WEIGHTS[tap + beside]
+            bands[2 - beside, held] += weight * SECOND_DIFFERENCE[tap + beside]
     bands[2] += firm
     return solveh_banded(bands, right)
 
 
-def spread(
+def interpolate_offsets(
     values: Float[Tensor, "frames width"], firm: Bool[Tensor, " frames"], *, seconds: float, fps: float
 ) -> Float[Tensor, "frames width"]:
     """The smoothest offsets that are the values in the frames that are firm, and fade to nothing away from them over
@@ -48,6 +48,6 @@ def spread(
     count = len(values)
     if count < 3:
         return torch.where(firm[:, None], values, 0.0)
-    weight = fading(seconds, fps) + _FIRM * firm.double().numpy()
-    right = _FIRM * (values * firm[:, None]).double().numpy()
-    return torch.as_tensor(solved(right, weight, start=0, frames=count)).to(values)
+    weight = fade_weight(seconds, fps) + _CONSTRAINT_WEIGHT * firm.double().numpy()
+    right = _CONSTRAINT_WEIGHT * (values * firm[:, None]).double().numpy()
+    return torch.as_tensor(solve_offsets(right, weight, start=0, frames=count)).to(values)

@@ -6,21 +6,21 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, PRIOR_FPS, Place
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
-class Context:
+class WindowContext:
     """What is known before the window."""
 
     density: Density
     """The prior."""
     state: Any
     """Its state after the committed frames; batch of one, or one for each candidate."""
-    place: Place
+    place: GroundPose
     """Of the last committed frame."""
     before: Float[Tensor, "past joints 3"]
     """World joint positions of the last committed frames, metres."""
@@ -37,6 +37,6 @@ class Context:
         return Trial(features, self.place, noise, density, contacts, self.before, self.skeleton, self.fps, planted)
 
 
-def _spread(state: Any, batch: int) -> Any:
+def _expand_state(state: Any, batch: int) -> Any:
     """The state for a batch of candidates."""
     return state if state.batch == batch else state.repeat(batch)

@@ -17,14 +17,14 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.motion import Motion
 
-WINDOW = 96
+SELECTION_WINDOW = 96
 """Frames over which a density's trust is told: of the windows of denoising, and of a card's `windows`."""
-_ANGLE_DEG, _PLACE_CM = 1.0, 0.5  # by which proposals are typically off
-_HOPELESS = -1e6  # nats
+_ANGLE_DEG, _POSITION_CM = 1.0, 0.5  # by which proposals are typically off
+_NON_FINITE_LOG_DENSITY = -1e6  # nats
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class DensityChoice:
     """The density under which a motion is likeliest."""
 
     density: Any
@@ -38,12 +38,12 @@ class Choice:
 
         Gaussians whose errors are sqrt(T) times too large lose (T - 1) / 2 nats a value: 1 / T makes up for it.
         """
-        lacking = self.density.usual_nats - self.nats[self.density.name]
+        lacking = self.density.reference_log_density - self.nats[self.density.name]
         return 1.0 / (1.0 + max(0.0, lacking) / (LAYOUT.continuous / 2))
 
 
 @dataclass(frozen=True)
-class Stretch:
+class DensityInterval:
     """What densities made of some frames."""
 
     start: int
@@ -58,7 +58,9 @@ class Stretch:
     """Share that its log density counted with; below 1 it was out of its depth."""
 
 
-def likeliest(densities: Sequence[Any], features: Float[Tensor, "frames size"], states: Sequence[Any]) -> Choice:
+def select_density(
+    densities: Sequence[Any], features: Float[Tensor, "frames size"], states: Sequence[Any]
+) -> DensityChoice:
     """Of some densities with their states before the frames. RequestError where there are none.
 
     To score a proposal, blur the densities first (`density.blurred(spread())`): they are sharper than it is right.
@@ -66,35 +68,40 @@ def likeliest(densities: Sequence[Any], features: Float[Tensor, "frames size"], 
     if not densities:
         raise RequestError("no density to choose from")
     with torch.no_grad():
-        nats = {density.name: _nats(density, features, state) for density, state in zip(densities, states, strict=True)}
-    return Choice(max(densities, key=lambda density: nats[density.name]), nats)
+        nats = {
+            density.name: _mean_log_density(density, features, state)
+            for density, state in zip(densities, states, strict=True)
+        }
+    return DensityChoice(max(densities, key=lambda density: nats[density.name]), nats)
 
 
-def likeliest_of_motion(densities: Sequence[Any], motion: Motion) -> Choice:
+def select_density_for_motion(densities: Sequence[Any], motion: Motion) -> DensityChoice:
     """The same of a whole canonical motion at any rate, from its first frame on.
 
     RequestError where there are none; MapctlError for a motion of fewer than two frames at the priors' rate.
     """
     features = encode(motion.resample(PRIOR_FPS))[0].float()
-    return likeliest(densities, features[1:], [density.initial_state(features[:1]) for density in densities])
+    return select_density(densities, features[1:], [density.initial_state(features[:1]) for density in densities])
 
 
-def spread() -> Float[Tensor, " continuous"]:
+def proposal_sigma() -> Float[Tensor, " continuous"]:
     """What a proposal is off by: standard deviations of the continuous features, physical units."""
     found = torch.full((LAYOUT.continuous,), math.radians(_ANGLE_DEG))
     for block in ("root_displacement_heading", "root_height"):
-        found[LAYOUT.slices[block]] = _PLACE_CM / 100
+        found[LAYOUT.slices[block]] = _POSITION_CM / 100
     # Errors of neighbouring frames go together, so their difference is smaller.
     found[LAYOUT.slices["heading_change"]] /= 2
     return found
 
 
-def physical_nats(log_density: Float[Tensor, "*batch"], feature_std: Float[Tensor, " size"]) -> Float[Tensor, "*batch"]:
+def to_physical_log_density(
+    log_density: Float[Tensor, "*batch"], feature_std: Float[Tensor, " size"]
+) -> Float[Tensor, "*batch"]:
     """Log densities of normalised features in physical units."""
     return log_density - feature_std[: LAYOUT.continuous].log().sum()
 
 
-def _nats(density: Any, features: Tensor, state: Any) -> float:
+def _mean_log_density(density: Any, features: Tensor, state: Any) -> float:
     """Mean of the frames; hopeless where it is not finite."""
-    found = float(physical_nats(density.log_prob(features[None], state), density.feature_std).mean())
-    return found if math.isfinite(found) else _HOPELESS
+    found = float(to_physical_log_density(density.log_prob(features[None], state), density.feature_std).mean())
+    return found if math.isfinite(found) else _NON_FINITE_LOG_DENSITY

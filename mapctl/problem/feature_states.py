@@ -7,15 +7,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.context import Context, _spread
+from mapctl.problem.context import WindowContext, _expand_state
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
-class States:
+class FeatureStates:
     """Unknowns are features (in units of `scale`) and the noise on the network's input, side by side."""
 
-    context: Context
+    context: WindowContext
     """Before the window."""
     scale: Float[Tensor, " continuous"]
     """Physical size of one unit of each feature: the prior's standard deviations."""
@@ -40,5 +40,5 @@ class States:
         features = torch.cat([states * self.scale + self.centre, bits], dim=-1)
         inputs = features[..., : LAYOUT.continuous] + noise * self.input_noise * self.scale
         seen = torch.cat([inputs, bits], dim=-1)
-        density = context.density.log_prob(features, _spread(context.state, len(states)), inputs=seen)
+        density = context.density.log_prob(features, _expand_state(context.state, len(states)), inputs=seen)
         return context.trial(features, noise, density, self.contacts.expand(len(states), -1, -1))

@@ -33,7 +33,7 @@ class Ledger:
         if not self.entries:
             return other
         mine, theirs = ({entry.name: entry for entry in ledger.entries} for ledger in (self, other))
-        return Ledger(tuple(_joined(mine.get(name), theirs.get(name), self, other) for name in mine | theirs))
+        return Ledger(tuple(_join_entries(mine.get(name), theirs.get(name), self, other) for name in mine | theirs))
 
     def slice(self, frames: int) -> "Ledger":
         """The first frames."""
@@ -53,7 +53,7 @@ class Ledger:
         }
 
 
-def _joined(before: LedgerEntry | None, after: LedgerEntry | None, first: Ledger, second: Ledger) -> LedgerEntry:
+def _join_entries(before: LedgerEntry | None, after: LedgerEntry | None, first: Ledger, second: Ledger) -> LedgerEntry:
     """One term of two ledgers, of which one may not have it."""
     some = before or after
     assert some is not None, "the term comes from one of them"

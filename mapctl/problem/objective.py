@@ -29,12 +29,12 @@ class Objective:
 
     def energy(self, unknowns: Float[Tensor, "batch unknowns"]) -> Float[Tensor, " batch"]:
         """Total nats of each candidate."""
-        return self._total(self.build(unknowns)).sum(-1)
+        return self._sum_terms(self.build(unknowns)).sum(-1)
 
-    def _total(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        total = checked(self.terms[0], "energy", self.terms[0](trial), trial)
+    def _sum_terms(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        total = check_shape(self.terms[0], "energy", self.terms[0](trial), trial)
         for term in self.terms[1:]:
-            total = total + checked(term, "energy", term(trial), trial)
+            total = total + check_shape(term, "energy", term(trial), trial)
         return total
 
     def energy_and_gradient(self, unknowns: Tensor) -> tuple[Tensor, Tensor]:
@@ -46,14 +46,14 @@ class Objective:
         energy = self.energy(unknowns)
         (gradient,) = torch.autograd.grad(energy.sum(), unknowns)
         if not bool(torch.isfinite(energy.detach().sum() + gradient.sum())):
-            self._blame(unknowns)
+            self._raise_for_bad_term(unknowns)
         return energy.detach(), gradient
 
-    def _blame(self, unknowns: Tensor) -> None:
+    def _raise_for_bad_term(self, unknowns: Tensor) -> None:
         """Find the term that is not finite, one after the other; says nothing where the motion is none either."""
         for term in self.terms:
             trial = self.build(unknowns)
-            if not _sane(trial):
+            if not _is_plausible(trial):
                 return
             energy = term(trial)
             _check_finite(term, "energy", energy)
@@ -62,16 +62,16 @@ class Objective:
                 if gradient is not None:
                     _check_finite(term, "gradient", gradient)
 
-    def ledger_of(self, trial: Trial) -> Ledger:
+    def build_ledger(self, trial: Trial) -> Ledger:
         """By term, the energies and residuals of a trial of one candidate."""
         with torch.no_grad():
-            return Ledger(tuple(_entry(term, trial) for term in self.terms))
+            return Ledger(tuple(_build_entry(term, trial) for term in self.terms))
 
 
-_BEYOND = 1e4  # metres or radians: a motion that a search has thrown this far says nothing of a term
+_PLAUSIBLE_LIMIT = 1e4  # metres or radians: a motion that a search has thrown this far says nothing of a term
 
 
-def checked(term: Term, what: str, values: Any, trial: Trial) -> Float[Tensor, "batch frames"]:
+def check_shape(term: Term, what: str, values: Any, trial: Trial) -> Float[Tensor, "batch frames"]:
     """What a term gave, if it has a number for each candidate and frame; RequestError that names the term if not."""
     wanted = tuple(trial.features.shape[:-1])
     got = tuple(values.shape) if torch.is_tensor(values) else None
@@ -85,16 +85,16 @@ def checked(term: Term, what: str, values: Any, trial: Trial) -> Float[Tensor, "
     )
 
 
-def _entry(term: Term, trial: Trial) -> LedgerEntry:
-    energy = checked(term, "energy", term(trial), trial)
-    residual = checked(term, "residual", term.residual(trial), trial)
-    if _sane(trial):
+def _build_entry(term: Term, trial: Trial) -> LedgerEntry:
+    energy = check_shape(term, "energy", term(trial), trial)
+    residual = check_shape(term, "residual", term.residual(trial), trial)
+    if _is_plausible(trial):
         _check_finite(term, "residual", residual)
     return LedgerEntry(term.name, term.unit, energy[0], residual[0])
 
 
-def _sane(trial: Trial) -> bool:
-    return all(bool((values.detach().abs() < _BEYOND).all()) for values in (trial.features, trial.noise))
+def _is_plausible(trial: Trial) -> bool:
+    return all(bool((values.detach().abs() < _PLAUSIBLE_LIMIT).all()) for values in (trial.features, trial.noise))
 
 
 def _check_finite(term: Term, what: str, values: Tensor) -> None:

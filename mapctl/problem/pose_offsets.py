@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, Place
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.numerics import gaussian
 from mapctl.skeleton import Skeleton
 from mapctl.terms.trial import Trial
@@ -44,14 +44,14 @@ class Guide:
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class PoseOffsets:
     """Builds trials from unknowns about a guide."""
 
     guide: Guide
     """Of the window."""
     sigma: Float[Tensor, "frames width"]
     """Of root, heading and angles (see `Guide.packed`): metres and radians."""
-    place: Place
+    place: GroundPose
     """Of the frame before the window."""
     before: Float[Tensor, "past joints 3"]
     """World joint positions of the last frames before it, metres."""
@@ -67,15 +67,15 @@ class Poses:
     """Its state before the window."""
 
     @cached_property
-    def _smoothing(self) -> Float[Tensor, "frames frames"]:
-        weight = gaussian.weights(len(self.sigma), self.smooth, self.sigma.dtype)
+    def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
+        weight = gaussian.pairwise_weights(len(self.sigma), self.smooth, self.sigma.dtype)
         return weight / weight.square().sum(dim=-1, keepdim=True).sqrt()
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
         """The guide, changed."""
         white = unknowns.unflatten(-1, tuple(self.sigma.shape))
-        packed = self.guide.packed() + self.sigma * torch.einsum("ts,bsw->btw", self._smoothing, white)
-        features = self._features(packed)
+        packed = self.guide.packed() + self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
+        features = self._encode_features(packed)
         density = features.new_zeros(features.shape[:2])
         if self.density is not None:
             density = self.density.log_prob(features, self.state)
@@ -84,7 +84,7 @@ class Poses:
             features, self.place, white, density, bits, self.before, self.skeleton, PRIOR_FPS, self.contacts_before
         )
 
-    def _features(self, packed: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames size"]:
+    def _encode_features(self, packed: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames size"]:
         """Steps and turns from places and headings."""
         batch = len(packed)
         ground, heading = packed[..., [0, 2]], packed[..., 3]

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import PRIOR_FPS, Place, root_places
-from mapctl.problem.context import Context
+from mapctl.features import PRIOR_FPS, GroundPose, integrate_root
+from mapctl.problem.context import WindowContext
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, WindowRecord
-from mapctl.problem.window_solvers import LatentMethod, Method
+from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term
@@ -28,7 +28,7 @@ TermsOf = Callable[[int, int], Sequence[Term]]
 
 
 @dataclass(frozen=True)
-class WindowSettings:
+class HorizonSettings:
     """How windows are laid."""
 
     frames: int = 34
@@ -44,18 +44,18 @@ class WindowSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Committed:
+class CommittedFrames:
     """Everything fixed so far."""
 
     state: Any
     """The density's state after it, batch of one."""
-    place: Place
+    place: GroundPose
     """Of its last frame."""
     features: Float[Tensor, "frames size"]
     """Of every committed frame, the first being the start."""
     joints_world: Float[Tensor, "past joints 3"]
     """World joint positions of its last frames, metres."""
-    tail: Float[Tensor, "ahead width"]
+    warm_start: Float[Tensor, "ahead width"]
     """What the last window found for the frames beyond: where the next one starts (see the method's `carry`)."""
     ledger: Ledger = field(default_factory=Ledger)
     """Of the solved frames."""
@@ -71,30 +71,30 @@ class Committed:
 
 
 @dataclass(frozen=True, eq=False)
-class WindowSolver:
+class RecedingHorizonSolver:
     """What stays the same from window to window."""
 
     density: Density
     """The prior."""
-    settings: WindowSettings = field(default_factory=WindowSettings)
+    settings: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths and budgets."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
     fps: float = PRIOR_FPS
     """Frames per second."""
-    method: Method = field(default_factory=LatentMethod)
+    method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
     """How one window is solved."""
 
     def solve(
         self,
-        committed: Committed,
+        committed: CommittedFrames,
         terms_of: TermsOf,
         frames: int,
         *,
         generator: torch.Generator,
         progress: Callable[[int, int], None] | None = None,
         deadline: float | None = None,
-    ) -> tuple[Committed, Outcome]:
+    ) -> tuple[CommittedFrames, Outcome]:
         """Extend `committed` to `frames` frames; stops early, with all that is committed, at the deadline or Ctrl-C.
 
         `deadline` is a time.monotonic() value in seconds; the window it falls into is committed as far as it was
@@ -107,7 +107,7 @@ class WindowSolver:
                 if (left := _seconds_until(deadline)) <= 0:
                     return committed, Outcome.BUDGET
                 count = min(self.settings.frames - self.settings.overlap, frames - done)
-                following = self._next(committed, terms_of(done, self.settings.frames), count, generator, left)
+                following = self._solve_next(committed, terms_of(done, self.settings.frames), count, generator, left)
                 if not following.windows[-1].evaluations and _seconds_until(deadline) <= 0:
                     return committed, Outcome.BUDGET
                 if not following.finite(count):
@@ -121,27 +121,32 @@ class WindowSolver:
             return committed, Outcome.INTERRUPTED
         return committed, Outcome.DONE
 
-    def _next(
-        self, done: Committed, terms: Sequence[Term], count: int, generator: torch.Generator, seconds: float
-    ) -> Committed:
+    def _solve_next(
+        self, done: CommittedFrames, terms: Sequence[Term], count: int, generator: torch.Generator, seconds: float
+    ) -> CommittedFrames:
         began = time.perf_counter()
-        context = Context(
+        context = WindowContext(
             self.density, done.state, done.place, done.joints_world, self.settings.frames, self.skeleton, self.fps
         )
-        window = self.method(context, terms, done.tail, generator, seconds=seconds)
+        window = self.method(context, terms, done.warm_start, generator, seconds=seconds)
         features = window.trial.features[0, :count]
-        ground, heading = root_places(features, done.place)
+        ground, heading = integrate_root(features, done.place)
         joints = torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :]
         state = self.density.advance(done.state, features.unsqueeze(0))
         record = WindowRecord(
-            count, time.perf_counter() - began, window.evaluations, window.start_energy, window.energy, window.ended
+            count,
+            time.perf_counter() - began,
+            window.evaluations,
+            window.start_energy,
+            window.energy,
+            window.stop_reason,
         )
-        return Committed(
+        return CommittedFrames(
             state=state,
-            place=Place(ground[-1], heading[-1]),
+            place=GroundPose(ground[-1], heading[-1]),
             features=torch.cat([done.features, features]),
             joints_world=joints,
-            tail=window.carry[count:],
+            warm_start=window.carry[count:],
             ledger=done.ledger.join(window.ledger.slice(count)),
             windows=(*done.windows, record),
             forecast=window.trial.joints_world[0, count:],

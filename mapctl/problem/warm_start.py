@@ -13,19 +13,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.context import Context
-from mapctl.problem.latent_noise import Latents
+from mapctl.problem.context import WindowContext
+from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.solver.budget import Meter
-from mapctl.solver.swarm import SwarmSettings, best_of, swarm
+from mapctl.solver.swarm import SwarmSettings, run_best_of_samples, run_swarm
 from mapctl.terms.base import Term
 
-Proposal = Callable[[Context, Sequence[Term], Float[Tensor, "1 unknowns"], Meter, torch.Generator], Tensor]
+WarmStartProposal = Callable[
+    [WindowContext, Sequence[Term], Float[Tensor, "1 unknowns"], Meter, torch.Generator], Tensor
+]
 """(context, terms, warm start, meter, generator) to unknowns (1, unknowns)."""
 
 
-def zero_start(
-    context: Context, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
+def keep_warm_start(
+    context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
 ) -> Tensor:
     """The warm start itself."""
     return warm
@@ -59,7 +61,7 @@ class SteeringKnots:
 
 
 @dataclass(frozen=True)
-class BestOf:
+class BestOfSamples:
     """The best of random draws in the steering space, the warm start among them."""
 
     count: int = 32
@@ -68,16 +70,18 @@ class BestOf:
     """Where they are drawn."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
+        self, context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
     ) -> Tensor:
         """See Proposal."""
-        cost, start = _cost(context, terms, warm, self.space), torch.zeros(self.space.size())
-        found = best_of(cost, start=start, spread=self.space.spread, count=self.count, meter=meter, generator=generator)
+        cost, start = _steering_cost(context, terms, warm, self.space), torch.zeros(self.space.size())
+        found = run_best_of_samples(
+            cost, start=start, spread=self.space.spread, count=self.count, meter=meter, generator=generator
+        )
         return warm + self.space.expand(found.x.to(warm.dtype)[None], context.frames).flatten(1)
 
 
 @dataclass(frozen=True)
-class Swarm:
+class SwarmProposal:
     """A particle swarm (rnn paper, section 5.2) in the steering space, started at the warm start."""
 
     settings: SwarmSettings = field(default_factory=lambda: SwarmSettings(particles=16, iterations=6))
@@ -86,22 +90,24 @@ class Swarm:
     """Where they fly."""
 
     def __call__(
-        self, context: Context, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
+        self, context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
     ) -> Tensor:
         """See Proposal."""
-        cost, start = _cost(context, terms, warm, self.space), torch.zeros(self.space.size())
-        found = swarm(
+        cost, start = _steering_cost(context, terms, warm, self.space), torch.zeros(self.space.size())
+        found = run_swarm(
             cost, start=start, spread=self.space.spread, settings=self.settings, meter=meter, generator=generator
         )
         return warm + self.space.expand(found.x.to(warm.dtype)[None], context.frames).flatten(1)
 
 
-def _cost(context: Context, terms: Sequence[Term], warm: Tensor, space: SteeringKnots) -> Callable[[Tensor], Tensor]:
+def _steering_cost(
+    context: WindowContext, terms: Sequence[Term], warm: Tensor, space: SteeringKnots
+) -> Callable[[Tensor], Tensor]:
     """Energy of many points of the steering space around the warm start; every point has its own plan."""
 
     def cost(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
         unknowns = warm + space.expand(points.to(warm.dtype), context.frames).flatten(1)
         with torch.no_grad():
-            return Objective(Latents.planned(context, unknowns).build, terms).energy(unknowns)
+            return Objective(LatentNoise.from_unknowns(context, unknowns).build, terms).energy(unknowns)
 
     return cost

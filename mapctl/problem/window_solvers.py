@@ -10,13 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.context import Context
-from mapctl.problem.feature_states import States
-from mapctl.problem.latent_noise import Latents
+from mapctl.problem.context import WindowContext
+from mapctl.problem.feature_states import FeatureStates
+from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
-from mapctl.problem.warm_start import Proposal, zero_start
-from mapctl.protocols import Plan
+from mapctl.problem.warm_start import WarmStartProposal, keep_warm_start
+from mapctl.protocols import DiscreteChoices
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
 from mapctl.terms.base import Term
@@ -39,17 +39,17 @@ class SolvedWindow:
     """Nats at the first point of L-BFGS."""
     energy: float
     """Nats at the end."""
-    ended: str
+    stop_reason: str
     """Why L-BFGS stopped."""
 
 
 @runtime_checkable
-class Method(Protocol):
+class SingleWindowSolver(Protocol):
     """Solves one window."""
 
     def __call__(
         self,
-        context: Context,
+        context: WindowContext,
         terms: Sequence[Term],
         tail: Float[Tensor, "frames width"],
         generator: torch.Generator,
@@ -61,7 +61,7 @@ class Method(Protocol):
 
 
 @dataclass(frozen=True)
-class LatentMethod:
+class LatentNoiseSolver:
     """Propose, plan, then rounds of L-BFGS over the rollout's noise.
 
     Between rounds components and contact bits are chosen anew along the current rollout; a round that ends higher than
@@ -70,19 +70,19 @@ class LatentMethod:
 
     rounds: int = 3
     """Rounds at most."""
-    enough: float = 8.0
+    energy_threshold: float = 8.0
     """Nats a frame below which no further round is begun: a new round forgets L-BFGS's curvature, which pays only where
     the last one is stuck. Windows are worth the effort, since one that lags behind leaves a debt to all after it."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=36))
     """Of one round."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=120))
     """Of one window."""
-    proposal: Proposal = zero_start
+    proposal: WarmStartProposal = keep_warm_start
     """Where the first round starts."""
 
     def __call__(
         self,
-        context: Context,
+        context: WindowContext,
         terms: Sequence[Term],
         tail: Tensor,
         generator: torch.Generator,
@@ -91,29 +91,29 @@ class LatentMethod:
     ) -> SolvedWindow:
         """See Method; the carry is the noise."""
         meter = Meter(self.budget.within(seconds))
-        unknowns = self.proposal(context, terms, _extended(tail, context.frames), meter, generator)
-        best = self._round(context, terms, unknowns, meter)
+        unknowns = self.proposal(context, terms, _extend_warm_start(tail, context.frames), meter, generator)
+        best = self._run_round(context, terms, unknowns, meter)
         start_energy = float(best[1].start_energy[0])
         for _ in range(self.rounds - 1):
-            if meter.exhausted or not best[1].energy[0] > self.enough * context.frames:
+            if meter.exhausted or not best[1].energy[0] > self.energy_threshold * context.frames:
                 break
-            again = self._round(context, terms, best[1].x, meter)
+            again = self._run_round(context, terms, best[1].x, meter)
             if not again[1].energy[0] < best[1].energy[0]:
                 break
             best = again
         objective, result = best
         carry = result.x[0].unflatten(-1, (context.frames, LAYOUT.continuous))
-        return _solved(objective, result, carry, meter, start_energy)
+        return _build_solved_window(objective, result, carry, meter, start_energy)
 
-    def _round(
-        self, context: Context, terms: Sequence[Term], unknowns: Tensor, meter: Meter
+    def _run_round(
+        self, context: WindowContext, terms: Sequence[Term], unknowns: Tensor, meter: Meter
     ) -> tuple[Objective, LbfgsResult]:
-        objective = Objective(Latents.planned(context, unknowns).build, terms)
+        objective = Objective(LatentNoise.from_unknowns(context, unknowns).build, terms)
         return objective, minimise(objective.energy_and_gradient, unknowns, settings=self.lbfgs, meter=meter)
 
 
 @dataclass(frozen=True, eq=False)
-class GuidedMethod:
+class GuidedNoiseSolver:
     """L-BFGS over the latents of a given motion: its components and contact bits are kept, its noise is where to start.
 
     For motion that is to be changed a little; the terms say what about it.
@@ -130,7 +130,7 @@ class GuidedMethod:
 
     def __call__(
         self,
-        context: Context,
+        context: WindowContext,
         terms: Sequence[Term],
         tail: Tensor,
         generator: torch.Generator,
@@ -143,14 +143,14 @@ class GuidedMethod:
         start = self.share * noise[0]
         start[: len(tail)] = tail[: len(start)]
         unknowns = start.flatten().unsqueeze(0)
-        objective = Objective(Latents(context, plan).build, terms)
+        objective = Objective(LatentNoise(context, plan).build, terms)
         result = minimise(objective.energy_and_gradient, unknowns, settings=self.lbfgs, meter=meter)
         carry = result.x[0].unflatten(-1, (context.frames, LAYOUT.continuous))
-        return _solved(objective, result, carry, meter, float(result.start_energy[0]))
+        return _build_solved_window(objective, result, carry, meter, float(result.start_energy[0]))
 
 
 @dataclass(frozen=True, eq=False)
-class StateMethod:
+class FeatureStateSolver:
     """L-BFGS over the states and the network's input noise, with teacher forcing (Eq. 14-19).
 
     The terms should hold a likelihood. Starts from the last window's states and the prior's plain continuation of them.
@@ -167,7 +167,7 @@ class StateMethod:
 
     def __call__(
         self,
-        context: Context,
+        context: WindowContext,
         terms: Sequence[Term],
         tail: Tensor,
         generator: torch.Generator,
@@ -176,17 +176,17 @@ class StateMethod:
     ) -> SolvedWindow:
         """See Method; the carry is the features."""
         meter = Meter(self.budget.within(seconds))
-        features, plan = _continued(context, tail)
-        states = States(context, self.scale, self.centre, plan.contacts)
+        features, plan = _continue_features(context, tail)
+        states = FeatureStates(context, self.scale, self.centre, plan.contacts)
         objective = Objective(states.build, terms)
         result = minimise(
             objective.energy_and_gradient, states.from_features(features), settings=self.lbfgs, meter=meter
         )
         carry = states.build(result.x).features[0].detach()
-        return _solved(objective, result, carry, meter, float(result.start_energy[0]))
+        return _build_solved_window(objective, result, carry, meter, float(result.start_energy[0]))
 
 
-def _solved(
+def _build_solved_window(
     objective: Objective, result: LbfgsResult, carry: Tensor, meter: Meter, start_energy: float
 ) -> SolvedWindow:
     with torch.no_grad():
@@ -194,7 +194,7 @@ def _solved(
     return SolvedWindow(
         trial,
         carry,
-        objective.ledger_of(trial),
+        objective.build_ledger(trial),
         meter.evaluations,
         start_energy,
         float(result.energy[0]),
@@ -202,14 +202,14 @@ def _solved(
     )
 
 
-def _extended(tail: Tensor, frames: int) -> Float[Tensor, "1 unknowns"]:
+def _extend_warm_start(tail: Tensor, frames: int) -> Float[Tensor, "1 unknowns"]:
     """The last solution's tail, and zero noise (the prior's own continuation) beyond it."""
     noise = tail.new_zeros(frames, LAYOUT.continuous)
     noise[: len(tail)] = tail[:frames]
     return noise.flatten().unsqueeze(0)
 
 
-def _continued(context: Context, tail: Tensor) -> tuple[Float[Tensor, "1 frames size"], Plan]:
+def _continue_features(context: WindowContext, tail: Tensor) -> tuple[Float[Tensor, "1 frames size"], DiscreteChoices]:
     """The tail's features and the prior's zero-noise rollout after them, and their contact bits."""
     known = tail[: context.frames].unsqueeze(0)
     state = context.density.advance(context.state, known) if len(tail) else context.state
@@ -219,4 +219,4 @@ def _continued(context: Context, tail: Tensor) -> tuple[Float[Tensor, "1 frames 
         beyond, _ = context.density.rollout(state, noise, plan)
     features = torch.cat([known, beyond], dim=1) if len(tail) else beyond
     bits = LAYOUT.pick(features, "contacts") > 0.5
-    return features, Plan(torch.zeros(bits.shape[:2], dtype=torch.long), bits)
+    return features, DiscreteChoices(torch.zeros(bits.shape[:2], dtype=torch.long), bits)

@@ -7,17 +7,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.numerics.intervals import runs
+from mapctl.numerics.intervals import true_intervals
 
 NOISE_DEG, NOISE_CM = 0.5, 0.2
 """Noise below this is not worth a line: optical capture has as much."""
-_SLIDE = 0.2  # m/s that a planted toe moves by, over some frames, before it is said to slide
-_FLOAT = 0.03  # metres that it is above its rest height
-_SHORTEST = 3  # frames of either
+_SKATE_SPEED = 0.2  # m/s that a planted toe moves by, over some frames, before it is said to slide
+_FLOAT_HEIGHT = 0.03  # metres that it is above its rest height
+_MIN_FRAMES = 3  # frames of either
 
 
 @dataclass(frozen=True)
-class Fault:
+class Artefact:
     """One thing that was wrong."""
 
     joint: str
@@ -34,56 +34,56 @@ class Fault:
     """Of the amount."""
 
 
-def noise(
+def list_noise(
     names: Sequence[str], angles: Float[Tensor, " joints"], root: float, *, travels: int, frames: int
-) -> list[Fault]:
+) -> list[Artefact]:
     """Joints whose angles shake (radians), and the place of the joint that travels (metres)."""
     degrees = torch.rad2deg(angles).tolist()
     found = [
-        Fault(name, 0, frames, "noise", amount, "deg")
+        Artefact(name, 0, frames, "noise", amount, "deg")
         for name, amount in zip(names, degrees, strict=True)
         if amount >= NOISE_DEG
     ]
     if 100 * root >= NOISE_CM:
-        found.append(Fault(names[travels], 0, frames, "noise", 100 * root, "cm"))
+        found.append(Artefact(names[travels], 0, frames, "noise", 100 * root, "cm"))
     return found
 
 
-def leaping(
+def list_spikes(
     names: Sequence[str], spikes: Bool[Tensor, "frames joints"], away: Float[Tensor, "frames joints"], unit: str
-) -> list[Fault]:
+) -> list[Artefact]:
     """Spikes, and how far each lies from what replaced it."""
     return [
-        Fault(names[joint], start, stop, "spike", float(away[start:stop, joint].max()), unit)
-        for joint, start, stop in runs(spikes)
+        Artefact(names[joint], start, stop, "spike", float(away[start:stop, joint].max()), unit)
+        for joint, start, stop in true_intervals(spikes)
     ]
 
 
-def lost(names: Sequence[str], dropouts: Bool[Tensor, "frames joints"]) -> list[Fault]:
+def list_dropouts(names: Sequence[str], dropouts: Bool[Tensor, "frames joints"]) -> list[Artefact]:
     """Where joints were not seen."""
-    return [Fault(names[joint], start, stop, "dropout", 0.0, "") for joint, start, stop in runs(dropouts)]
+    return [Artefact(names[joint], start, stop, "dropout", 0.0, "") for joint, start, stop in true_intervals(dropouts)]
 
 
-def feet(
+def list_foot_artefacts(
     names: Sequence[str],
     toes: Float[Tensor, "frames 2 3"],
     planted: Bool[Tensor, "frames 2"],
     *,
     rest_height: float,
     fps: float,
-) -> list[Fault]:
+) -> list[Artefact]:
     """Planted toes that slide, and planted toes in the air; world positions, metres, at any rate."""
     steps = torch.diff(toes[..., ::2], dim=0, prepend=toes[:1, :, ::2]).norm(dim=-1)
-    slides = planted & (steps * fps > _SLIDE)
-    floats = planted & (toes[..., 1] > rest_height + _FLOAT)
+    slides = planted & (steps * fps > _SKATE_SPEED)
+    floats = planted & (toes[..., 1] > rest_height + _FLOAT_HEIGHT)
     found = [
-        Fault(names[foot], start, stop, "slide", 100 * float(steps[start:stop, foot].sum()), "cm")
-        for foot, start, stop in runs(slides)
-        if stop - start >= _SHORTEST
+        Artefact(names[foot], start, stop, "slide", 100 * float(steps[start:stop, foot].sum()), "cm")
+        for foot, start, stop in true_intervals(slides)
+        if stop - start >= _MIN_FRAMES
     ]
     height = 100 * (toes[..., 1] - rest_height)
     return found + [
-        Fault(names[foot], start, stop, "float", float(height[start:stop, foot].max()), "cm")
-        for foot, start, stop in runs(floats)
-        if stop - start >= _SHORTEST
+        Artefact(names[foot], start, stop, "float", float(height[start:stop, foot].max()), "cm")
+        for foot, start, stop in true_intervals(floats)
+        if stop - start >= _MIN_FRAMES
     ]

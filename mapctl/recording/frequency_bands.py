@@ -19,19 +19,19 @@ from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 
-EDGE_HZ = 10.0
+CROSSOVER_HZ = 10.0
 """Between the bands: two thirds of what the prior's rate can hold, so that a spline carries the slow one back whole."""
-_ORDER = 6
-_MOMENT = 0.15  # seconds over which the fast band is compared with the noise
-_CERTAIN = 3.0  # times the noise's power that the fast band has before half of it is kept
+_FILTER_ORDER = 6
+_POWER_SECONDS = 0.15  # seconds over which the fast band is compared with the noise
+_NOISE_FACTOR = 3.0  # times the noise's power that the fast band has before half of it is kept
 
 
 @dataclass(frozen=True, eq=False)
-class Bands:
+class FrequencyBands:
     """A motion on canonical joints, split."""
 
     slow: Motion
-    """At the recording's rate, without what is faster than `EDGE_HZ`."""
+    """At the recording's rate, without what is faster than `CROSSOVER_HZ`."""
     fast_angles: Float[Tensor, "frames joints 3"]
     """What the slow band's joints turn by to be the recording's: rotation vectors in their own frames."""
     fast_root: Float[Tensor, "frames 3"]
@@ -66,42 +66,44 @@ class Bands:
         """How many frames at the prior's rate lie within the recording."""
         return int((self.slow.num_frames - 1) * PRIOR_FPS / self.slow.fps) + 1
 
-    def joined(self, shown: Motion, cleaned: Motion, sigma: Float[Tensor, " joints"], sigma_root: float) -> Motion:
+    def recombine(self, shown: Motion, cleaned: Motion, sigma: Float[Tensor, " joints"], sigma_root: float) -> Motion:
         """The slow band changed as `shown` (see `at_prior_rate`) was to `cleaned`, and what the fast one has of motion.
 
         Sigmas are the recording's own, at its own rate.
         """
         turned = rotations.multiply(rotations.inverse(shown.local_quat_xyzw), cleaned.local_quat_xyzw)
-        angles = self._carried(rotations.to_rotation_vector(turned))
-        moved = self._carried(cleaned.root_position - shown.root_position)
-        base, fast_angles, fast_root = self._beside(shown)
-        frames_a_moment = _MOMENT * float(self.slow.fps)
-        high = 0.0 if self.whole else 1 - EDGE_HZ / (float(self.slow.fps) / 2)  # share of the noise's power
-        fast = _more_than_noise(fast_angles, high * sigma.square()[None, :, None], frames_a_moment)
-        root = _more_than_noise(fast_root[:, None], torch.tensor(high * sigma_root**2), frames_a_moment)[:, 0]
+        angles = self._upsample_to_recording(rotations.to_rotation_vector(turned))
+        moved = self._upsample_to_recording(cleaned.root_position - shown.root_position)
+        base, fast_angles, fast_root = self._upsample_with_residual(shown)
+        frames_a_moment = _POWER_SECONDS * float(self.slow.fps)
+        high = 0.0 if self.whole else 1 - CROSSOVER_HZ / (float(self.slow.fps) / 2)  # share of the noise's power
+        fast = _apply_wiener_gain(fast_angles, high * sigma.square()[None, :, None], frames_a_moment)
+        root = _apply_wiener_gain(fast_root[:, None], torch.tensor(high * sigma_root**2), frames_a_moment)[:, 0]
         quats = rotations.multiply(base.local_quat_xyzw, rotations.from_rotation_vector(angles))
         quats = rotations.multiply(quats, rotations.from_rotation_vector(fast))
-        return Motion(base.skeleton, base.fps, base.root_position + moved + root, rotations.sign_continuous(quats))
+        return Motion(base.skeleton, base.fps, base.root_position + moved + root, rotations.make_sign_continuous(quats))
 
-    def _beside(self, shown: Motion) -> tuple[Motion, Float[Tensor, "frames joints 3"], Float[Tensor, "frames 3"]]:
+    def _upsample_with_residual(
+        self, shown: Motion
+    ) -> tuple[Motion, Float[Tensor, "frames joints 3"], Float[Tensor, "frames 3"]]:
         """What was shown, at the recording's rate, and how the recording differs from it: not from the slow band, of
         whose noise near the edge a spline through fewer frames would leave some.
         """
         if self.whole or shown.num_frames < 2:
             return self.slow, self.fast_angles, self.fast_root
-        quats = torch.nn.functional.normalize(self._carried(shown.local_quat_xyzw), dim=-1)
-        base = Motion(self.slow.skeleton, self.slow.fps, self._carried(shown.root_position), quats)
+        quats = torch.nn.functional.normalize(self._upsample_to_recording(shown.local_quat_xyzw), dim=-1)
+        base = Motion(self.slow.skeleton, self.slow.fps, self._upsample_to_recording(shown.root_position), quats)
         whole = rotations.multiply(self.slow.local_quat_xyzw, rotations.from_rotation_vector(self.fast_angles))
         angles = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats), whole))
         return base, angles, self.slow.root_position + self.fast_root - base.root_position
 
-    def _carried(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
+    def _upsample_to_recording(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
         """From the prior's rate to the recording's."""
         seconds = torch.arange(len(change), dtype=torch.float64) / PRIOR_FPS
-        return upsampled(change, seconds, fps=float(self.slow.fps), frames=self.slow.num_frames)
+        return upsample(change, seconds, fps=float(self.slow.fps), frames=self.slow.num_frames)
 
 
-def upsampled(
+def upsample(
     values: Float[Tensor, "shown *width"], seconds: Float[Tensor, " shown"], *, fps: float, frames: int
 ) -> Float[Tensor, "frames *width"]:
     """Values at these times, which rise, at a rate of so many frames, by a cubic spline; held beyond the last."""
@@ -112,16 +114,18 @@ def upsampled(
     return torch.as_tensor(CubicSpline(times, values.double().numpy(), axis=0)(wanted))
 
 
-def split(motion: Motion) -> Bands:
+def split_bands(motion: Motion) -> FrequencyBands:
     """The bands of a motion whose quaternions' signs are continuous; at the prior's rate or less all of it is slow."""
     fps, quats = float(motion.fps), motion.local_quat_xyzw
-    if _is_slow(fps) or motion.num_frames < 3 * _ORDER:
+    if _is_slow(fps) or motion.num_frames < 3 * _FILTER_ORDER:
         slow = Motion(motion.skeleton, motion.fps, motion.root_position, quats)
-        return Bands(slow, torch.zeros(*quats.shape[:2], 3, dtype=quats.dtype), torch.zeros_like(motion.root_position))
-    sections = butter(_ORDER, EDGE_HZ / (fps / 2), output="sos")
+        return FrequencyBands(
+            slow, torch.zeros(*quats.shape[:2], 3, dtype=quats.dtype), torch.zeros_like(motion.root_position)
+        )
+    sections = butter(_FILTER_ORDER, CROSSOVER_HZ / (fps / 2), output="sos")
 
     def low(values: Tensor) -> Tensor:
-        whole = _with_ends(values.numpy(), round(fps / EDGE_HZ))
+        whole = _extend_ends(values.numpy(), round(fps / CROSSOVER_HZ))
         side = (len(whole) - len(values)) // 2
         return torch.as_tensor(sosfiltfilt(sections, whole, axis=0, padlen=0)[side:-side].copy())
 
@@ -129,10 +133,10 @@ def split(motion: Motion) -> Bands:
         motion.skeleton, motion.fps, low(motion.root_position), torch.nn.functional.normalize(low(quats), dim=-1)
     )
     fast = rotations.multiply(rotations.inverse(slow.local_quat_xyzw), quats)
-    return Bands(slow, rotations.to_rotation_vector(fast), motion.root_position - slow.root_position)
+    return FrequencyBands(slow, rotations.to_rotation_vector(fast), motion.root_position - slow.root_position)
 
 
-def _with_ends(values: np.ndarray, about: int) -> np.ndarray:
+def _extend_ends(values: np.ndarray, about: int) -> np.ndarray:
     """Frames put before and after, turned about what the `about` outermost ones say of the ends: a filter that begins
     at the first frame itself would take its noise for motion.
     """
@@ -153,11 +157,11 @@ def _is_slow(fps: float) -> bool:
     return fps <= 1.05 * PRIOR_FPS
 
 
-def _more_than_noise(values: Float[Tensor, "frames joints 3"], noise: Tensor, moment: float) -> Tensor:
+def _apply_wiener_gain(values: Float[Tensor, "frames joints 3"], noise: Tensor, moment: float) -> Tensor:
     """Values by the share of their power, about each frame, that noise of this variance does not explain."""
     power = values.square().mean(dim=-1, keepdim=True)
     side = max(1, round(moment / 2))
-    near = gaussian.convolved(power, gaussian.kernel(side, 2 * side), "repeated")
+    near = gaussian.convolve(power, gaussian.kernel(side, 2 * side), "repeated")
     # Wiener's gain on what exceeds the noise by far: its own power varies within a moment too.
-    excess = (near - _CERTAIN * noise).clamp_min(0)
+    excess = (near - _NOISE_FACTOR * noise).clamp_min(0)
     return values * torch.where(near > 0, excess / near.clamp_min(1e-30), 1.0)

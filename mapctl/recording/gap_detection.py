@@ -6,23 +6,23 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import runs
-from mapctl.recording.inspection import examine
+from mapctl.numerics.intervals import true_intervals
+from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import ALL, ROOT, Mask
 
 _FROZEN_SECONDS = 0.1  # that nothing at all moves, by a hair, in a motion that moves
 
 
-def find(motion: Motion) -> tuple[Mask, ...]:
+def find_gaps(motion: Motion) -> tuple[Mask, ...]:
     """What of a motion is missing, by looking at it; RequestError if nothing is."""
-    frozen = _frozen_frames(motion)
-    masks = [Mask(ALL, start, stop) for _, start, stop in runs(frozen[:, None])]
-    examined = examine(motion)
+    frozen = _find_frozen_frames(motion)
+    masks = [Mask(ALL, start, stop) for _, start, stop in true_intervals(frozen[:, None])]
+    examined = inspect_recording(motion)
     names = motion.skeleton.names
     wrong = ~examined.seen & ~frozen[:, None]
-    masks += [Mask(names[joint], start, stop) for joint, start, stop in runs(wrong)]
+    masks += [Mask(names[joint], start, stop) for joint, start, stop in true_intervals(wrong)]
     lost = examined.spikes_root & ~frozen
-    masks += [Mask(ROOT, start, stop) for _, start, stop in runs(lost[:, None])]
+    masks += [Mask(ROOT, start, stop) for _, start, stop in true_intervals(lost[:, None])]
     if not masks:
         raise RequestError(
             "no frame is frozen and none leaps: say which frames are missing (--gap A:B) or which joints"
@@ -30,14 +30,14 @@ def find(motion: Motion) -> tuple[Mask, ...]:
     return tuple(masks)
 
 
-def _frozen_frames(motion: Motion) -> Bool[Tensor, " frames"]:
+def _find_frozen_frames(motion: Motion) -> Bool[Tensor, " frames"]:
     """Frames that repeat the one before them to the bit, in runs; the one before them is the last true one."""
     values = [motion.local_quat_xyzw.flatten(1), motion.root_position, *motion.moving_offsets.values()]
     whole = torch.cat(values, dim=1)
     still = torch.zeros(len(whole), dtype=torch.bool)
     still[1:] = (whole[1:] == whole[:-1]).all(dim=1)
     shortest = max(2, round(_FROZEN_SECONDS * float(motion.fps)))
-    for _, start, stop in runs(still[:, None].clone()):
+    for _, start, stop in true_intervals(still[:, None].clone()):
         # A body that does not move at the end of its recording, or all the time, is at rest.
         if stop - start < shortest or stop == len(still):
             still[start:stop] = False

@@ -9,16 +9,16 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import filled, last_seen
-from mapctl.recording.masks import Mask, masked, traveller
-from mapctl.recording.noise_estimation import angle_noise, place_noise
-from mapctl.recording.spike_detection import angle_spikes, place_spikes
+from mapctl.numerics.intervals import fill_missing, last_observed
+from mapctl.recording.masks import Mask, expand_valid_masks, travelling_joint
+from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
+from mapctl.recording.spike_detection import find_angle_spikes, find_position_spikes
 
 _FROZEN_SECONDS = 0.1  # that a joint which moves otherwise does not move at all
 
 
 @dataclass(frozen=True, eq=False)
-class Examined:
+class Inspection:
     """A recording on its own rig, and what of it is to be believed."""
 
     motion: Motion
@@ -52,7 +52,7 @@ class Examined:
         """Of the joint that travels, in a motion of this rig, metres."""
         return motion.moving_offsets[self.travels] if self.travels else motion.root_position
 
-    def slice(self, start: int, stop: int) -> "Examined":
+    def slice(self, start: int, stop: int) -> "Inspection":
         """Frames start to stop; the noise stays that of the whole."""
         part = slice(start, stop)
         return replace(
@@ -67,11 +67,11 @@ class Examined:
     def repaired(self) -> Motion:
         """The recording with what is not to be believed filled in: straight between the frames around it."""
         motion, seen = self.motion, self.seen
-        quats = rotations.sign_continuous(_only(motion.local_quat_xyzw, seen))
-        steps = filled(quats.transpose(0, 1), seen.T).transpose(0, 1)
-        root = filled(motion.root_position[None], self.seen_root[None])[0]
+        quats = rotations.make_sign_continuous(_hold_last_observed(motion.local_quat_xyzw, seen))
+        steps = fill_missing(quats.transpose(0, 1), seen.T).transpose(0, 1)
+        root = fill_missing(motion.root_position[None], self.seen_root[None])[0]
         moving = {
-            joint: filled(values[None], self.seen_root[None])[0] if joint == self.travels else values
+            joint: fill_missing(values[None], self.seen_root[None])[0] if joint == self.travels else values
             for joint, values in motion.moving_offsets.items()
         }
         return replace(
@@ -82,24 +82,24 @@ class Examined:
         )
 
 
-def examine(motion: Motion, masks: Sequence[Mask] = ()) -> Examined:
+def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     """Look over a recording on any rig; RequestError for masks that name joints or frames it has not."""
-    quats = rotations.sign_continuous(motion.local_quat_xyzw)
-    hidden, hidden_root = masked(motion, masks)
-    travels = traveller(motion)
+    quats = rotations.make_sign_continuous(motion.local_quat_xyzw)
+    hidden, hidden_root = expand_valid_masks(motion, masks)
+    travels = travelling_joint(motion)
     place = motion.moving_offsets[travels] if travels else motion.root_position
-    frozen = _frozen(quats, float(motion.fps))
+    frozen = _find_frozen_joints(quats, float(motion.fps))
     dropouts, dropouts_root = hidden | frozen, hidden_root
-    noise, noise_root = angle_noise(quats, ~dropouts), place_noise(place, ~dropouts_root)
-    spikes = angle_spikes(quats, noise) & ~dropouts
-    spikes_root = place_spikes(place, noise_root) & ~dropouts_root
+    noise, noise_root = estimate_angle_noise(quats, ~dropouts), estimate_position_noise(place, ~dropouts_root)
+    spikes = find_angle_spikes(quats, noise) & ~dropouts
+    spikes_root = find_position_spikes(place, noise_root) & ~dropouts_root
     # Each spike spoils the differences of the frames around it.
-    noise = angle_noise(quats, ~(dropouts | spikes))
-    noise_root = place_noise(place, ~(dropouts_root | spikes_root))
-    return Examined(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
+    noise = estimate_angle_noise(quats, ~(dropouts | spikes))
+    noise_root = estimate_position_noise(place, ~(dropouts_root | spikes_root))
+    return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
 
 
-def _frozen(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor, "frames joints"]:
+def _find_frozen_joints(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor, "frames joints"]:
     """Runs in which nothing of a joint's rotation changes, not even by rounding, of joints that move most of the time.
 
     A whole body that stands still is a paused recording, or a stand: it is left alone.
@@ -118,7 +118,7 @@ def _frozen(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor,
     return torch.cat([torch.zeros_like(spread[:1]), spread])
 
 
-def _only(quats: Tensor, seen: Tensor) -> Tensor:
+def _hold_last_observed(quats: Tensor, seen: Tensor) -> Tensor:
     """What was seen last, where nothing is seen: signs are then chosen between frames that count."""
-    nearest = last_seen(seen.T).T
+    nearest = last_observed(seen.T).T
     return torch.take_along_dim(quats, nearest[..., None], dim=0)

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats.missing import Missing
+from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import read_table, shorten
-from mapctl.joint_names import find_joint, nearest
-from mapctl.joint_roles import roles
+from mapctl.joint_names import describe_nearest, find_joint
+from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import runs
+from mapctl.numerics.intervals import true_intervals
 from mapctl.retarget import canonical_joints
 from mapctl.retarget.rigs import Rig
 
@@ -43,10 +43,10 @@ def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
     if not set(_COLUMNS) <= set(names) or len(set(names)) < len(names):
         found = shorten(",".join(names)) if names else "nothing"
         raise FileFormatError(path, f"needs the columns {', '.join(_COLUMNS)}, each once; found {found}", line)
-    return tuple(_mask(path, line, names, words) for line, words in rows)
+    return tuple(_parse_mask(path, line, names, words) for line, words in rows)
 
 
-def _mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Sequence[str]) -> Mask:
+def _parse_mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Sequence[str]) -> Mask:
     if len(words) != len(names):
         raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", line)
     row = dict(zip(names, words, strict=True))
@@ -60,27 +60,27 @@ def _mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Seq
     return Mask(row["joint"], start, stop)
 
 
-def of_missing(motion: Motion, missing: Missing) -> tuple[Mask, ...]:
+def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ...]:
     """What a file marks as lost. A joint that travels beside the body's own travel is lost with its place."""
-    travels, joints = traveller(motion), missing.rotations.clone()
+    travels, joints = travelling_joint(motion), missing.rotations.clone()
     below = motion.skeleton.children(0)
     if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
         travels = below[0]  # hips under a root that stays on the ground: the body's way is not known anywhere
     for joint in motion.moving_offsets:
         if joint != travels:
             joints[:, joint] |= missing.places[:, joint]
-    lost = [Mask(motion.skeleton.names[joint], start, stop) for joint, start, stop in runs(joints)]
-    return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in runs(missing.places[:, travels, None])))
+    lost = [Mask(motion.skeleton.names[joint], start, stop) for joint, start, stop in true_intervals(joints)]
+    return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in true_intervals(missing.places[:, travels, None])))
 
 
-def traveller(motion: Motion) -> int:
+def travelling_joint(motion: Motion) -> int:
     """The joint whose place is that of the body: the root, or the first below a root that stays where it is."""
     moving = [joint for joint, values in motion.moving_offsets.items() if bool((values != values[0]).any())]
     stays = bool((motion.root_position == motion.root_position[0]).all())
     return min(moving) if stays and moving else 0
 
 
-def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
+def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     """Which joints (frames, joints) and root places (frames,) are masked.
 
     RequestError for joints that the rig has not (with the nearest that it has), frames beyond the end, and joints of
@@ -89,17 +89,17 @@ def masked(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     for mask in masks:
         if mask.stop > motion.num_frames:
             raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
-    joints, root = hidden(motion, masks)
+    joints, root = expand_masks(motion, masks)
     if root.all() or joints.all(dim=0).any():
         gone = "root position" if root.all() else motion.skeleton.names[int(joints.all(dim=0).nonzero()[0])]
         raise RequestError(f"the masks leave nothing of {gone} in {motion.num_frames} frames")
     return joints, root
 
 
-def hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
+def expand_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     """Masked joints (frames, joints) and root places (frames,)."""
     names = motion.skeleton.names
-    masks = by_own_names(motion, masks)
+    masks = resolve_joint_names(motion, masks)
     joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
     root = torch.zeros(motion.num_frames, dtype=torch.bool)
     for mask in masks:
@@ -112,35 +112,35 @@ def hidden(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
     return joints, root
 
 
-def by_own_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None = None) -> tuple[Mask, ...]:
+def resolve_joint_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None = None) -> tuple[Mask, ...]:
     """The masks with every joint by the name that the motion's own rig has for it.
 
     `rig` wins over what would be recognised. RequestError, with the nearest names, for joints that it has not.
     """
     known = cache(lambda: canonical_joints(motion, rig))
-    own = {name: _own_name(motion, name, known) for name in {mask.joint for mask in masks} - {ALL, ROOT}}
+    own = {name: _resolve_joint_name(motion, name, known) for name in {mask.joint for mask in masks} - {ALL, ROOT}}
     return tuple(replace(mask, joint=own.get(mask.joint, mask.joint)) for mask in masks)
 
 
-def part_of(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
+def slice_masks(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
     """The masks of frames start to stop, counted from there."""
     clipped = [Mask(m.joint, max(m.start, start) - start, min(m.stop, stop) - start) for m in masks]
     return tuple(mask for mask in clipped if mask.start < mask.stop)
 
 
-def after(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
+def trim_masks_before(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
     """The masks as far as they hold from that frame on."""
     cut = [Mask(m.joint, max(m.start, frame), m.stop) for m in masks]
     return tuple(mask for mask in cut if mask.start < mask.stop)
 
 
-def written_back(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
+def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
     """The motion with what is masked of its first frames taken from a clean version of them.
 
     So that a joint which is lost for long is known by what was made of it before.
     """
     shared = clean.num_frames
-    joints, root = hidden(motion, masks)
+    joints, root = expand_masks(motion, masks)
     joints, root = joints[:shared], root[:shared]
     if not bool(joints.any() | root.any()):
         return motion
@@ -154,9 +154,11 @@ def written_back(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion
     return replace(motion, local_quat_xyzw=quats, root_position=place, moving_offsets=moving)
 
 
-def _own_name(motion: Motion, wanted: str, known: Callable[[], Mapping[str, int]]) -> str:
+def _resolve_joint_name(motion: Motion, wanted: str, known: Callable[[], Mapping[str, int]]) -> str:
     names = motion.skeleton.names
     joint = find_joint(wanted, names, known)
     if joint is None:
-        raise RequestError(f"no joint {wanted!r} to mask; {nearest(wanted, names, roles(motion.skeleton))}")
+        raise RequestError(
+            f"no joint {wanted!r} to mask; {describe_nearest(wanted, names, classify_joints(motion.skeleton))}"
+        )
     return names[joint]

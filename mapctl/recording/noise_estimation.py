@@ -13,11 +13,11 @@ from torch import Tensor
 from mapctl import rotations
 
 _ORDERS = (4, 3, 2)  # of the differences, the first that enough runs of frames have been seen for
-_ENOUGH = 12  # runs
-_SIGMAS_A_MEDIAN = 1.4826  # of a normal number's size
+_MIN_WINDOWS = 12  # runs
+_MAD_TO_SIGMA = 1.4826  # of a normal number's size
 
 
-def angle_noise(
+def estimate_angle_noise(
     quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
 ) -> Float[Tensor, " joints"]:
     """White noise of each of a joint's three angles, radians; 0 of a recording too short to tell. A joint that is never
@@ -26,30 +26,32 @@ def angle_noise(
     Between two frames a joint turns by what it moved and by the difference of their noise.
     """
     steps = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
-    sigma = _sigma(steps, seen, differenced=1)
+    sigma = _estimate_sigma(steps, seen, differenced=1)
     known = sigma[(sigma > 0) & sigma.isfinite()]
     usual = known.median() if len(known) else sigma.new_zeros(())
     return torch.where(sigma.isnan(), usual, sigma)
 
 
-def place_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:
+def estimate_position_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:
     """White noise of each coordinate, in the places' unit; 0 of a recording too short to tell."""
-    return float(_sigma(places[:, None], seen[:, None], differenced=0).nan_to_num(0.0))
+    return float(_estimate_sigma(places[:, None], seen[:, None], differenced=0).nan_to_num(0.0))
 
 
-def _sigma(values: Float[Tensor, "some joints 3"], seen: Bool[Tensor, "frames joints"], *, differenced: int) -> Tensor:
+def _estimate_sigma(
+    values: Float[Tensor, "some joints 3"], seen: Bool[Tensor, "frames joints"], *, differenced: int
+) -> Tensor:
     """By joint, from differences of the highest order that there are enough runs for; NaN where there are not.
 
     `values` are differences of that order already.
     """
     sigma = torch.full((values.shape[1],), math.nan, dtype=values.dtype)
     for order in _ORDERS:
-        differences, used = _differences(values, order - differenced), _runs(seen, order + 1)
+        differences, used = _differences(values, order - differenced), _observed_windows(seen, order + 1)
         if len(differences) == 0:
             continue
         # Not of a whole that is shorter, which has nothing better.
-        enough = used.sum(dim=0) >= min(_ENOUGH, len(used))
-        found = _spread(differences, used) / math.sqrt(math.comb(2 * order, order))
+        enough = used.sum(dim=0) >= min(_MIN_WINDOWS, len(used))
+        found = _robust_sigma(differences, used) / math.sqrt(math.comb(2 * order, order))
         sigma = torch.where(sigma.isnan() & enough, found, sigma)
     return sigma if len(values) > _ORDERS[-1] else torch.zeros_like(sigma)
 
@@ -60,14 +62,16 @@ def _differences(values: Tensor, order: int) -> Tensor:
     return values
 
 
-def _runs(seen: Bool[Tensor, "frames joints"], length: int) -> Bool[Tensor, "runs joints"]:
+def _observed_windows(seen: Bool[Tensor, "frames joints"], length: int) -> Bool[Tensor, "runs joints"]:
     """Whether each run of `length` frames was seen throughout."""
     if len(seen) < length:
         return seen[:0]
     return seen.unfold(0, length, 1).all(dim=-1)
 
 
-def _spread(differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "runs joints"]) -> Float[Tensor, " joints"]:
+def _robust_sigma(
+    differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "runs joints"]
+) -> Float[Tensor, " joints"]:
     """From the median along each of a joint's principal axes: a rig near gimbal lock shakes about two of them only."""
     size = differences.norm(dim=-1)
     size = torch.where(used, size, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
@@ -77,4 +81,4 @@ def _spread(differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "run
     axes = torch.linalg.eigh(torch.einsum("fja,fjb->jab", clipped, clipped)).eigenvectors
     along = torch.einsum("fja,jab->fjb", differences, axes).abs()
     median = torch.where(used[..., None], along, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
-    return torch.sqrt((_SIGMAS_A_MEDIAN * median).square().mean(dim=-1))
+    return torch.sqrt((_MAD_TO_SIGMA * median).square().mean(dim=-1))

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from mapctl import rotations
 
-_LEAST = math.radians(0.2)  # noise of an angle in the best of captures
-_UNEVEN = 0.1  # of second differences of the shares
-_BOW = 0.3  # height of a bow, of the length of the way
-_CERTAIN = 3.0  # times the noise's power that is left in most frames before any of it is kept
-_ROUNDS = 5  # of weighing anew what does not fit
+_MIN_NOISE = math.radians(0.2)  # noise of an angle in the best of captures
+_SECOND_DIFFERENCE_SIGMA = 0.1  # of second differences of the shares
+_DEVIATION_SIGMA = 0.3  # height of a bow, of the length of the way
+_NOISE_FACTOR = 3.0  # times the noise's power that is left in most frames before any of it is kept
+_ITERATIONS = 5  # of weighing anew what does not fit
 
 
-def shares(
+def estimate_blend_weights(
     pose: Float[Tensor, "1 joints 4"],
     ahead: Float[Tensor, "frames joints 4"],
     seen: Float[Tensor, "frames joints 4"],
@@ -32,24 +32,28 @@ def shares(
     By least squares over the joints, without those that go another way, and as evenly over time as noise makes it;
     after the last frame all of it has been gone.
     """
-    whole, gone, usual = _vector(pose, ahead), _vector(pose, seen), _floored(noise)
+    whole, gone, usual = (
+        _relative_rotation_vector(pose, ahead),
+        _relative_rotation_vector(pose, seen),
+        _floor_noise(noise),
+    )
     trust = counts / usual.square()
     share, known = torch.full((len(seen),), 0.5, dtype=seen.dtype), torch.ones(len(seen), dtype=seen.dtype)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         away = (gone - share[:, None, None] * whole).norm(dim=-1)
         fits = trust * (2 * math.sqrt(3.0) * usual / away.clamp_min(1e-9)).clamp(max=1.0)
         known = (fits[..., None] * whole.square()).sum(dim=(-1, -2)).clamp_min(1e-6)
         share = (fits[..., None] * whole * gone).sum(dim=(-1, -2)) / known
-    return _even(share, known).clamp(0, 1)
+    return _smooth_weights(share, known).clamp(0, 1)
 
 
-def mixed(pose: Tensor, ahead: Tensor, share: Float[Tensor, " frames"]) -> Float[Tensor, "frames joints 4"]:
+def blend_poses(pose: Tensor, ahead: Tensor, share: Float[Tensor, " frames"]) -> Float[Tensor, "frames joints 4"]:
     """The pose and the motion mixed, the short way."""
-    turn = rotations.from_rotation_vector(share[:, None, None] * _vector(pose, ahead))
+    turn = rotations.from_rotation_vector(share[:, None, None] * _relative_rotation_vector(pose, ahead))
     return rotations.multiply(pose.expand_as(turn), turn)
 
 
-def bows(
+def estimate_geodesic_deviation(
     along: Tensor,
     seen: Tensor,
     share: Float[Tensor, " frames"],
@@ -63,12 +67,14 @@ def bows(
     how long the short way is, radians.
     """
     shape = (4 * share * (1 - share))[:, None, None]
-    rest, trust = _vector(along, seen), counts[..., None].double()
-    noise = _floored(noise)
+    rest, trust = _relative_rotation_vector(along, seen), counts[..., None].double()
+    noise = _floor_noise(noise)
     usual = noise[None, :, None] * math.sqrt(3.0)
-    likely = (noise / (_BOW * whole.amax(dim=0)).clamp_min(1e-6)).square()[:, None]  # a short way has a small bow
+    likely = (noise / (_DEVIATION_SIGMA * whole.amax(dim=0)).clamp_min(1e-6)).square()[
+        :, None
+    ]  # a short way has a small bow
     bow, power = rest.new_zeros(rest.shape[1:]), likely
-    for _ in range(_ROUNDS):  # what lies far from the bow, as a spike does, counts less
+    for _ in range(_ITERATIONS):  # what lies far from the bow, as a spike does, counts less
         fits = trust * (2 * usual / (rest - shape * bow).norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
         power = (fits * shape.square()).sum(dim=0) + likely
         bow = (fits * shape * rest).sum(dim=0) / power
@@ -77,21 +83,21 @@ def bows(
     left = trust * (rest - bowed)
     # In most frames, so that a spike in one is none of it.
     power = left.square().sum(dim=-1, keepdim=True).median(dim=0).values
-    return bowed + left * (1 - _CERTAIN * usual[0].square() / power.clamp_min(1e-12)).clamp_min(0.0)
+    return bowed + left * (1 - _NOISE_FACTOR * usual[0].square() / power.clamp_min(1e-12)).clamp_min(0.0)
 
 
-def apart(first: Tensor, second: Tensor) -> Tensor:
+def angle_between(first: Tensor, second: Tensor) -> Tensor:
     """Angles between rotations, radians."""
-    return _vector(first, second).norm(dim=-1)
+    return _relative_rotation_vector(first, second).norm(dim=-1)
 
 
-def line(values: Float[Tensor, "frames *width"], first: int, count: int, *, upto: int) -> Tensor:
+def extrapolate_linear(values: Float[Tensor, "frames *width"], first: int, count: int, *, upto: int) -> Tensor:
     """Frames 1 to `upto`, by the line through so many frames from `first` on."""
-    weights = torch.stack([line_weights(count, float(frame - first)) for frame in range(1, upto + 1)])
+    weights = torch.stack([linear_fit_weights(count, float(frame - first)) for frame in range(1, upto + 1)])
     return torch.einsum("kn,n...->k...", weights, values[first : first + count])
 
 
-def line_weights(count: int, at: float) -> Float[Tensor, " count"]:
+def linear_fit_weights(count: int, at: float) -> Float[Tensor, " count"]:
     """What the line through values at 0, 1, ... is at some place, as weights of those values."""
     place = torch.arange(count, dtype=torch.float64)
     middle = place.mean()
@@ -99,24 +105,24 @@ def line_weights(count: int, at: float) -> Float[Tensor, " count"]:
     return 1 / count + (at - middle) * (place - middle) / spread
 
 
-def _floored(noise: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
+def _floor_noise(noise: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
     """Of joints that never move, and seem to have none, as much as is at all likely."""
     known = noise[noise > 0]
     usual = float(known.median()) / 2 if len(known) else 0.0
-    return noise.clamp_min(max(usual, _LEAST))
+    return noise.clamp_min(max(usual, _MIN_NOISE))
 
 
-def _even(share: Float[Tensor, " frames"], known: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+def _smooth_weights(share: Float[Tensor, " frames"], known: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
     """Shares, known to 1 / sqrt(known), made even: from 0 before the first to 1 after the last."""
     count = len(share)
     second = torch.zeros(count, count + 2, dtype=share.dtype)
     for row in range(count):
         second[row, row : row + 3] = torch.tensor([1.0, -2.0, 1.0], dtype=share.dtype)
     within = second[:, 1:-1]
-    left = within.T @ within / _UNEVEN**2 + torch.diag(known)
-    return torch.linalg.solve(left, known * share - within.T @ second[:, -1] / _UNEVEN**2)
+    left = within.T @ within / _SECOND_DIFFERENCE_SIGMA**2 + torch.diag(known)
+    return torch.linalg.solve(left, known * share - within.T @ second[:, -1] / _SECOND_DIFFERENCE_SIGMA**2)
 
 
-def _vector(start: Tensor, stop: Tensor) -> Tensor:
+def _relative_rotation_vector(start: Tensor, stop: Tensor) -> Tensor:
     """Rotation vectors from one to the other, in the first's frame."""
     return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start).expand_as(stop), stop))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import filled, filled_angle
+from mapctl.numerics.intervals import fill_missing, fill_missing_angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +68,13 @@ class Capture:
     @cached_property
     def heading(self) -> Float[Tensor, "batch frames"]:
         """Of the hips about +Y, radians, not wrapped; across frames that were not seen it is filled in."""
-        return filled_angle(rotations.split_heading(self.hips)[0], self.seen[..., 0])
+        return fill_missing_angle(rotations.split_heading(self.hips)[0], self.seen[..., 0])
 
     @cached_property
     def tilt(self) -> Float[Tensor, "batch frames 2"]:
         """What remains of the hips' rotation without the heading (rotation vector, x and z), filled in."""
         vector = rotations.to_rotation_vector(rotations.split_heading(self.hips)[1])
-        return filled(vector[..., ::2], self.seen[..., 0])
+        return fill_missing(vector[..., ::2], self.seen[..., 0])
 
 
 def _continuous_vectors(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 3"]:

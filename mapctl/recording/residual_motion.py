@@ -13,13 +13,13 @@ from torch import Tensor
 from mapctl.numerics import gaussian
 
 _WIDTHS = (0.6, 0.8, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)  # frames, sigma of the smoothing
-_MOMENT = 20.0  # frames, sigma, over which the risk is told
+_RISK_FRAMES = 20.0  # frames, sigma, over which the risk is told
 _PENALTY = 0.1  # of the noise's power, that a return must gain: the risk itself is told with an error
 _CAUTION = 0.5  # and this share of the noise that it would bring back
-_SOFTNESS = 0.06  # of the noise's power, between choices that are as good as equal
+_TEMPERATURE = 0.06  # of the noise's power, between choices that are as good as equal
 
 
-def returned(
+def restore_residual_motion(
     rest: Float[Tensor, "frames joints 3"], seen: Bool[Tensor, "frames joints"], sigma: Float[Tensor, " joints"]
 ) -> tuple[Float[Tensor, "frames joints 3"], Float[Tensor, "frames joints"]]:
     """What of the rest goes back, and the share of smoothing in each place: 0 where the model is believed, 1 where it
@@ -32,13 +32,13 @@ def returned(
     risks, smooth = [trusted], [torch.zeros_like(rest)]
     for width in _WIDTHS:
         kernel = gaussian.kernel(width, max(1, round(3 * width)))
-        weight = gaussian.convolved(known, kernel, "nothing")
-        wide = gaussian.convolved(rest, kernel, "nothing") / weight.clamp_min(1e-6)
+        weight = gaussian.convolve(known, kernel, "nothing")
+        wide = gaussian.convolve(rest, kernel, "nothing") / weight.clamp_min(1e-6)
         change = ((wide - rest) * known).square().sum(-1, keepdim=True)
         own = kernel.max() / weight[..., 0].clamp_min(0.1)
         risks.append(_local_mean(change, known)[..., 0] / noise + (2 + _CAUTION) * own - 1 + _PENALTY)
         smooth.append(wide)
-    share = torch.softmax(-torch.stack(risks) / _SOFTNESS, dim=0)
+    share = torch.softmax(-torch.stack(risks) / _TEMPERATURE, dim=0)
     back = (share[..., None] * torch.stack(smooth)).sum(dim=0)
     noisy = (sigma > 0).to(rest)
     return back * noisy[None, :, None], (1 - share[0]) * noisy
@@ -46,6 +46,6 @@ def returned(
 
 def _local_mean(values: Float[Tensor, "frames joints 1"], known: Float[Tensor, "frames joints 1"]) -> Tensor:
     """Over about a moment, of what is known."""
-    kernel = gaussian.kernel(_MOMENT, round(2 * _MOMENT))
-    weight = gaussian.convolved(known, kernel, "nothing")
-    return gaussian.convolved(values * known, kernel, "nothing") / weight.clamp_min(1e-6)
+    kernel = gaussian.kernel(_RISK_FRAMES, round(2 * _RISK_FRAMES))
+    weight = gaussian.convolve(known, kernel, "nothing")
+    return gaussian.convolve(values * known, kernel, "nothing") / weight.clamp_min(1e-6)

@@ -8,61 +8,68 @@ from torch import Tensor
 
 from mapctl import rotations
 
-_SPAN = 5  # frames of the running median: bursts of up to two are seen
-_NEAR = 6  # frames on either side that tell how fast a joint is moving
-SIGMAS = 5.0
+_MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are seen
+_STEP_FRAMES = 6  # frames on either side that tell how fast a joint is moving
+MIN_SPIKE_SIGMAS = 5.0
 """Of the noise, that a spike lies away from the median of its surroundings at least."""
-SMALLEST_DEG = 12.0
+MIN_SPIKE_DEG = 12.0
 """And so many degrees, or as many centimetres: less is left to what treats noise."""
-_REST_SIGMAS, _REST_DEG = 4.8, 3.0  # of a leap in the rest: one in 5,000 of normal noise is as far from its median
-_SWING = 2.0  # and so many times the usual way between frames about there: the turning point of a fast kick is none
+_RESIDUAL_SIGMAS, _RESIDUAL_DEG = (
+    4.8,
+    3.0,
+)  # of a leap in the rest: one in 5,000 of normal noise is as far from its median
+_STEP_FACTOR = (
+    2.0  # and so many times the usual way between frames about there: the turning point of a fast kick is none
+)
 
 
-def angle_spikes(
+def find_angle_spikes(
     quats: Float[Tensor, "frames joints 4"], sigma: Float[Tensor, " joints"]
 ) -> Bool[Tensor, "frames joints"]:
     """Which joints leap in which frames; `sigma` is the noise of each angle, radians."""
-    quats = rotations.sign_continuous(quats)
+    quats = rotations.make_sign_continuous(quats)
     middle = torch.nn.functional.normalize(_running_median(quats.flatten(1)).unflatten(1, quats.shape[1:]), dim=-1)
-    away = _angle(middle, quats)
-    usual = _usual_step(_angle(middle[:-1], middle[1:]))
-    return away > (SIGMAS * sigma).clamp_min(math.radians(SMALLEST_DEG)) + _SWING * usual
+    away = _rotation_distance(middle, quats)
+    usual = _mean_step(_rotation_distance(middle[:-1], middle[1:]))
+    return away > (MIN_SPIKE_SIGMAS * sigma).clamp_min(math.radians(MIN_SPIKE_DEG)) + _STEP_FACTOR * usual
 
 
-def place_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Bool[Tensor, " frames"]:
+def find_position_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Bool[Tensor, " frames"]:
     """In which frames the place leaps; metres."""
     middle = _running_median(places)
     away = (places - middle).norm(dim=-1)
-    usual = _usual_step(torch.diff(middle, dim=0).norm(dim=-1)[:, None])[:, 0]
-    return away > max(SIGMAS * sigma, SMALLEST_DEG / 100) + _SWING * usual
+    usual = _mean_step(torch.diff(middle, dim=0).norm(dim=-1)[:, None])[:, 0]
+    return away > max(MIN_SPIKE_SIGMAS * sigma, MIN_SPIKE_DEG / 100) + _STEP_FACTOR * usual
 
 
-def leaps(rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"]) -> Bool[Tensor, "frames joints"]:
+def find_residual_spikes(
+    rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"]
+) -> Bool[Tensor, "frames joints"]:
     """Where what is left of a capture beside a model of it leaps: rotation vectors, radians. Without the motion itself
     a spike stands out more clearly; `sigma` is the noise of each of the three numbers.
     """
     middle = _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])
-    return (rest - middle).norm(dim=-1) > _REST_SIGMAS * sigma + math.radians(_REST_DEG)
+    return (rest - middle).norm(dim=-1) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
 
 
 def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
     """Over `_SPAN` frames; beyond the ends they are mirrored, since repeated, an outermost frame that leaps would be
     its own median.
     """
-    side, last = _SPAN // 2, len(values) - 1
+    side, last = _MEDIAN_FRAMES // 2, len(values) - 1
     frame = last - (last - torch.arange(-side, len(values) + side).abs()).abs()
-    return values[frame.clamp_min(0)].unfold(0, _SPAN, 1).median(dim=-1).values
+    return values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
 
 
-def _usual_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames joints"]:
+def _mean_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames joints"]:
     """Mean way between frames about each frame, of the medians."""
     if len(steps) == 0:
         return steps.new_zeros(1, steps.shape[1])
-    padded = torch.nn.functional.pad(steps.T, (_NEAR, _NEAR - 1), mode="replicate")
-    return torch.nn.functional.pad(padded.unfold(-1, 2 * _NEAR, 1).mean(-1), (0, 1), mode="replicate").T
+    padded = torch.nn.functional.pad(steps.T, (_STEP_FRAMES, _STEP_FRAMES - 1), mode="replicate")
+    return torch.nn.functional.pad(padded.unfold(-1, 2 * _STEP_FRAMES, 1).mean(-1), (0, 1), mode="replicate").T
 
 
-def _angle(start: Float[Tensor, "frames joints 4"], stop: Float[Tensor, "frames joints 4"]) -> Tensor:
+def _rotation_distance(start: Float[Tensor, "frames joints 4"], stop: Float[Tensor, "frames joints 4"]) -> Tensor:
     """Between two rotations, radians."""
     dots = (start * stop).sum(-1).abs().clamp(max=1)
     return 2 * torch.arccos(dots)

@@ -16,13 +16,19 @@ from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
-from mapctl.retarget.joint_matching import Match, match, with_sides_checked
-from mapctl.retarget.pose_axes import Poses, up_axis
-from mapctl.retarget.reference_pose import TPose, find, kind, rest_facing, upright_of
+from mapctl.retarget.joint_matching import Match, correct_sides, match
+from mapctl.retarget.pose_axes import RigPoses, find_up_axis
+from mapctl.retarget.reference_pose import (
+    TPose,
+    classify_reference_pose,
+    find_rest_facing,
+    find_tpose,
+    upright_rotation,
+)
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, Skeleton
 
-_FITS = math.radians(60)  # between a limb's bone in a table's T-pose and its canonical direction
+_MAX_BONE_ANGLE = math.radians(60)  # between a limb's bone in a table's T-pose and its canonical direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +63,7 @@ class RigMap:
     """Whether hips below the root have an animated offset; else the root carries them."""
 
 
-def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
+def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
     """Tell the rig's joints, find its T-pose and measure its bones; RequestError where its joints cannot be told.
 
     What `rig` says is taken as it is; else presets are tried, and then names, tree and places (see
@@ -65,16 +71,16 @@ def map_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None
     begins with a T-pose, where the pose with all rotations zero does not.
     """
     found = match(skeleton, rig)
-    told = _by_table(found, skeleton, motion)
+    told = _map_by_table(found, skeleton, motion)
     if told is not None:
-        return _with_travel(told, motion)
-    found = with_sides_checked(found, skeleton, motion)
-    zero = Poses.zero(skeleton, found.joint_of)
-    clip = None if motion is None else Poses.of(motion, found.joint_of)
-    return _with_travel(_map(found, skeleton, find(zero, clip, rig=found.rig)), motion)
+        return _set_hips_travel(told, motion)
+    found = correct_sides(found, skeleton, motion)
+    zero = RigPoses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
+    return _set_hips_travel(_build_rig_map(found, skeleton, find_tpose(zero, clip, rig=found.rig)), motion)
 
 
-def settled(rigmap: RigMap) -> Rig:
+def as_rig(rigmap: RigMap) -> Rig:
     """The rig as it was found, so that parts of a clip are converted as the whole was.
 
     A part may lack the first frame that showed the T-pose, or the steps that showed how knees bend.
@@ -93,30 +99,32 @@ def settled(rigmap: RigMap) -> Rig:
     )
 
 
-def _with_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
+def _set_hips_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
     """The map, told whether the hips travel below the root; without a motion they may."""
-    return rigmap if motion is None else replace(rigmap, hips_travel=_hips(rigmap) in motion.moving_offsets)
+    return rigmap if motion is None else replace(rigmap, hips_travel=_hips_joint(rigmap) in motion.moving_offsets)
 
 
-def _by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
+def _map_by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
     """By the T-pose that the rig's table tells; None where it tells none, or its limbs would not lie as in one."""
     rig, joint_of = found.rig, found.joint_of
     if not rig.has_tpose:
         return None
-    quats = _tpose(rig, skeleton, joint_of)
-    zero = Poses.zero(skeleton, joint_of)
-    clip = None if motion is None else Poses.of(motion, joint_of)
-    up = up_axis(zero, clip) if rig.up == "auto" else rig.up
+    quats = _table_tpose(rig, skeleton, joint_of)
+    zero = RigPoses.zero(skeleton, joint_of)
+    clip = None if motion is None else RigPoses.of(motion, joint_of)
+    up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
     idle = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(skeleton.num_joints, 4)
-    rest = kind(zero, torch.eye(3, dtype=torch.float64))
-    told = _map(found, skeleton, TPose(quats, idle, upright_of(up), up, rest_facing(zero), rest, "table"))
+    rest = classify_reference_pose(zero, torch.eye(3, dtype=torch.float64))
+    told = _build_rig_map(
+        found, skeleton, TPose(quats, idle, upright_rotation(up), up, find_rest_facing(zero), rest, "table")
+    )
     if rig.rest == "tpose" and rig.name != "canonical":  # what a user asks for is done
         return told
-    return told if (rest == "T" or not rig.straighten) and _lies_as_canonical(told.skeleton) else None
+    return told if (rest == "T" or not rig.straighten) and _is_canonical_pose(told.skeleton) else None
 
 
-def _map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
-    measured = bone_offsets.measure(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw)
+def _build_rig_map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
+    measured = bone_offsets.measure_bones(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw)
     return RigMap(
         found.rig,
         skeleton,
@@ -133,7 +141,7 @@ def _map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
     )
 
 
-def _lies_as_canonical(skeleton: Skeleton) -> bool:
+def _is_canonical_pose(skeleton: Skeleton) -> bool:
     """Whether limbs lie about as they do in the T-pose, and hang from their own side of a trunk that stands."""
     names = [side + part for side in ("left", "right") for part in ("LowerArm", "Hand", "LowerLeg", "Foot")]
     own, usual = skeleton.offsets, CANONICAL.offsets
@@ -142,15 +150,17 @@ def _lies_as_canonical(skeleton: Skeleton) -> bool:
     pairs.append((own[trunk].sum(0), usual[trunk].sum(0)))
     legs = [CANONICAL.index(side + "UpperLeg") for side in ("left", "right")]
     pairs.append((own[legs[0]] - own[legs[1]], usual[legs[0]] - usual[legs[1]]))
-    return all(float(bone @ wanted) >= math.cos(_FITS) * float(bone.norm() * wanted.norm()) for bone, wanted in pairs)
+    return all(
+        float(bone @ wanted) >= math.cos(_MAX_BONE_ANGLE) * float(bone.norm() * wanted.norm()) for bone, wanted in pairs
+    )
 
 
 def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap]:
     """The motion in canonical joint frames with the performer's own bones, and the map that leads back.
 
-    `rig` wins over what would be recognised (see `map_rig`).
+    `rig` wins over what would be recognised (see `identify_rig`).
     """
-    rigmap = map_rig(motion.skeleton, rig, motion=motion)
+    rigmap = identify_rig(motion.skeleton, rig, motion=motion)
     world = motion.joint_rotations()
     picked = []
     for name, joint, tpose in zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True):
@@ -159,15 +169,15 @@ def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap
         else:
             picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
-    hips = motion.joint_positions()[:, _hips(rigmap)]
+    hips = motion.joint_positions()[:, _hips_joint(rigmap)]
     upright = rigmap.upright_quat_xyzw
     if upright is not None:  # all other joints turn with the hips
         local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
         hips = rotations.rotate(upright.expand(len(world), 4), hips)
-    return Motion(rigmap.skeleton, motion.fps, hips, rotations.sign_continuous(local)), rigmap
+    return Motion(rigmap.skeleton, motion.fps, hips, rotations.make_sign_continuous(local)), rigmap
 
 
-def places_on_rig(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:
+def rig_joint_positions(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:
     """Where the rig's own joints are, by canonical joint, in a world that stands along Y; 0 for joints it lacks.
 
     Joints that only the rig has, as those of twist, carry them elsewhere than the canonical motion tells.
@@ -191,7 +201,7 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     if rigmap.idle_quat_xyzw is not None:
         rest = rigmap.idle_quat_xyzw.expand(frames, skeleton.num_joints, 4)
     own = original.local_quat_xyzw if original is not None and kept else rest
-    hips, wanted = _in_the_files_world(motion, rigmap)
+    hips, wanted = _to_file_world(motion, rigmap)
     local, world = [], []
     for joint, parent in enumerate(skeleton.parents):
         above = world[parent] if parent >= 0 else None
@@ -204,13 +214,13 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
         skeleton,
         motion.fps,
         torch.zeros(frames, 3, dtype=torch.float64),
-        rotations.sign_continuous(torch.stack(local, 1)),
+        rotations.make_sign_continuous(torch.stack(local, 1)),
         source=original.source if original is not None else None,
     )
     return _place_hips(on_rig, rigmap, hips, original if kept else None)
 
 
-def _in_the_files_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
+def _to_file_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
     """Where the hips are to be, and which world rotation each joint of the rig is to have."""
     world, hips = motion.joint_rotations(), motion.root_position
     if rigmap.upright_quat_xyzw is not None:
@@ -224,7 +234,7 @@ def _in_the_files_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[in
 
 def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion | None) -> Motion:
     """Put the hips where they belong: by the root itself, or by their offset below it where that is animated."""
-    joint = _hips(rigmap)
+    joint = _hips_joint(rigmap)
     if joint == 0:
         moving = original.moving_offsets if original is not None else {}
         return replace(on_rig, root_position=hips, moving_offsets=moving)
@@ -240,25 +250,25 @@ def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion |
     return replace(on_rig, moving_offsets={**on_rig.moving_offsets, joint: offset})
 
 
-def _hips(rigmap: RigMap) -> int:
+def _hips_joint(rigmap: RigMap) -> int:
     joint = rigmap.joint_of[0]
     if joint is None:
         raise RequestError(f"the rig {rigmap.rig.name} names no hips")
     return joint
 
 
-def _tpose(rig: Rig, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
+def _table_tpose(rig: Rig, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
     quats = []
     for index, name in enumerate(CANONICAL.names):
         axes = rig.tpose.get(name)
-        matrix = frame_of(axes["x"], axes["y"]) if axes else torch.eye(3, dtype=torch.float64)
+        matrix = frame_from_axes(axes["x"], axes["y"]) if axes else torch.eye(3, dtype=torch.float64)
         if name in rig.straighten:
-            matrix = _straightened(index, skeleton, joint_of)
+            matrix = _straighten_bone(index, skeleton, joint_of)
         quats.append(rotations.from_matrix(matrix))
     return torch.stack(quats)
 
 
-def frame_of(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
+def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
     """Rotation whose first two columns point along x and (as nearly as they are square) y."""
     first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
     second = torch.tensor(y, dtype=torch.float64)
@@ -266,7 +276,7 @@ def frame_of(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
     return torch.stack([first, second, torch.linalg.cross(first, second)], dim=1)
 
 
-def _straightened(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
+def _straighten_bone(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
     """The smallest rotation that lays the joint's bone along its canonical direction."""
     child = CANONICAL.children(index)[0]
     rig_child = joint_of[child]
@@ -274,10 +284,10 @@ def _straightened(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ..
         raise RequestError(f"cannot straighten {CANONICAL.names[index]}: the rig has no joint after it")
     bone = torch.nn.functional.normalize(skeleton.offsets[rig_child], dim=0)
     aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
-    return _shortest_turn(bone, aim)
+    return _shortest_rotation(bone, aim)
 
 
-def _shortest_turn(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def _shortest_rotation(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The smallest rotation from one unit vector to another; of opposite ones, one of the half turns."""
     axis, cosine = torch.linalg.cross(start, stop), start @ stop
     if cosine < 0 and axis.norm() < 1e-9:
@@ -291,7 +301,7 @@ def _shortest_turn(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float
 def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:
     """The joint of a motion's rig by canonical name, those that it has; none where the rig cannot be told."""
     try:
-        joint_of = map_rig(motion.skeleton, rig, motion=motion).joint_of
+        joint_of = identify_rig(motion.skeleton, rig, motion=motion).joint_of
     except RequestError:
         return {}
     return {name: joint for name, joint in zip(CANONICAL.names, joint_of, strict=True) if joint is not None}

@@ -7,13 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.retarget.pose_axes import JointOf, next_of
+from mapctl.retarget.pose_axes import JointOf, next_joint
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _END_SITES = ("Toes", "Hand", "head")  # what an End Site of the joint above may stand for
 
 
-def measure(
+def measure_bones(
     skeleton: Skeleton, joint_of: JointOf, tpose: Float[Tensor, "joints 4"], idle: Float[Tensor, "rigged 4"]
 ) -> Skeleton:
     """The canonical skeleton with a rig's bones, metres.
@@ -38,18 +38,18 @@ def measure(
     known = {c: place[joint] for c, joint in enumerate(joint_of) if joint is not None}
     spots: list[Tensor] = []
     for c in range(CANONICAL.num_joints):
-        spots.append(known[c] if c in known else _put(c, joint_of, spots, known, ends))
+        spots.append(known[c] if c in known else _estimate_position(c, joint_of, spots, known, ends))
     places = torch.stack(spots)
     offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
     tips = {
-        CANONICAL.names[c]: _triple(ends[j])
+        CANONICAL.names[c]: _to_triple(ends[j])
         for c, j in enumerate(joint_of)
         if j is not None and j in ends and not CANONICAL.children(c)
     }
     return Skeleton(CANONICAL.names, CANONICAL.parents, offsets, tips)
 
 
-def _put(
+def _estimate_position(
     c: int, joint_of: JointOf, spots: list[Tensor], known: Mapping[int, Tensor], ends: Mapping[int, Tensor]
 ) -> Float[Tensor, "3"]:
     """A place for a joint that the rig lacks."""
@@ -57,22 +57,22 @@ def _put(
     above, own = joint_of[parent], float(CANONICAL.offsets[c].norm())
     if name.endswith(_END_SITES) and above is not None and above in ends:
         return spots[parent] + ends[above]
-    length, following = own, next_of(name)
+    length, following = own, next_joint(name)
     while following is not None:
         length += float(CANONICAL.offsets[CANONICAL.index(following)].norm())
         if CANONICAL.index(following) in known:
             return spots[parent] + (known[CANONICAL.index(following)] - spots[parent]) * (own / length)
-        following = next_of(following)
-    return spots[parent] + CANONICAL.offsets[c] * _scale(spots)
+        following = next_joint(following)
+    return spots[parent] + CANONICAL.offsets[c] * _estimate_scale(spots)
 
 
-def _scale(spots: list[Tensor]) -> float:
+def _estimate_scale(spots: list[Tensor]) -> float:
     """Of the performer to the canonical one: by how far the joints so far reach."""
     own = sum(float((spot - spots[CANONICAL.parents[c]]).norm()) for c, spot in enumerate(spots) if c)
     usual = float(CANONICAL.offsets[1 : len(spots)].norm(dim=-1).sum())
     return own / usual if own > 0 and usual > 0 else 1.0
 
 
-def _triple(vector: Tensor) -> tuple[float, float, float]:
+def _to_triple(vector: Tensor) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z

@@ -17,30 +17,36 @@ from mapctl import contacts, kinematics, rotations
 from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, from_canonical, settled, to_canonical
+from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import SIDES, Stance
 from mapctl.skeleton import CANONICAL, Skeleton, leg_length
 
-_HIPJOINTS, _SHINS, _FEET, _TOES = (
+_HIP_JOINTS, _SHINS, _FEET, _TOES = (
     [CANONICAL.index(side + part) for side in SIDES] for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")
 )
-_ONE_STAND = 0.2  # seconds between two contacts of one place that are one
-_PLACE = 0.06  # metres that such contacts are apart at most
-_STRETCHED = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
-_STRAIGHT = 0.9995  # of the leg that one may be at most
-_SOFT = 0.004  # of the leg, before the most that it may be, over which it gives in
-_DIP = 0.12  # seconds over which hips go down for a leg that is too short, and up again
-_SINK = 0.008  # metres under its rest height that a toe goes at most
-_HEEL, _OVER = 10.0, 60.0  # degrees that toes are raised by when a foot is on its heel, and until when it may be
-_LOW, _HIGH = 0.1, 0.35  # of the leg: over the floor from where on rotations begin to count, and until they alone do
-_STEADY = 0.05  # seconds over which what hips carry is smoothed
+_MERGE_SECONDS = 0.2  # seconds between two contacts of one place that are one
+_MERGE_METRES = 0.06  # metres that such contacts are apart at most
+_FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
+_MAX_EXTENSION = 0.9995  # of the leg that one may be at most
+_SOFT_MARGIN = 0.004  # of the leg, before the most that it may be, over which it gives in
+_HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
+_MAX_TOE_SINK = 0.008  # metres under its rest height that a toe goes at most
+_HEEL_DEG, _MAX_HEEL_DEG = (
+    10.0,
+    60.0,
+)  # degrees that toes are raised by when a foot is on its heel, and until when it may be
+_LOW_SHARE, _HIGH_SHARE = (
+    0.1,
+    0.35,
+)  # of the leg: over the floor from where on rotations begin to count, and until they alone do
+_SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed
 _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-_SEEN = 0.005  # metres that a foot misses its place by before it is worth a line
+_NOTED_METRES = 0.005  # metres that a foot misses its place by before it is worth a line
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class RiggedCharacter:
     """Who is to move: a rig with its performer's bones and stance."""
 
     rigmap: RigMap
@@ -51,10 +57,10 @@ class Body:
     """Layout and unit of the rig's file, which the result is written in."""
 
     @staticmethod
-    def of(clip: Motion, rig: Rig | None = None) -> "tuple[Motion, Body]":
+    def of(clip: Motion, rig: Rig | None = None) -> "tuple[Motion, RiggedCharacter]":
         """A clip on canonical joints, and whose it is; RequestError where its joints cannot be told."""
         canonical, rigmap = to_canonical(clip, rig)
-        return canonical, Body(rigmap, Stance.of(canonical, rigmap), clip.source)
+        return canonical, RiggedCharacter(rigmap, Stance.of(canonical, rigmap), clip.source)
 
     @property
     def skeleton(self) -> Skeleton:
@@ -77,7 +83,7 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class RetargetedMotion:
     """A motion on another body."""
 
     motion: Motion
@@ -86,62 +92,67 @@ class Carried:
     """What could not be kept; empty where all is."""
 
 
-def carry(clip: Motion, body: Body, rig: Rig | None = None) -> Carried:
+def retarget_motion(clip: Motion, body: RiggedCharacter, rig: Rig | None = None) -> RetargetedMotion:
     """A clip of any rig on a body's bones, in the canonical joint frames of its rig. This is the one way there.
 
     A clip of the body's own skeleton comes as it is, to the bit. `rig` is the clip's, where it is not the one that
     would be recognised. RequestError where its joints cannot be told.
     """
     if clip.skeleton.matches(body.rigmap.rig_skeleton):
-        return Carried(replace(to_canonical(clip, settled(body.rigmap))[0], skeleton=body.skeleton))
-    canonical, giver = Body.of(clip, rig)
-    return carry_canonical(canonical, giver, body)
+        return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
+    canonical, giver = RiggedCharacter.of(clip, rig)
+    return retarget_canonical(canonical, giver, body)
 
 
-def carry_canonical(motion: Motion, giver: Body, body: Body) -> Carried:
+def retarget_canonical(motion: Motion, giver: RiggedCharacter, body: RiggedCharacter) -> RetargetedMotion:
     """The same of a motion (canonical joints, any part of a clip) whose giver is known."""
     own = giver.stance.leveled(motion)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
-    moved = _raised(own, giver, body, scale)
-    ankles = _ankle_places(own, moved, giver.stance, body.stance, scale)
-    moved = _lowered(moved, ankles, _stretch(own))
-    done = _reached(moved, ankles)
-    return Carried(body.stance.unleveled(done), _missed(done, ankles))
+    moved = _transfer_root(own, giver, body, scale)
+    ankles = _ankle_targets(own, moved, giver.stance, body.stance, scale)
+    moved = _lower_hips(moved, ankles, _leg_extension(own))
+    done = _reach_ankle_targets(moved, ankles)
+    return RetargetedMotion(body.stance.restore_foot_tilt(done), _note_ankle_errors(done, ankles))
 
 
-def _raised(own: Motion, giver: Body, body: Body, scale: float) -> Motion:
+def _transfer_root(own: Motion, giver: RiggedCharacter, body: RiggedCharacter, scale: float) -> Motion:
     """The giver's rotations on the body's bones. The middle between the thighs goes its way in scale, as much higher as
     ankles and floor ask for."""
-    to_thighs = body.leveled.offsets[_HIPJOINTS].mean(0) - scale * own.skeleton.offsets[_HIPJOINTS].mean(0)
+    to_thighs = body.leveled.offsets[_HIP_JOINTS].mean(0) - scale * own.skeleton.offsets[_HIP_JOINTS].mean(0)
     turns = own.joint_rotations()[:, 0]
     # Hips are turned by noise; what they carry at another distance is not to shake for it.
-    aside = _smooth(rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _STEADY * float(own.fps))
-    ankle, others = _ankle(body.stance.toe_height, body.leveled), _ankle(giver.stance.flat_height, own.skeleton)
+    aside = _low_pass(rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _SMOOTH_SECONDS * float(own.fps))
+    ankle, others = (
+        _ankle_height(body.stance.toe_height, body.leveled),
+        _ankle_height(giver.stance.flat_height, own.skeleton),
+    )
     rise = _UP * (ankle - scale * others + (1 - scale) * giver.stance.floor)
     return replace(own, skeleton=body.leveled, root_position=scale * own.root_position + rise - aside, source=None)
 
 
-def _ankle(toe_height: Float[Tensor, "2"], leveled: Skeleton) -> Float[Tensor, ""]:
+def _ankle_height(toe_height: Float[Tensor, "2"], leveled: Skeleton) -> Float[Tensor, ""]:
     """Height of the ankles over the floor while feet lie flat, metres, mean of both."""
     return (toe_height - leveled.offsets[_TOES, 1]).mean()
 
 
-def _ankle_places(own: Motion, moved: Motion, giver: Stance, body: Stance, scale: float) -> Float[Tensor, "frames 2 3"]:
+def _ankle_targets(
+    own: Motion, moved: Motion, giver: Stance, body: Stance, scale: float
+) -> Float[Tensor, "frames 2 3"]:
     """Where ankles are to be: with the toe joints as the giver's in scale, over their own rest heights, and moved over
     the ground to where the body's rotations bring them, by as much throughout a contact. High over the floor rotations
     alone count: a kick is a pose, and no place to be."""
     toes, places = own.joint_positions()[:, _TOES], scale * own.joint_positions()[:, _FEET]
     shift = moved.joint_positions()[:, _TOES] - scale * toes
-    for k, spans in enumerate(_stands(toes, own.fps)):
-        places[:, k, ::2] += _held(shift[:, k, ::2], spans, float(own.fps))
+    for k, spans in enumerate(_contact_intervals(toes, own.fps)):
+        places[:, k, ::2] += _hold_through_contacts(shift[:, k, ::2], spans, float(own.fps))
     over = scale * (toes[..., 1] - giver.floor - giver.flat_height)
-    lifted = torch.where(over < 0, _SINK * torch.expm1(over / _SINK) - over, 0.0)
+    lifted = torch.where(over < 0, _MAX_TOE_SINK * torch.expm1(over / _MAX_TOE_SINK) - over, 0.0)
     places[..., 1] += (1 - scale) * giver.floor + body.toe_height - scale * giver.flat_height + lifted
-    high = _step(over / leg_length(moved.skeleton) / _HIGH - _LOW / _HIGH)[..., None]
-    return torch.lerp(places + _longer_foot(own, moved, scale), moved.joint_positions()[:, _FEET], high)
+    high = _smootherstep(over / leg_length(moved.skeleton) / _HIGH_SHARE - _LOW_SHARE / _HIGH_SHARE)[..., None]
+    return torch.lerp(places + _foot_length_offset(own, moved, scale), moved.joint_positions()[:, _FEET], high)
 
 
-def _longer_foot(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "frames 2 3"]:
+def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "frames 2 3"]:
     """From where the ankle would be, were the foot the giver's in scale, to where it is.
 
     A foot whose heel is raised stands on its toes, one whose toes are raised on its heel, which the ankle is over: then
@@ -152,45 +163,47 @@ def _longer_foot(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "fra
     heading, tilt = rotations.split_heading(turns)
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(longer)
     up = torch.rad2deg(torch.atan2(*(rotations.rotate(turns, way)[..., 1] for way in (forward, forward.roll(-1, -1)))))
-    on_toes = 1 - _step(up / _HEEL) * (1 - _step((up - _OVER) / _OVER))
+    on_toes = 1 - _smootherstep(up / _HEEL_DEG) * (1 - _smootherstep((up - _MAX_HEEL_DEG) / _MAX_HEEL_DEG))
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand_as(tilt)
     tilt = rotations.slerp(still, tilt, on_toes)
     return rotations.rotate(rotations.multiply(rotations.about_y(heading), tilt), longer)
 
 
-def _step(way: Tensor) -> Tensor:
+def _smootherstep(way: Tensor) -> Tensor:
     """From 0 to 1 over 0 to 1, without a jump of the first two derivatives."""
     way = way.clamp(0, 1)
     return way**3 * (10 + way * (6 * way - 15))
 
 
-def _stands(toes: Float[Tensor, "frames 2 3"], fps) -> list[list[tuple[int, int]]]:
+def _contact_intervals(toes: Float[Tensor, "frames 2 3"], fps) -> list[list[tuple[int, int]]]:
     """First frames of contacts and one past their last ones, by foot; what is one stand, but for noise, is one."""
-    planted, apart = contacts.planted(toes, fps), _ONE_STAND * float(fps)
-    return [_joined(_runs(planted[:, k]), toes[:, k], apart) for k in range(toes.shape[1])]
+    planted, apart = contacts.detect_contacts(toes, fps), _MERGE_SECONDS * float(fps)
+    return [_merge_contacts(_planted_intervals(planted[:, k]), toes[:, k], apart) for k in range(toes.shape[1])]
 
 
-def _runs(stands: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+def _planted_intervals(stands: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
     edges = torch.nn.functional.pad(stands.long(), (1, 1)).diff()
     return list(zip((edges == 1).nonzero()[:, 0].tolist(), (edges == -1).nonzero()[:, 0].tolist(), strict=True))
 
 
-def _joined(runs: list[tuple[int, int]], toe: Float[Tensor, "frames 3"], apart: float) -> list[tuple[int, int]]:
+def _merge_contacts(runs: list[tuple[int, int]], toe: Float[Tensor, "frames 3"], apart: float) -> list[tuple[int, int]]:
     found: list[tuple[int, int]] = []
     for start, stop in runs:
         near = bool(found) and start - found[-1][1] < apart
-        if near and float((toe[start] - toe[found[-1][1] - 1])[::2].norm()) < _PLACE:
+        if near and float((toe[start] - toe[found[-1][1] - 1])[::2].norm()) < _MERGE_METRES:
             found[-1] = (found[-1][0], stop)
         else:
             found.append((start, stop))
     return found
 
 
-def _held(shift: Float[Tensor, "frames 2"], spans: list[tuple[int, int]], fps: float) -> Float[Tensor, "frames 2"]:
+def _hold_through_contacts(
+    shift: Float[Tensor, "frames 2"], spans: list[tuple[int, int]], fps: float
+) -> Float[Tensor, "frames 2"]:
     """The shift, of one value throughout each span (its mean there) and smooth from one to the next; low-passed where
     there is no span at all."""
     if not spans:
-        return _smooth(shift, 0.25 * fps)
+        return _low_pass(shift, 0.25 * fps)
     held = torch.empty_like(shift)
     values = [shift[start:stop].mean(0) for start, stop in spans]
     held[: spans[0][0]], held[spans[-1][0] :] = values[0], values[-1]
@@ -198,11 +211,11 @@ def _held(shift: Float[Tensor, "frames 2"], spans: list[tuple[int, int]], fps: f
         held[start:stop] = value
     for (_, stop), (start, _), before, after in zip(spans[:-1], spans[1:], values[:-1], values[1:], strict=True):
         way = torch.arange(1, start - stop + 1, dtype=shift.dtype)[:, None] / (start - stop + 1)
-        held[stop:start] = before + (after - before) * _step(way)
+        held[stop:start] = before + (after - before) * _smootherstep(way)
     return held
 
 
-def _smooth(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Tensor, "frames columns"]:
+def _low_pass(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Tensor, "frames columns"]:
     """Gaussian low-pass over time, `sigma` in frames; ends held."""
     reach = max(1, round(3 * sigma))
     at = torch.arange(-reach, reach + 1, dtype=values.dtype)
@@ -211,64 +224,64 @@ def _smooth(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Tens
     return torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None])[:, 0].T
 
 
-def _stretch(own: Motion) -> Float[Tensor, "frames 2"]:
+def _leg_extension(own: Motion) -> Float[Tensor, "frames 2"]:
     """How straight the giver's legs are: hip joint to ankle over both bones' length."""
     places = own.joint_positions()
-    return (places[:, _FEET] - places[:, _HIPJOINTS]).norm(dim=-1) / _lengths(own.skeleton)
+    return (places[:, _FEET] - places[:, _HIP_JOINTS]).norm(dim=-1) / _leg_bone_lengths(own.skeleton)
 
 
-def _lengths(skeleton: Skeleton) -> Float[Tensor, "2"]:
+def _leg_bone_lengths(skeleton: Skeleton) -> Float[Tensor, "2"]:
     return sum((skeleton.offsets[joints].norm(dim=-1) for joints in (_SHINS, _FEET)), torch.zeros(2).double())
 
 
-def _lowered(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
+def _lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
     """Hips so much lower that legs reach the ankles' places no straighter than the giver's, or than most; smoothly."""
-    ways = ankles - moved.joint_positions()[:, _HIPJOINTS]
-    most = _lengths(moved.skeleton) * stretch.clamp(_STRETCHED, _STRAIGHT)
+    ways = ankles - moved.joint_positions()[:, _HIP_JOINTS]
+    most = _leg_bone_lengths(moved.skeleton) * stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION)
     level, down = ways[..., ::2].square().sum(-1), -ways[..., 1]
     # The height at which the leg just reaches; a leg that points sideways or up is not helped by lower hips.
     short = (down - (most.square() - level).clamp_min(0).sqrt()).clamp_min(0)
     short = torch.where(down > 0.5 * most, short, 0.0).amax(dim=-1, keepdim=True)
-    frames = max(1, round(_DIP * float(moved.fps)))
+    frames = max(1, round(_HIP_DROP_SECONDS * float(moved.fps)))
     padded = torch.nn.functional.pad(short.T[None], (frames, frames), mode="replicate")
     highest = torch.nn.functional.max_pool1d(padded, 2 * frames + 1, stride=1)[0].T
-    dip = _smooth(highest, frames / 2)[:, 0]
+    dip = _low_pass(highest, frames / 2)[:, 0]
     return replace(moved, root_position=moved.root_position - dip[:, None] * _UP)
 
 
-def _reached(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
+def _reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
     """Legs bent and turned so that ankles are at their places; feet keep how they are turned in the world."""
     places, world = moved.joint_positions().clone(), moved.joint_rotations()
-    at, most = places[:, _HIPJOINTS], _STRAIGHT * _lengths(moved.skeleton)
+    at, most = places[:, _HIP_JOINTS], _MAX_EXTENSION * _leg_bone_lengths(moved.skeleton)
     ways = ankles - at
     far = ways.norm(dim=-1)
-    places[:, _FEET] = at + ways * (_give_in(far, most) / far.clamp_min(1e-9))[..., None]
+    places[:, _FEET] = at + ways * (_soft_clamp(far, most) / far.clamp_min(1e-9))[..., None]
     free = torch.zeros(places.shape[:2], dtype=torch.bool)
-    free[:, [*_HIPJOINTS, *_SHINS]] = True
+    free[:, [*_HIP_JOINTS, *_SHINS]] = True
     legs = [LIMBS[side + "Foot"] for side in SIDES]
-    local = inverse.solve(
+    local = inverse.solve_inverse_kinematics(
         places, moved.local_quat_xyzw, moved.skeleton, free=free, root_position=moved.root_position, limbs=legs
     )
     turned = replace(moved, local_quat_xyzw=local).joint_rotations().clone()
     turned[:, [*_FEET, *_TOES]] = world[:, [*_FEET, *_TOES]]
-    local = rotations.sign_continuous(kinematics.local_from_world(moved.skeleton.parents, turned))
+    local = rotations.make_sign_continuous(kinematics.local_from_world(moved.skeleton.parents, turned))
     return replace(moved, local_quat_xyzw=local)
 
 
-def _give_in(far: Float[Tensor, "frames 2"], most: Float[Tensor, "2"]) -> Float[Tensor, "frames 2"]:
+def _soft_clamp(far: Float[Tensor, "frames 2"], most: Float[Tensor, "2"]) -> Float[Tensor, "frames 2"]:
     """How far an ankle may be: as far as it is, and ever less beyond what is nearly the most."""
-    soft = _SOFT * most
+    soft = _SOFT_MARGIN * most
     over = (far - (most - soft)).clamp_min(0)
     return torch.minimum(far, most - soft) + soft * (1 - torch.exp(-over / soft))
 
 
-def _missed(done: Motion, ankles: Float[Tensor, "frames 2 3"]) -> tuple[str, ...]:
+def _note_ankle_errors(done: Motion, ankles: Float[Tensor, "frames 2 3"]) -> tuple[str, ...]:
     """A line on feet that are not where they were to be."""
     off = (done.joint_positions()[:, _FEET] - ankles).norm(dim=-1).amax(dim=-1)
-    if float(off.max()) < _SEEN:
+    if float(off.max()) < _NOTED_METRES:
         return ()
-    frames, worst = int((off > _SEEN).sum()), int(off.argmax())
+    frames, worst = int((off > _NOTED_METRES).sum()), int(off.argmax())
     return (
         f"the legs are too short for some of the way: feet are up to {100 * float(off.max()):.1f} cm off"
-        f" (frame {worst}), by more than {100 * _SEEN:g} cm in {frames} of {len(off)} frames",
+        f" (frame {worst}), by more than {100 * _NOTED_METRES:g} cm in {frames} of {len(off)} frames",
     )

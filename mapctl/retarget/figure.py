@@ -12,14 +12,14 @@ from mapctl.errors import RequestError
 from mapctl.formats.bvh import layout as bvh_layout
 from mapctl.motion import Motion
 from mapctl.retarget.joint_matching import REQUIRED
-from mapctl.retarget.reference_pose import upright_of, vector
+from mapctl.retarget.reference_pose import axis_vector, upright_rotation
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
 _FPS, _FRAMES = Fraction(30), 30
 
 
-def stand(rig: Rig) -> Motion:
+def make_tpose_clip(rig: Rig) -> Motion:
     """A second of standing in the T-pose on the rig's joints, in its world and unit; toes on the floor.
 
     Bones are the canonical body's, since a rig tells names and no lengths. RequestError where it does not name all that
@@ -31,34 +31,34 @@ def stand(rig: Rig) -> Motion:
             f"rig {rig.name} names no joint for {', '.join(missing)}: a skeleton cannot be made of it; "
             "name them, or a clip"
         )
-    skeleton = _skeleton(rig)
-    standing = retarget.from_canonical(_tpose(), retarget.map_rig(skeleton, rig))
+    skeleton = _build_skeleton(rig)
+    standing = retarget.from_canonical(_canonical_tpose(), retarget.identify_rig(skeleton, rig))
     if rig.metres_per_unit is None:
         return standing
-    layout = bvh_layout.of(standing, rig.name)
+    layout = bvh_layout.choose_layout(standing, rig.name)
     return replace(standing, source=replace(layout, metres_per_unit=rig.metres_per_unit))
 
 
-def _tpose() -> Motion:
-    places = _places()
+def _canonical_tpose() -> Motion:
+    places = _tpose_positions()
     root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
     root[:, 1] = TOE_REST_HEIGHT - places[CANONICAL.index("leftToes"), 1]
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     return Motion(CANONICAL, _FPS, root, still.expand(_FRAMES, CANONICAL.num_joints, 4).clone())
 
 
-def _places() -> Float[Tensor, "joints 3"]:
+def _tpose_positions() -> Float[Tensor, "joints 3"]:
     """Of the canonical joints in the T-pose, from the hips."""
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)
     root = torch.zeros(1, 3, dtype=torch.float64)
     return kinematics.forward_kinematics(CANONICAL.offsets, CANONICAL.parents, root, still)[0][0]
 
 
-def _skeleton(rig: Rig) -> Skeleton:
+def _build_skeleton(rig: Rig) -> Skeleton:
     """The joints that the rig names, depth first, as files nest them."""
-    places, order = _places(), [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
-    frames = {joint: _frame(rig, CANONICAL.names[joint]) for joint in order}
-    above = {joint: _above(joint, rig) for joint in order}
+    places, order = _tpose_positions(), [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
+    frames = {joint: _joint_frame(rig, CANONICAL.names[joint]) for joint in order}
+    above = {joint: _named_ancestor(joint, rig) for joint in order}
     offsets = [places[0] if p is None else frames[p].T @ (places[j] - places[p]) for j, p in above.items()]
     own = [rig.joints[CANONICAL.names[joint]] for joint in order]
     ends: dict[str, Tensor] = {}
@@ -77,7 +77,7 @@ def _depth_first(joint: int) -> list[int]:
     return [joint, *(below for child in CANONICAL.children(joint) for below in _depth_first(child))]
 
 
-def _above(joint: int, rig: Rig) -> int | None:
+def _named_ancestor(joint: int, rig: Rig) -> int | None:
     """The nearest canonical joint above that the rig names."""
     parent = CANONICAL.parents[joint]
     while parent >= 0 and CANONICAL.names[parent] not in rig.joints:
@@ -85,21 +85,21 @@ def _above(joint: int, rig: Rig) -> int | None:
     return None if parent < 0 else parent
 
 
-def _frame(rig: Rig, name: str) -> Float[Tensor, "3 3"]:
+def _joint_frame(rig: Rig, name: str) -> Float[Tensor, "3 3"]:
     """How a joint's frame is turned in the T-pose, in a world with Y up: as the table tells it, or as the file's axes
     lie."""
     axes = rig.tpose.get(name)
     if axes:
-        return retarget.frame_of(axes["x"], axes["y"])
+        return retarget.frame_from_axes(axes["x"], axes["y"])
     if rig.tpose:
         return torch.eye(3, dtype=torch.float64)
     return _file_to_world(rig)
 
 
 def _file_to_world(rig: Rig) -> Float[Tensor, "3 3"]:
-    up = vector("y" if rig.up == "auto" else rig.up)
-    upright = upright_of(rig.up) if rig.up not in ("auto", "y") else None
-    front = vector("z") if upright is None else rotations.rotate(rotations.inverse(upright), vector("z"))
-    if rig.facing != "auto" and abs(float(vector(rig.facing) @ up)) < 0.5:
-        front = vector(rig.facing)
+    up = axis_vector("y" if rig.up == "auto" else rig.up)
+    upright = upright_rotation(rig.up) if rig.up not in ("auto", "y") else None
+    front = axis_vector("z") if upright is None else rotations.rotate(rotations.inverse(upright), axis_vector("z"))
+    if rig.facing != "auto" and abs(float(axis_vector(rig.facing) @ up)) < 0.5:
+        front = axis_vector(rig.facing)
     return torch.stack([torch.linalg.cross(up, front), up, front])

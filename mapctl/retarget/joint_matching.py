@@ -8,15 +8,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import Part, Role, Side, nearest, plain_name, shorten
-from mapctl.joint_roles import find_hips, roles
+from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_nearest, normalise_name
+from mapctl.joint_roles import classify_joints, find_hips
 from mapctl.motion import Motion
 from mapctl.retarget import topology
-from mapctl.retarget.pose_axes import Poses, swapped
-from mapctl.retarget.rigs import Rig, known
-from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+from mapctl.retarget.pose_axes import RigPoses, are_sides_swapped
+from mapctl.retarget.rigs import Rig, known_rigs
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
-ACCEPTED = 0.6
+MIN_SCORE = 0.6
 """Score below which a rig is not believed to be understood."""
 REQUIRED = (
     "hips",
@@ -25,8 +25,8 @@ REQUIRED = (
 )
 """Canonical joints that a rig must have; the others are put in between or at the end where it lacks them."""
 
-_BY_NAME, _BY_PLACE, _ABSENT, _SWAPPED = 1.0, 0.7, 0.4, 0.9
-_NO_BODY = re.compile(
+_BY_NAME, _BY_TOPOLOGY, _ABSENT, _SWAPPED = 1.0, 0.7, 0.4, 0.9
+_HELPER_NAME = re.compile(
     r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
     r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust",
     re.IGNORECASE,
@@ -55,40 +55,40 @@ def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
 
     RequestError where a score of ACCEPTED is not reached or a joint of REQUIRED is not found, naming what is missing.
     """
-    chosen, found = _preset(skeleton) if rig is None else (rig, _given(rig, skeleton))
+    chosen, found = _find_preset(skeleton) if rig is None else (rig, _match_by_rig(rig, skeleton))
     if rig is not None:
         _check_given(rig, found, skeleton)
     credit = dict.fromkeys(found, _BY_NAME)
     complete = all(name in found for name in REQUIRED)
     if chosen is None or not complete or (rig is None and not chosen.fits(skeleton)):
-        found, credit = _looked_up(skeleton, found)
+        found, credit = _complete_match(skeleton, found)
     absent = _ABSENT if all(name in found for name in REQUIRED) else 0.0
     worth = [credit.get(name, 0.0 if name in REQUIRED else absent) for name in CANONICAL.names]
     score = sum(worth) / len(worth)
-    _check(skeleton, found, score)
+    _check_match(skeleton, found, score)
     if chosen is None:
         chosen = Rig("unlisted", {name: skeleton.names[joint] for name, joint in found.items()})
     return Match(chosen, tuple(found.get(name) for name in CANONICAL.names), score, _unmapped(skeleton, found))
 
 
-def with_sides_checked(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
+def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
     """The match with left and right exchanged if the rig's names contradict the places of its joints."""
-    zero = Poses.zero(skeleton, found.joint_of)
-    clip = None if motion is None else Poses.of(motion, found.joint_of)
-    if not swapped(zero, clip):
+    zero = RigPoses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
+    if not are_sides_swapped(zero, clip):
         return found
-    partner = [CANONICAL.index(mirrored_name(name)) for name in CANONICAL.names]
+    partner = [CANONICAL.index(mirror_name(name)) for name in CANONICAL.names]
     joint_of = tuple(found.joint_of[other] for other in partner)
-    named = any(r.side is not Side.MIDDLE for j, r in enumerate(roles(skeleton)) if j in found.joint_of)
+    named = any(r.side is not Side.MIDDLE for j, r in enumerate(classify_joints(skeleton)) if j in found.joint_of)
     return replace(found, joint_of=joint_of, score=found.score * (_SWAPPED if named else 1.0), sides_exchanged=named)
 
 
-def _given(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
+def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
     """Joints by a rig's names, in the version that fits best; spelling counts only where it must."""
     exact = {name: joint for joint, name in enumerate(skeleton.names)}
-    plain = {plain_name(name): joint for joint, name in reversed(list(enumerate(skeleton.names)))}
+    plain = {normalise_name(name): joint for joint, name in reversed(list(enumerate(skeleton.names)))}
     listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
-    joint_of = {name: exact.get(name, plain.get(plain_name(name))) for names in listed.values() for name in names}
+    joint_of = {name: exact.get(name, plain.get(normalise_name(name))) for names in listed.values() for name in names}
 
     best: dict[str, int] = {}
     versions = 1 + max((len(others) for others in rig.aliases.values()), default=0)
@@ -105,16 +105,16 @@ def _given(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
     return best
 
 
-def _preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
+def _find_preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
     """The listed rig that explains most of the skeleton, if one has all that is required."""
     best, chosen, joints = 0.0, None, {}
-    plain = {plain_name(name) for name in skeleton.names}
-    for rig in known():
-        found = _given(rig, skeleton)
+    plain = {normalise_name(name) for name in skeleton.names}
+    for rig in known_rigs():
+        found = _match_by_rig(rig, skeleton)
         if any(name not in found for name in REQUIRED) or (rig.name == "canonical" and not rig.fits(skeleton)):
             continue
-        extra = {plain_name(name) for name in rig.also}
-        explained = len(found) + len(extra & plain - {plain_name(skeleton.names[j]) for j in found.values()})
+        extra = {normalise_name(name) for name in rig.also}
+        explained = len(found) + len(extra & plain - {normalise_name(skeleton.names[j]) for j in found.values()})
         lacking = len(rig.joints) - len(found) + len(extra - plain)
         # Fingers and props beyond what a list knows say nothing against it; what a list has and a rig lacks does.
         spelled = sum(skeleton.names[joint] in (rig.joints[c], *rig.aliases.get(c, ())) for c, joint in found.items())
@@ -124,22 +124,22 @@ def _preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
     return chosen, joints
 
 
-def _looked_up(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, float]]:
+def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, float]]:
     """Joints by the words in their names, completed by the tree; and what each is worth."""
     found = dict(given)
-    for name, joint in _by_words(skeleton, given.get("hips")).items():
+    for name, joint in _match_by_words(skeleton, given.get("hips")).items():
         if joint not in found.values():
             found.setdefault(name, joint)
     credit = dict.fromkeys(found, _BY_NAME)
-    placed = _sided(topology.find(skeleton), roles(skeleton), skeleton)
+    placed = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton)
     for name, joint in placed.items():
-        helper = _NO_BODY.search(skeleton.names[joint])
+        helper = _HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
-            found[name], credit[name] = joint, _BY_PLACE
+            found[name], credit[name] = joint, _BY_TOPOLOGY
     return found, credit
 
 
-def _by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
+def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
     """Canonical joint by side and part that names tell, below the hips, top down."""
     if hips is None:
         try:
@@ -147,16 +147,16 @@ def _by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
         except RequestError:
             return {}
     found = {"hips": hips}
-    inside = _below(skeleton, hips)
+    inside = _descendants(skeleton, hips)
     told = [
-        r if j in inside and not _NO_BODY.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
-        for j, r in enumerate(roles(skeleton))
+        r if j in inside and not _HELPER_NAME.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
+        for j, r in enumerate(classify_joints(skeleton))
     ]
     for side in (Side.LEFT, Side.RIGHT):
-        found |= _limb_by_words(told, side)
+        found |= _match_limb_by_words(told, side)
     arms = [found[name] for name in ("leftUpperArm", "rightUpperArm") if name in found]
     trunk = [j for j, r in enumerate(told) if r == Role(Side.MIDDLE, Part.TORSO)]
-    holding = [j for j in trunk if arms and all(arm in _below(skeleton, j) for arm in arms)] or trunk
+    holding = [j for j in trunk if arms and all(arm in _descendants(skeleton, j) for arm in arms)] or trunk
     if holding:
         found["spine"] = holding[0]
     if len(holding) > 1:
@@ -168,7 +168,7 @@ def _by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
     return found
 
 
-def _limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
+def _match_limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
     def named(part: Part) -> list[int]:
         return [joint for joint, role in enumerate(told) if role == Role(side, part)]
 
@@ -197,14 +197,14 @@ def _limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
     return {side.value + part: joints[0] for part, joints in parts.items() if joints}
 
 
-def _sided(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
+def _assign_sides(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
     """Limbs found by the tree alone, put on the side that their joints' names or else their places tell.
 
-    Without names, left is +X: where the rest pose faces elsewhere, the toes tell it (see `with_sides_checked`).
+    Without names, left is +X: where the rest pose faces elsewhere, the toes tell it (see `correct_sides`).
     """
     if not placed:
         return placed
-    places = Poses.zero(skeleton, (None,) * CANONICAL.num_joints).places[0]
+    places = RigPoses.zero(skeleton, (None,) * CANONICAL.num_joints).places[0]
     left = None
     for limb in (("UpperLeg", "LowerLeg", "Foot", "Toes"), ("UpperArm", "LowerArm", "Hand", "Shoulder")):
         votes = 0
@@ -216,13 +216,13 @@ def _sided(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: Skeleton
             left = across * across[across.abs().argmax()].sign()
         if votes < 0 or (votes == 0 and float(across @ left) < 0):
             names = {side + part for side in ("left", "right") for part in limb}
-            placed = {mirrored_name(name) if name in names else name: joint for name, joint in placed.items()}
+            placed = {mirror_name(name) if name in names else name: joint for name, joint in placed.items()}
             across = -across
         left = across
     return placed
 
 
-def _below(skeleton: Skeleton, joint: int) -> set[int]:
+def _descendants(skeleton: Skeleton, joint: int) -> set[int]:
     """The joint and all below it."""
     found = {joint}
     for child, parent in enumerate(skeleton.parents):
@@ -239,17 +239,17 @@ def _unmapped(skeleton: Skeleton, found: Mapping[str, int]) -> tuple[str, ...]:
 def _check_given(rig: Rig, found: Mapping[str, int], skeleton: Skeleton) -> None:
     for canonical in REQUIRED:
         if canonical in rig.joints and canonical not in found:
-            near = nearest(rig.joints[canonical], skeleton.names, roles(skeleton))
+            near = describe_nearest(rig.joints[canonical], skeleton.names, classify_joints(skeleton))
             raise RequestError(f"rig {rig.name}: no joint {rig.joints[canonical]!r} for {canonical}; {near}")
 
 
-def _check(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
+def _check_match(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
     missing = [name for name in REQUIRED if name not in found]
-    if not missing and score >= ACCEPTED:
+    if not missing and score >= MIN_SCORE:
         return
     what = f"no joint for {', '.join(missing)}" if missing else "too few joints are known by name"
-    names, rigs = shorten(skeleton.names), ", ".join(rig.name for rig in known())
+    names, rigs = abbreviate_names(skeleton.names), ", ".join(rig.name for rig in known_rigs())
     raise RequestError(
-        f"cannot tell this rig: {what} (score {score:.2f}, {ACCEPTED} is needed); "
+        f"cannot tell this rig: {what} (score {score:.2f}, {MIN_SCORE} is needed); "
         f"its joints are {names}; known rigs: {rigs}; a TOML file can name its joints"
     )

@@ -13,15 +13,15 @@ from mapctl.skeleton import CANONICAL, Skeleton
 
 SAMPLES = 200
 """Frames of a clip that are looked at, spread over it."""
-_STANDING = 0.8  # cosine between an axis and the body that stands along it
-_CLEAR = 0.3  # of the triple product left x up x toes, below which toes do not tell the facing
+_UPRIGHT_COSINE = 0.8  # cosine between an axis and the body that stands along it
+_MIN_HANDEDNESS = 0.3  # of the triple product left x up x toes, below which toes do not tell the facing
 
 JointOf = Sequence[int | None]
 """For each canonical joint the rig's joint, or None."""
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class RigPoses:
     """Poses of one rig in its file's world: frames of a clip, or the single pose with all rotations zero."""
 
     places: Float[Tensor, "poses joints 3"]
@@ -34,25 +34,25 @@ class Poses:
     """Which joint of the rig each canonical one is."""
 
     @staticmethod
-    def zero(skeleton: Skeleton, joint_of: JointOf) -> "Poses":
+    def zero(skeleton: Skeleton, joint_of: JointOf) -> "RigPoses":
         """All rotations zero."""
         still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
         root = torch.zeros(1, 3, dtype=torch.float64)
-        return Poses(
+        return RigPoses(
             *kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, root, still), skeleton, tuple(joint_of)
         )
 
     @staticmethod
-    def of(motion: Motion, joint_of: JointOf) -> "Poses":
+    def of(motion: Motion, joint_of: JointOf) -> "RigPoses":
         """Up to SAMPLES frames of a clip, the first among them."""
         picked = torch.linspace(0, motion.num_frames - 1, min(SAMPLES, motion.num_frames)).round().long()
-        return Poses(
+        return RigPoses(
             motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton, tuple(joint_of)
         )
 
-    def first(self) -> "Poses":
+    def first(self) -> "RigPoses":
         """The first pose alone."""
-        return Poses(self.places[:1], self.turns[:1], self.skeleton, self.joint_of)
+        return RigPoses(self.places[:1], self.turns[:1], self.skeleton, self.joint_of)
 
     def has(self, *names: str) -> bool:
         """Whether the rig has all these canonical joints."""
@@ -97,9 +97,9 @@ class Poses:
         """
         if not self.has(name):
             return None
-        following = next_of(name)
+        following = next_joint(name)
         while following is not None and not self.has(following):
-            following = next_of(following)
+            following = next_joint(following)
         stop = self.end(name) if following is None else self.place(following)
         return None if stop is None else stop - self.place(name)
 
@@ -109,7 +109,7 @@ class Poses:
         return (torch.linalg.cross(self.left(), up) * toes).sum(-1)
 
 
-def next_of(name: str) -> str | None:
+def next_joint(name: str) -> str | None:
     """The canonical joint that a bone leads to: the knee for the thigh; None for hips and for the ends of limbs."""
     below = {"spine": "chest", "chest": "neck", "neck": "head"}
     if name in ("hips", *below):
@@ -118,28 +118,28 @@ def next_of(name: str) -> str | None:
     return CANONICAL.names[children[0]] if children else None
 
 
-def swapped(zero: Poses, clip: Poses | None) -> bool:
+def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
     """Whether the joints that are called left are on the right, seen by the way that the toes point."""
     rest = float(zero.handedness()[0])
-    if abs(rest) > _CLEAR:
+    if abs(rest) > _MIN_HANDEDNESS:
         return rest < 0
-    return clip is not None and float(clip.handedness().median()) < -_CLEAR
+    return clip is not None and float(clip.handedness().median()) < -_MIN_HANDEDNESS
 
 
-def up_axis(zero: Poses, clip: Poses | None) -> str:
+def find_up_axis(zero: RigPoses, clip: RigPoses | None) -> str:
     """Y or Z, as the body stands in the clip, else in the zero pose; Y where neither tells.
 
     Against the zero pose, and where that tells nothing, only a clip counts in which the body stands along Z all the
     time: people lie down, too.
     """
     rest = zero.up()[0]
-    told = "z" if float(rest[2]) > _STANDING else "y"
+    told = "z" if float(rest[2]) > _UPRIGHT_COSINE else "y"
     if clip is None:
         return told
     tall = clip.up()
     if told == "y":
-        return "z" if float(tall[:, 2].min()) > 0.5 and float(tall[:, 2].mean()) > _STANDING else "y"
-    return "y" if float(tall[:, 1].min()) > 0.5 and float(tall[:, 1].mean()) > _STANDING else "z"
+        return "z" if float(tall[:, 2].min()) > 0.5 and float(tall[:, 2].mean()) > _UPRIGHT_COSINE else "y"
+    return "y" if float(tall[:, 1].min()) > 0.5 and float(tall[:, 1].mean()) > _UPRIGHT_COSINE else "z"
 
 
 def _unit(vectors: Tensor) -> Tensor:

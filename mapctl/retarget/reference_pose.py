@@ -12,18 +12,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.retarget.pose_axes import Poses, up_axis
+from mapctl.retarget.pose_axes import RigPoses, find_up_axis
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 
 _LIMBS = ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg")
 _SNAP = math.radians(20)  # a rest pose this near an axis stands and faces along it
-_OFF = math.radians(40)  # trunk and shoulders keep their own shape up to here
+_TRUNK_TOLERANCE = math.radians(40)  # trunk and shoulders keep their own shape up to here
 _LEVEL, _HANGING = math.radians(25), math.radians(100)  # of arms: T-pose up to the first, A-pose up to the second
-_STRAIGHT = math.radians(35)  # of legs in a rest pose that somebody stands in
-_EXACT = math.radians(15)  # of arms and legs in a frame that is a T-pose and not a moment of a dance
-_BENT, _TWISTED = 0.2, math.radians(60)  # mean bend (radians) that tells a hinge, and the twist that is put right
-_QUARTER = math.pi / 2  # rigs are built in quarter turns
+_LEG_TOLERANCE = math.radians(35)  # of legs in a rest pose that somebody stands in
+_EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose and not a moment of a dance
+_MIN_HINGE_BEND, _MIN_TWIST = (
+    0.2,
+    math.radians(60),
+)  # mean bend (radians) that tells a hinge, and the twist that is put right
+_QUARTER_TURN = math.pi / 2  # rigs are built in quarter turns
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -47,38 +50,42 @@ class TPose:
     """Where the T-pose comes from: table, rest pose, or frame 0."""
 
 
-def find(zero: Poses, clip: Poses | None, *, rig: Rig) -> TPose:
+def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig) -> TPose:
     """The T-pose of a rig that no table tells; what the rig sets is not looked for."""
-    up = up_axis(zero, clip) if rig.up == "auto" else rig.up
-    upright = upright_of(up)
-    base, found, facing = zero, "rest pose", None if rig.facing == "auto" else vector(rig.facing)
-    front = _front(zero, facing)
-    rest = kind(zero, front)
+    up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
+    upright = upright_rotation(up)
+    base, found, facing = zero, "rest pose", None if rig.facing == "auto" else axis_vector(rig.facing)
+    front = _facing_rotation(zero, facing)
+    rest = classify_reference_pose(zero, front)
     if clip is not None and rig.rest in ("auto", "frame0"):
         first = clip.first()
-        turned = _standing(first, vector(up))
+        turned = _first_frame_rotation(first, axis_vector(up))
         if rig.rest == "frame0" or (rest == "neither" and is_tpose(first, turned)):
             base, front, found = first, turned, "frame 0"
-    stands = kind(base, front) != "neither"
+    stands = classify_reference_pose(base, front) != "neither"
     if clip is None or stands:
-        quats = _laid(base, front, stands, pitch=None, twists={})
+        quats = _lay_out_tpose(base, front, stands, pitch=None, twists={})
     else:
-        quats = _untwisted(base, front, clip, upright)
-    return TPose(quats, _idle(base), upright, up, named_axis(_front(zero, facing)[2]), rest, found)
+        quats = _untwist_tpose(base, front, clip, upright)
+    return TPose(
+        quats, _local_rotations(base), upright, up, nearest_axis_name(_facing_rotation(zero, facing)[2]), rest, found
+    )
 
 
-def kind(poses: Poses, front: Float[Tensor, "3 3"]) -> str:
+def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str:
     """Whether the first pose is a T-pose, an A-pose (arms anywhere between level and hanging), or neither.
 
     `front` turns it to stand upright and face +Z.
     """
     arms = [
-        (_way(poses, side + part, front), sign)
+        (_bone_direction(poses, side + part, front), sign)
         for side, sign in (("left", 1.0), ("right", -1.0))
         for part in ("UpperArm", "LowerArm")
     ]
-    legs = [_way(poses, side + part, front) for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")]
-    if any(float(-leg[1]) < math.cos(_STRAIGHT) for leg in legs):
+    legs = [
+        _bone_direction(poses, side + part, front) for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")
+    ]
+    if any(float(-leg[1]) < math.cos(_LEG_TOLERANCE) for leg in legs):
         return "neither"
     arms = [(arm, sign) for arm, sign in arms if float(arm.norm()) > 0]
     lowered = [math.atan2(-float(arm[1]), max(sign * float(arm[0]), -0.2)) for arm, sign in arms]
@@ -87,32 +94,32 @@ def kind(poses: Poses, front: Float[Tensor, "3 3"]) -> str:
     return "T" if max(lowered) < _LEVEL else "A"
 
 
-def upright_of(up: str) -> Float[Tensor, "4"] | None:
+def upright_rotation(up: str) -> Float[Tensor, "4"] | None:
     """The rotation that turns a world so that Y is up; None where it is."""
-    return None if up == "y" else _turn(_shortest(vector(up), vector("y")))
+    return None if up == "y" else _matrix_to_quat(_shortest_rotation(axis_vector(up), axis_vector("y")))
 
 
-def is_tpose(poses: Poses, front: Float[Tensor, "3 3"]) -> bool:
+def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
     """Whether the first pose is a T-pose as captures begin with: everything straight, arms level, legs vertical."""
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        for part, aim in (("Arm", vector("x") * sign), ("Leg", -vector("y"))):
-            ways = [_way(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
-            if any(float(way @ aim) < math.cos(_EXACT) for way in ways):
+        for part, aim in (("Arm", axis_vector("x") * sign), ("Leg", -axis_vector("y"))):
+            ways = [_bone_direction(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
+            if any(float(way @ aim) < math.cos(_EXACT_TPOSE_ANGLE) for way in ways):
                 return False
     return True
 
 
-def vector(axis: str) -> Float[Tensor, "3"]:
+def axis_vector(axis: str) -> Float[Tensor, "3"]:
     """`-z` as a vector."""
     return torch.tensor(_VECTORS[axis[-1]], dtype=torch.float64) * (-1 if axis.startswith("-") else 1)
 
 
-def rest_facing(zero: Poses) -> str:
+def find_rest_facing(zero: RigPoses) -> str:
     """The axis that the pose with all rotations zero faces; `unknown` if it is along none."""
-    return named_axis(_front(zero, None)[2])
+    return nearest_axis_name(_facing_rotation(zero, None)[2])
 
 
-def named_axis(direction: Float[Tensor, "3"]) -> str:
+def nearest_axis_name(direction: Float[Tensor, "3"]) -> str:
     """The axis that a unit vector points along; `unknown` if it is none."""
     largest = int(direction.abs().argmax())
     if float(direction[largest].abs()) < math.cos(_SNAP):
@@ -120,36 +127,36 @@ def named_axis(direction: Float[Tensor, "3"]) -> str:
     return ("-" if float(direction[largest]) < 0 else "") + "xyz"[largest]
 
 
-def _front(zero: Poses, facing: Tensor | None) -> Float[Tensor, "3 3"]:
+def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 3"]:
     """Turns the zero pose upright and toward +Z; its rows are where left, up and forward were."""
-    up, left = _snapped(zero.up()[0]), zero.left()[0]
+    up, left = _snap_to_axis(zero.up()[0]), zero.left()[0]
     if facing is not None and float(facing @ up) < 0.5:
         left = torch.linalg.cross(up, facing)
-    return _frame(_snapped(left), up)
+    return _body_frame(_snap_to_axis(left), up)
 
 
-def _standing(first: Poses, up: Tensor) -> Float[Tensor, "3 3"]:
+def _first_frame_rotation(first: RigPoses, up: Tensor) -> Float[Tensor, "3 3"]:
     """Turns a frame of a clip toward +Z; it stands as upright as its performer did."""
-    return _frame(first.left()[0], up)
+    return _body_frame(first.left()[0], up)
 
 
-def _frame(left: Tensor, up: Tensor) -> Float[Tensor, "3 3"]:
+def _body_frame(left: Tensor, up: Tensor) -> Float[Tensor, "3 3"]:
     left = torch.nn.functional.normalize(left - up * (left @ up), dim=0)
     return torch.stack([left, up, torch.linalg.cross(left, up)])
 
 
-def _snapped(direction: Tensor) -> Tensor:
-    axis = named_axis(direction)
-    return direction if axis == "unknown" else vector(axis)
+def _snap_to_axis(direction: Tensor) -> Tensor:
+    axis = nearest_axis_name(direction)
+    return direction if axis == "unknown" else axis_vector(axis)
 
 
-def _way(poses: Poses, name: str, front: Tensor) -> Float[Tensor, "3"]:
+def _bone_direction(poses: RigPoses, name: str, front: Tensor) -> Float[Tensor, "3"]:
     way = poses.way(name)
     return torch.zeros(3, dtype=torch.float64) if way is None else _unit(front @ way[0])
 
 
-def _laid(
-    base: Poses, front: Tensor, stands: bool, *, pitch: float | None, twists: dict[str, float]
+def _lay_out_tpose(
+    base: RigPoses, front: Tensor, stands: bool, *, pitch: float | None, twists: dict[str, float]
 ) -> Float[Tensor, "joints 4"]:
     """World rotation of each canonical joint's rig joint, once the base pose has been laid out as a T-pose."""
     turns: list[Tensor] = []
@@ -157,37 +164,43 @@ def _laid(
         part = name.removeprefix("left").removeprefix("right")
         above = turns[CANONICAL.parents[index]] if index else front
         if part in ("Foot", "Toes"):
-            turns.append(front if stands else _foot(base, name, above, pitch))
+            turns.append(front if stands else _lay_out_foot(base, name, above, pitch))
             continue
-        way, aim = _way(base, name, above), _aim(index)
+        way, aim = _bone_direction(base, name, above), _canonical_direction(index)
         limb = part in _LIMBS
         apart = float(torch.arccos((way @ aim).clamp(-1, 1)))
-        if aim.norm() > 0 and way.norm() > 0 and base.has(name) and (limb or apart > _OFF) and part != "Hand":
-            above = _shortest(way, aim) @ above
+        if (
+            aim.norm() > 0
+            and way.norm() > 0
+            and base.has(name)
+            and (limb or apart > _TRUNK_TOLERANCE)
+            and part != "Hand"
+        ):
+            above = _shortest_rotation(way, aim) @ above
         if name in twists:
             above = rotations.rotation_vector_to_matrix(aim * twists[name]) @ above
         turns.append(above)
-    still = [_turn(turn) for turn in turns]
+    still = [_matrix_to_quat(turn) for turn in turns]
     joints = [
         base.turns[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1]) for joint in base.joint_of
     ]
     return torch.stack([rotations.multiply(turn, own) for turn, own in zip(still, joints, strict=True)])
 
 
-def _foot(base: Poses, name: str, above: Tensor, pitch: float | None) -> Tensor:
+def _lay_out_foot(base: RigPoses, name: str, above: Tensor, pitch: float | None) -> Tensor:
     """A foot put flat on the floor, or toes laid level, where the base pose does not stand."""
     way = base.way(name)
     if name.endswith("Toes") and way is None:
         way = base.way(name.replace("Toes", "Foot"))
     if way is None:
         return above
-    slope = _canonical_pitch() if pitch is None else pitch
+    slope = _canonical_foot_pitch() if pitch is None else pitch
     slope = 0.0 if name.endswith("Toes") else slope
     aim = torch.tensor([0.0, -math.sin(slope), math.cos(slope)], dtype=torch.float64)
-    return _shortest(_unit(above @ way[0]), aim) @ above
+    return _shortest_rotation(_unit(above @ way[0]), aim) @ above
 
 
-def _aim(index: int) -> Float[Tensor, "3"]:
+def _canonical_direction(index: int) -> Float[Tensor, "3"]:
     """Direction of the bone that begins at a canonical joint; zero for hips and for the ends of limbs."""
     name = CANONICAL.names[index]
     if name == "hips" or not CANONICAL.children(index):
@@ -195,17 +208,17 @@ def _aim(index: int) -> Float[Tensor, "3"]:
     return _unit(CANONICAL.offsets[CANONICAL.children(index)[0]])
 
 
-def _canonical_pitch() -> float:
+def _canonical_foot_pitch() -> float:
     _, y, z = CANONICAL.offsets[CANONICAL.index("leftToes")].tolist()
     return math.atan2(-y, z)
 
 
-def _pitch(clip: Poses | None, upright: Tensor | None) -> float | None:
+def _estimate_foot_pitch(clip: RigPoses | None, upright: Tensor | None) -> float | None:
     """How far the foot's bone points below level while it stands flat, radians: by how much lower than the ankle the
     toe comes over the clip."""
     if clip is None or not clip.has("leftToes", "rightToes", "leftFoot", "rightFoot") or len(clip.places) < 10:
         return None
-    up = vector("y") if upright is None else rotations.rotate(rotations.inverse(upright), vector("y"))
+    up = axis_vector("y") if upright is None else rotations.rotate(rotations.inverse(upright), axis_vector("y"))
     found = []
     for side in ("left", "right"):
         ankle, toes = clip.place(side + "Foot"), clip.place(side + "Toes")
@@ -218,13 +231,13 @@ def _pitch(clip: Poses | None, upright: Tensor | None) -> float | None:
     return slope if 0 < slope < math.radians(70) else None
 
 
-def _untwisted(base: Poses, front: Tensor, clip: Poses, upright: Tensor | None) -> Float[Tensor, "joints 4"]:
+def _untwist_tpose(base: RigPoses, front: Tensor, clip: RigPoses, upright: Tensor | None) -> Float[Tensor, "joints 4"]:
     """The T-pose of a rig whose zero pose is none: bones tell all but how joints are turned about them.
 
     Over a clip the trunk's joints are hardly twisted, knees bend backward and elbows forward: what contradicts that is
     put right, from the hips outward.
     """
-    pitch, twists = _pitch(clip, upright), {}
+    pitch, twists = _estimate_foot_pitch(clip, upright), {}
     for name in (
         "spine",
         "chest",
@@ -232,46 +245,46 @@ def _untwisted(base: Poses, front: Tensor, clip: Poses, upright: Tensor | None) 
         "head",
         *(side + part for side in ("left", "right") for part in ("Shoulder", "UpperArm", "UpperLeg")),
     ):
-        quats = _laid(base, front, stands=False, pitch=pitch, twists=twists)
+        quats = _lay_out_tpose(base, front, stands=False, pitch=pitch, twists=twists)
         if clip.has(name):
             hinged = name.endswith(("Arm", "Leg"))
             angle = _hinge_error(clip, name, quats, upright) if hinged else None
             angle = _mean_twist(clip, name, quats, upright) if angle is None else angle
-            if abs(angle) > _TWISTED:
-                twists[name] = _QUARTER * round(angle / _QUARTER)
-    return _laid(base, front, stands=False, pitch=pitch, twists=twists)
+            if abs(angle) > _MIN_TWIST:
+                twists[name] = _QUARTER_TURN * round(angle / _QUARTER_TURN)
+    return _lay_out_tpose(base, front, stands=False, pitch=pitch, twists=twists)
 
 
-def _mean_twist(clip: Poses, name: str, quats: Tensor, upright: Tensor | None) -> float:
+def _mean_twist(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> float:
     """The turn about a joint's bone, radians, that takes away its mean twist against the joint above."""
     index = CANONICAL.index(name)
     above = CANONICAL.parents[index]
     while above > 0 and clip.joint_of[above] is None:
         above = CANONICAL.parents[above]
-    turns = _canonical_turns(clip, CANONICAL.names[above], quats, upright)
-    local = rotations.multiply(rotations.inverse(turns), _canonical_turns(clip, name, quats, upright))
-    bone = _aim(index)
-    bone = vector("y") if bone.norm() == 0 else bone
+    turns = _canonical_rotations(clip, CANONICAL.names[above], quats, upright)
+    local = rotations.multiply(rotations.inverse(turns), _canonical_rotations(clip, name, quats, upright))
+    bone = _canonical_direction(index)
+    bone = axis_vector("y") if bone.norm() == 0 else bone
     twist = 2 * torch.atan2(local[:, :3] @ bone, local[:, 3])
     return float(torch.atan2(torch.sin(twist).mean(), torch.cos(twist).mean()))
 
 
-def _hinge_error(clip: Poses, name: str, quats: Tensor, upright: Tensor | None) -> float | None:
+def _hinge_error(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> float | None:
     """The turn about an upper limb's bone, radians, by which the joint below it bends as people's do; None if it hardly
     bends."""
     below = name.replace("Upper", "Lower")
     left = 1.0 if name.startswith("left") else -1.0
-    wanted = vector("x") if name.endswith("Leg") else -left * vector("y")
-    upper, lower = (_canonical_turns(clip, joint, quats, upright) for joint in (name, below))
+    wanted = axis_vector("x") if name.endswith("Leg") else -left * axis_vector("y")
+    upper, lower = (_canonical_rotations(clip, joint, quats, upright) for joint in (name, below))
     bend = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(upper), lower)).mean(0)
-    bone = _aim(CANONICAL.index(name))
+    bone = _canonical_direction(CANONICAL.index(name))
     bend = bend - bone * (bend @ bone)
-    if float(bend.norm()) < _BENT:
+    if float(bend.norm()) < _MIN_HINGE_BEND:
         return None
     return float(torch.atan2(torch.linalg.cross(bend, wanted) @ bone, bend @ wanted))
 
 
-def _canonical_turns(clip: Poses, name: str, quats: Tensor, upright: Tensor | None) -> Float[Tensor, "poses 4"]:
+def _canonical_rotations(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> Float[Tensor, "poses 4"]:
     """World rotations of a canonical joint over a clip."""
     index, frames = CANONICAL.index(name), len(clip.turns)
     joint = clip.joint_of[index]
@@ -280,7 +293,7 @@ def _canonical_turns(clip: Poses, name: str, quats: Tensor, upright: Tensor | No
     return turns if upright is None else rotations.multiply(upright.expand(frames, 4), turns)
 
 
-def _idle(base: Poses) -> Float[Tensor, "rigged 4"]:
+def _local_rotations(base: RigPoses) -> Float[Tensor, "rigged 4"]:
     """Local rotations of the base pose."""
     parents, turns = base.skeleton.parents, base.turns[0]
     return torch.stack(
@@ -291,7 +304,7 @@ def _idle(base: Poses) -> Float[Tensor, "rigged 4"]:
     )
 
 
-def _shortest(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def _shortest_rotation(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The smallest rotation from one unit vector to another; of opposite ones, the half turn about +Z if it is one.
 
     Rigs whose bones all lie along one local axis keep their other axes so: a thigh that points up is turned down
@@ -299,15 +312,15 @@ def _shortest(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tens
     """
     axis, cosine = torch.linalg.cross(start, stop), start @ stop
     if cosine < 0 and axis.norm() < 0.1:
-        across = vector("z") if float(start[2].abs()) < 0.7 else vector("y")
+        across = axis_vector("z") if float(start[2].abs()) < 0.7 else axis_vector("y")
         half = torch.nn.functional.normalize(across - start * (across @ start), dim=0)
         over = rotations.rotation_vector_to_matrix(half * math.pi)
-        return _shortest(over @ start, stop) @ over
+        return _shortest_rotation(over @ start, stop) @ over
     sine = axis.norm().clamp_min(1e-12)
     return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
 
 
-def _turn(matrix: Tensor) -> Float[Tensor, "4"]:
+def _matrix_to_quat(matrix: Tensor) -> Float[Tensor, "4"]:
     return rotations.from_matrix(matrix)
 
 

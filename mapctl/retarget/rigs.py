@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.joint_names import nearest
+from mapctl.joint_names import describe_nearest
 from mapctl.skeleton import CANONICAL, Skeleton
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -56,7 +56,7 @@ class Rig:
                 raise RequestError(f"rig {self.name}: {key} is one of auto, {', '.join(allowed)}, got {value!r}")
         strange = [name for name in (*self.joints, *self.tpose, *self.straighten) if name not in CANONICAL.names]
         if strange:
-            near = nearest(strange[0], CANONICAL.names)
+            near = describe_nearest(strange[0], CANONICAL.names)
             raise RequestError(f"rig {self.name}: no canonical joint {strange[0]!r}; {near}")
 
     @property
@@ -70,7 +70,7 @@ class Rig:
 
 
 @cache
-def known() -> tuple[Rig, ...]:
+def known_rigs() -> tuple[Rig, ...]:
     """Every rig in this folder, the canonical one first."""
     canonical = Rig(
         "canonical",
@@ -82,7 +82,7 @@ def known() -> tuple[Rig, ...]:
         (p for p in files("mapctl.retarget").joinpath("presets").iterdir() if p.name.endswith(".toml")),
         key=lambda p: p.name,
     )
-    return canonical, *(_rig(tomllib.loads(path.read_text("utf-8"))) for path in paths)
+    return canonical, *(_rig_from_table(tomllib.loads(path.read_text("utf-8"))) for path in paths)
 
 
 def recognise(skeleton: Skeleton) -> Rig:
@@ -92,15 +92,15 @@ def recognise(skeleton: Skeleton) -> Rig:
     return match(skeleton).rig
 
 
-def read(name_or_path: str | PathLike[str]) -> Rig:
+def load_rig(name_or_path: str | PathLike[str]) -> Rig:
     """A preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
     text, path = str(name_or_path), Path(name_or_path)
-    for rig in known():
+    for rig in known_rigs():
         if rig.name == text.lower():
             return rig
     if path.suffix.lower() == ".toml":
         return _read_toml(path)
-    names = ", ".join(rig.name for rig in known())
+    names = ", ".join(rig.name for rig in known_rigs())
     if not path.suffix:
         raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
     from mapctl import formats, retarget
@@ -116,21 +116,21 @@ def _read_toml(path: Path) -> Rig:
     from mapctl.formats.text import read_bytes
 
     try:
-        return _rig({"name": path.stem, **tomllib.loads(read_bytes(path).decode("utf-8"))})
+        return _rig_from_table({"name": path.stem, **tomllib.loads(read_bytes(path).decode("utf-8"))})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FileFormatError(path, f"is no TOML: {error}") from None
     except RequestError as error:
         raise FileFormatError(path, str(error)) from None
 
 
-def _rig(table: Mapping[str, Any]) -> Rig:
+def _rig_from_table(table: Mapping[str, Any]) -> Rig:
     strange = sorted(table.keys() - _KEYS)
     if strange:
         raise RequestError(f"a rig has no {strange[0]!r}; it may have {', '.join(sorted(_KEYS))}")
     joints = table.get("joints", {})
     if not isinstance(joints, dict):
         raise RequestError("a rig's joints are a table of canonical names and the rig's own")
-    names = {canonical: _names(canonical, own) for canonical, own in joints.items()}
+    names = {canonical: _parse_names(canonical, own) for canonical, own in joints.items()}
     return Rig(
         table["name"],
         {canonical: own[0] for canonical, own in names.items()},
@@ -143,18 +143,18 @@ def _rig(table: Mapping[str, Any]) -> Rig:
         table.get("up", "auto"),
         table.get("facing", "auto"),
         table.get("rest", "auto"),
-        _unit(table.get("unit")),
+        _parse_unit(table.get("unit")),
     )
 
 
-def _names(canonical: str, own: Any) -> tuple[str, ...]:
+def _parse_names(canonical: str, own: Any) -> tuple[str, ...]:
     names = (own,) if isinstance(own, str) else tuple(own) if isinstance(own, list) else ()
     if not names or not all(isinstance(name, str) for name in names):
         raise RequestError(f"{canonical} is the rig's name for it, or a list of names, got {own!r}")
     return names
 
 
-def _unit(unit: Any) -> float | None:
+def _parse_unit(unit: Any) -> float | None:
     metres = UNITS.get(unit) if isinstance(unit, str) else unit
     if unit in (None, "auto"):
         return None

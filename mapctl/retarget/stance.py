@@ -17,13 +17,16 @@ from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
 
 SIDES = ("left", "right")
-_PLAUSIBLE = 0.15  # of the leg: toes that rest further from 0 do not stand on a floor at 0
-_APART = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
-_FLAT = 0.01  # metres over its lowest that the ankle of a flat foot is
-_LOWEST = 0.05  # quantile that is an ankle's lowest
-_SUNK = 0.03  # metres that toes go through the floor at most, of which a clip is believed
-_LONG = 0.25  # seconds of a flat foot that tell how it is turned
-_DOWN, _UP = math.radians(-12), math.radians(35)  # tilts that are the T-pose's; a foot further down is on tip-toe
+_MAX_FLOOR_OFFSET = 0.15  # of the leg: toes that rest further from 0 do not stand on a floor at 0
+_MAX_TOE_DIFFERENCE = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
+_FLAT_ANKLE_METRES = 0.01  # metres over its lowest that the ankle of a flat foot is
+_LOWEST_QUANTILE = 0.05  # quantile that is an ankle's lowest
+_MAX_TOE_DEPTH = 0.03  # metres that toes go through the floor at most, of which a clip is believed
+_MIN_FLAT_SECONDS = 0.25  # seconds of a flat foot that tell how it is turned
+_MIN_TILT, _MAX_TILT = (
+    math.radians(-12),
+    math.radians(35),
+)  # tilts that are the T-pose's; a foot further down is on tip-toe
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,35 +58,35 @@ class Stance:
         points down against the T-pose is more likely on tip-toe, and is believed for a little only.
         """
         rest = Stance.at_rest(rigmap.skeleton)
-        toes = clip.joint_positions()[:, _joints("Toes")]
-        seen, leg = contacts.floor_heights(toes), leg_length(rigmap.skeleton)
-        if float((seen[0] - seen[1]).abs()) > _APART * leg:
+        toes = clip.joint_positions()[:, _side_joints("Toes")]
+        seen, leg = contacts.estimate_floor_heights(toes), leg_length(rigmap.skeleton)
+        if float((seen[0] - seen[1]).abs()) > _MAX_TOE_DIFFERENCE * leg:
             seen = seen.min().expand(2)
-        flat = _flat(clip, contacts.planted(toes, clip.fps))
-        tilt = _tilt(clip, flat)
+        flat = _detect_flat_feet(clip, contacts.detect_contacts(toes, clip.fps))
+        tilt = _estimate_tilt(clip, flat)
         laid = torch.stack([toes[flat[:, k], k, 1].median() if flat[:, k].any() else seen[k] for k in range(2)])
-        laid = laid.clamp(seen, seen + _SUNK)
-        if float(seen.abs().max()) > _PLAUSIBLE * leg:
+        laid = laid.clamp(seen, seen + _MAX_TOE_DEPTH)
+        if float(seen.abs().max()) > _MAX_FLOOR_OFFSET * leg:
             floor = float((seen - rest.toe_height).mean())
             return Stance(rest.toe_height, rest.toe_height + laid - seen, tilt, floor)
         return Stance(seen, laid, tilt)
 
     def leveled(self, motion: Motion) -> Motion:
         """The same movement of bones whose T-pose has its feet flat: no joint moves, joint frames of feet turn."""
-        return _turned_feet(motion, rotations.from_rotation_vector(_about_x(-self.tilt)))
+        return _rotate_foot_frames(motion, rotations.from_rotation_vector(_about_x(-self.tilt)))
 
-    def unleveled(self, motion: Motion) -> Motion:
+    def restore_foot_tilt(self, motion: Motion) -> Motion:
         """What `leveled` does, undone."""
-        return _turned_feet(motion, rotations.from_rotation_vector(_about_x(self.tilt)))
+        return _rotate_foot_frames(motion, rotations.from_rotation_vector(_about_x(self.tilt)))
 
     def leveled_map(self, rigmap: RigMap) -> RigMap:
         """The way between the rig and canonical joints whose T-pose has its feet flat."""
-        turns = _by_joint(rotations.from_rotation_vector(_about_x(-self.tilt)))
+        turns = _expand_to_joints(rotations.from_rotation_vector(_about_x(-self.tilt)))
         tpose = rotations.multiply(turns, rigmap.tpose_quat_xyzw)
-        return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_turned_bones(rigmap.skeleton, turns))
+        return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_rotate_bones(rigmap.skeleton, turns))
 
 
-def _joints(part: str) -> list[int]:
+def _side_joints(part: str) -> list[int]:
     return [CANONICAL.index(side + part) for side in SIDES]
 
 
@@ -91,14 +94,14 @@ def _about_x(angle: Float[Tensor, "2 2"]) -> Float[Tensor, "2 2 3"]:
     return torch.stack([angle, torch.zeros_like(angle), torch.zeros_like(angle)], dim=-1)
 
 
-def _by_joint(turns: Float[Tensor, "2 2 4"]) -> Float[Tensor, "joints 4"]:
+def _expand_to_joints(turns: Float[Tensor, "2 2 4"]) -> Float[Tensor, "joints 4"]:
     """Turns of feet and toes among those of all joints, which have none."""
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(CANONICAL.num_joints, 1)
-    still[_joints("Foot")], still[_joints("Toes")] = turns[:, 0], turns[:, 1]
+    still[_side_joints("Foot")], still[_side_joints("Toes")] = turns[:, 0], turns[:, 1]
     return still
 
 
-def _turned_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skeleton:
+def _rotate_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skeleton:
     """The bones that begin at each joint, turned."""
     parents = list(skeleton.parents)
     offsets = skeleton.offsets.clone()
@@ -110,33 +113,33 @@ def _turned_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skele
     return replace(skeleton, offsets=offsets, end_offsets=ends)
 
 
-def _turned_feet(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion:
+def _rotate_foot_frames(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion:
     """Other joint frames for feet and toes: what is in them turns, and they turn back."""
-    by_joint = _by_joint(turns)
+    by_joint = _expand_to_joints(turns)
     world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint).expand_as(motion.local_quat_xyzw))
-    local = rotations.sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
-    return replace(motion, skeleton=_turned_bones(motion.skeleton, by_joint), local_quat_xyzw=local)
+    local = rotations.make_sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
+    return replace(motion, skeleton=_rotate_bones(motion.skeleton, by_joint), local_quat_xyzw=local)
 
 
-def _flat(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
+def _detect_flat_feet(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
     """Where feet lie flat; nowhere for a side that hardly ever does."""
-    ankles = clip.joint_positions()[:, _joints("Foot"), 1]
+    ankles = clip.joint_positions()[:, _side_joints("Foot"), 1]
     flat = torch.zeros_like(planted)
     for k in range(2):
         if bool(planted[:, k].any()):
-            lowest = torch.quantile(ankles[planted[:, k], k], _LOWEST)
-            flat[:, k] = planted[:, k] & (ankles[:, k] < lowest + _FLAT)
-    return flat & (flat.sum(0) >= max(3.0, _LONG * float(clip.fps)))
+            lowest = torch.quantile(ankles[planted[:, k], k], _LOWEST_QUANTILE)
+            flat[:, k] = planted[:, k] & (ankles[:, k] < lowest + _FLAT_ANKLE_METRES)
+    return flat & (flat.sum(0) >= max(3.0, _MIN_FLAT_SECONDS * float(clip.fps)))
 
 
-def _tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor, "2 2"]:
+def _estimate_tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor, "2 2"]:
     """Of foot and toes by side, median over the frames in which the foot is flat; of a side that has none, the other's;
     0 where it is too much to be true."""
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    turns = clip.joint_rotations()[:, [*_joints("Foot"), *_joints("Toes")]].reshape(-1, 2, 2, 4)
+    turns = clip.joint_rotations()[:, [*_side_joints("Foot"), *_side_joints("Toes")]].reshape(-1, 2, 2, 4)
     up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))
     found = [up[flat[:, k], :, k].median(dim=0).values for k in range(2) if flat[:, k].any()]
     if not found:
         return torch.zeros(2, 2, dtype=torch.float64)
     tilt = torch.stack(found if len(found) == 2 else found * 2)
-    return torch.where((tilt > _DOWN) & (tilt < _UP), tilt, 0.0)
+    return torch.where((tilt > _MIN_TILT) & (tilt < _MAX_TILT), tilt, 0.0)

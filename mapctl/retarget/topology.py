@@ -7,31 +7,31 @@ import torch
 
 from mapctl.skeleton import Skeleton
 
-_ALIKE = 1.2  # ratio of the lengths of two bones of one pair
-_SHARE = 0.25  # of the reach of the joint that they hang from, below which two branches are no limbs
+_MAX_LENGTH_RATIO = 1.2  # ratio of the lengths of two bones of one pair
+_MIN_REACH_SHARE = 0.25  # of the reach of the joint that they hang from, below which two branches are no limbs
 
-Ways = tuple[list[int], list[int]]
+LimbPair = tuple[list[int], list[int]]
 """The joints of the two limbs of a pair, side by side, from the body outward."""
 
 
-def find(skeleton: Skeleton) -> Mapping[str, int]:
+def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
     """Canonical joint name to the rig's joint, as far as the tree tells; empty where it is no human body's.
 
     Which limb of a pair is the left one is not told: sides are to be checked by what else is known.
     """
-    tree = _Tree(skeleton)
+    tree = _JointTree(skeleton)
     for hips in range(skeleton.num_joints):
-        for legs in tree.pairs(hips):
+        for legs in tree.find_limb_pairs(hips):
             others = [child for child in tree.children[hips] if child not in (legs[0][0], legs[1][0])]
             for trunk in sorted(others, key=lambda child: -tree.reach[child]):
                 for chest in tree.below(trunk):
-                    arms = tree.pairs(chest)
+                    arms = tree.find_limb_pairs(chest)
                     if arms:
-                        return _body(tree, hips, legs, chest, arms[0])
+                        return _name_body_joints(tree, hips, legs, chest, arms[0])
     return {}
 
 
-def _body(tree: "_Tree", hips: int, legs: Ways, chest: int, arms: Ways) -> Mapping[str, int]:
+def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> Mapping[str, int]:
     found = {"hips": hips}
     for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
         found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
@@ -48,7 +48,7 @@ def _body(tree: "_Tree", hips: int, legs: Ways, chest: int, arms: Ways) -> Mappi
     return found
 
 
-class _Tree:
+class _JointTree:
     """Bone lengths and reaches."""
 
     def __init__(self, skeleton: Skeleton):
@@ -61,33 +61,33 @@ class _Tree:
             below = [self.length[child] + self.reach[child] for child in self.children[joint]]
             self.reach[joint] = max([ends.get(joint, 0.0), *below])
 
-    def pairs(self, joint: int) -> list[Ways]:
+    def find_limb_pairs(self, joint: int) -> list[LimbPair]:
         """Branches that are two limbs of one pair, bone for bone of about the same length; the longest pair first."""
         found = []
         for k, first in enumerate(self.children[joint]):
             for second in self.children[joint][k + 1 :]:
-                ways = self.side_by_side(first, second)
+                ways = self.trace_limb_pair(first, second)
                 long = sum(self.length[joint] for joint in ways[0][1:])
-                if len(ways[0]) >= 3 and long >= _SHARE * self.reach[joint] and self.alike(first, second):
+                if len(ways[0]) >= 3 and long >= _MIN_REACH_SHARE * self.reach[joint] and self.are_alike(first, second):
                     found.append((-long, ways))
         return [ways for _, ways in sorted(found)]
 
-    def side_by_side(self, first: int, second: int) -> Ways:
+    def trace_limb_pair(self, first: int, second: int) -> LimbPair:
         """Down two branches as long as they are alike; a sword in one hand is not."""
         ways = [first], [second]
         while True:
             ends = product(self.children[ways[0][-1]], self.children[ways[1][-1]])
-            steps = [step for step in ends if self.alike(*step)]
+            steps = [step for step in ends if self.are_alike(*step)]
             if not steps:
                 return ways
             best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
             for way, joint in zip(ways, best, strict=True):
                 way.append(joint)
 
-    def alike(self, first: int, second: int) -> bool:
+    def are_alike(self, first: int, second: int) -> bool:
         """Whether two bones are of about the same length."""
         short, long = sorted((self.length[first], self.length[second]))
-        return long <= _ALIKE * short + 1e-6
+        return long <= _MAX_LENGTH_RATIO * short + 1e-6
 
     def chain(self, joint: int) -> list[int]:
         """The joints from this one to the farthest leaf."""

@@ -7,7 +7,7 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 
-UNKNOWN = "the rig is not known, and so not which way is up: taken as it is, with Y up"
+UNKNOWN_RIG_NOTE = "the rig is not known, and so not which way is up: taken as it is, with Y up"
 """What is to be said of a motion that cannot be put upright."""
 
 
@@ -17,9 +17,9 @@ def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[s
     Unchanged where Y is up already, or nothing is known.
     """
     try:
-        turn = retarget.map_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw
+        turn = retarget.identify_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw
     except RequestError:
-        return motion, (UNKNOWN,)
+        return motion, (UNKNOWN_RIG_NOTE,)
     if turn is None:
         return motion, ()
     every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()

@@ -13,11 +13,11 @@ from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """What ends work. Those that a process was told to ignore (nohup) are left ignored."""
-ONE_WISH = 1.0
+REPEAT_SECONDS = 1.0
 """Seconds."""
 
 
-def listen() -> list[int]:
+def raise_on_signals() -> list[int]:
     """From here on every one of SIGNALS raises KeyboardInterrupt; the list gets the numbers of those that did.
 
     For a process' main thread.
@@ -29,79 +29,79 @@ def listen() -> list[int]:
         nonlocal until
         if (now := time.monotonic()) < until:
             return
-        until = now + ONE_WISH
+        until = now + REPEAT_SECONDS
         received.append(number)
         raise KeyboardInterrupt
 
-    for number in _heeded():
+    for number in _handled_signals():
         signal.signal(number, stop)
     return received
 
 
-class Held:
+class DeferredSignals:
     """Signals that wait until what is under way is whole."""
 
     def __init__(self, before: dict[int, Any]):
         """`before` holds the handlers that they would have gone to."""
         self.wanted: int | None = None
         """The signal that waits."""
-        self._before, self._since = before, 0.0
-        self._passes = self._shut = False
+        self._handlers, self._since = before, 0.0
+        self._lets_through = self._defers_all = False
 
     def release(self) -> None:
         """Let a signal go that waits: KeyboardInterrupt, or whatever it did before it was held."""
         number, self.wanted = self.wanted, None
         if number is None:
             return
-        if not callable(self._before[number]):
+        if not callable(self._handlers[number]):
             raise KeyboardInterrupt
-        self._before[number](number, None)
+        self._handlers[number](number, None)
 
     @contextmanager
-    def passing(self) -> Iterator[None]:
+    def let_through(self) -> Iterator[None]:
         """Within, signals go through at once, as does one that waits already."""
-        self._passes = True
+        self._lets_through = True
         try:
             self.release()
             yield
         finally:
-            self._passes = False
+            self._lets_through = False
 
     @contextmanager
-    def shut(self) -> Iterator[None]:
+    def defer_all(self) -> Iterator[None]:
         """Within, signals wait however often they come: for saving, which is short."""
-        self._shut = True
+        self._defers_all = True
         try:
             yield
         finally:
-            self._shut = False
+            self._defers_all = False
 
     def receive(self, number: int, _: FrameType | None) -> None:
         """The handler. A second wish, more than a second after the first, is not held back."""
         now, again = time.monotonic(), self.wanted is not None
         if not again:
             self.wanted, self._since = number, now
-        if not self._shut and (self._passes or (again and now > self._since + ONE_WISH)):
+        if not self._defers_all and (self._lets_through or (again and now > self._since + REPEAT_SECONDS)):
             self.release()
 
 
 @contextmanager
-def held_back() -> Iterator[Held]:
+def defer_signals() -> Iterator[DeferredSignals]:
     """Hold SIGNALS back within; one that still waits at the end is then let go. In other threads nothing is held."""
     if threading.current_thread() is not threading.main_thread():
-        yield Held({})
+        yield DeferredSignals({})
         return
-    held = Held({number: signal.getsignal(number) for number in _heeded()})
-    for number in held._before:
+    held = DeferredSignals({number: signal.getsignal(number) for number in _handled_signals()})
+    for number in held._handlers:
         signal.signal(number, held.receive)
     try:
         yield held
     finally:
-        for number, handler in held._before.items():
+        for number, handler in held._handlers.items():
             signal.signal(number, handler)
     held.release()
 
 
-def _heeded() -> list[int]:
+def _handled_signals() -> list[int]:
     """Those that are neither ignored nor in the hands of something that is not Python."""
     return [number for number in SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]

@@ -16,7 +16,7 @@ from mapctl.skeleton import Skeleton
 
 
 @dataclass(frozen=True, eq=False)
-class Delivered:
+class FrameChunk:
     """Frames of one step, as plain arrays, so that they pass between processes."""
 
     due: float
@@ -38,7 +38,7 @@ class Delivered:
     spare: float
     """Seconds between delivery and when the first frame had to be there; negative where it came late. Frames that came
     very late are due anew, as soon as they are there."""
-    compute: float
+    compute_seconds: float
     """Seconds of the step."""
     evaluations: int
     """Of energy and gradient in the step."""
@@ -63,7 +63,7 @@ class LiveCharacter(Protocol):
     """Its bones."""
 
     def command(self, command: Command) -> None:
-        """Obey this from now on, and follow no path; as far as it can, which `Delivered.notes` tell."""
+        """Obey this from now on, and follow no path; as far as it can, which `FrameChunk.notes` tell."""
         ...
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
@@ -78,7 +78,7 @@ class LiveCharacter(Protocol):
         """Begin anew where it first stood; also who is no more."""
         ...
 
-    def poll(self) -> list[Delivered]:
+    def poll(self) -> list[FrameChunk]:
         """What was delivered since the last call, oldest first. MapctlError if the character is no more."""
         ...
 

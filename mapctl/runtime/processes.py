@@ -18,13 +18,13 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
     before `target` could look away; so it is born with the signal blocked, which no import undoes.
     """
     process = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
-    with _ctrl_c_waits():
+    with _defer_ctrl_c():
         process.start()
     return process
 
 
 @contextmanager
-def insist_on_ctrl_c() -> Iterator[None]:
+def reraise_ctrl_c() -> Iterator[None]:
     """A Ctrl-C that somebody in here swallows is raised at the end.
 
     Some packages catch everything while they are imported, and Python itself while it collects garbage.
@@ -48,7 +48,7 @@ def insist_on_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def _ctrl_c_waits() -> Iterator[None]:
+def _defer_ctrl_c() -> Iterator[None]:
     """A Ctrl-C that comes now is heard at the end; whoever is started now never hears of one.
 
     The signal's mask is inherited by who is started. It does not keep Python from interrupting the main thread where

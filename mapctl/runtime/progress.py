@@ -9,7 +9,7 @@ Progress = Callable[[int, int], None]
 
 
 @contextmanager
-def bar(label: str, *, quiet: bool = False) -> Iterator[Progress | None]:
+def show_progress(label: str, *, quiet: bool = False) -> Iterator[Progress | None]:
     """A function that moves a bar on standard error; None where there is no terminal, or with `quiet`."""
     if quiet or not sys.stderr.isatty():
         yield None

@@ -114,7 +114,7 @@ def minimise(
         calls += 1
         if callback is not None:
             callback(calls, x.new_tensor([problem.best.energy for problem in problems]))
-    return _result(problems, x)
+    return _collect_result(problems, x)
 
 
 def _evaluate(function: EnergyAndGradient, points: NDArray, like: Tensor) -> tuple[list[float], NDArray[np.float64]]:
@@ -127,7 +127,7 @@ def _evaluate(function: EnergyAndGradient, points: NDArray, like: Tensor) -> tup
     return energy.detach().tolist(), gradient.detach().to("cpu", torch.float64).numpy()
 
 
-def _result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
+def _collect_result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
     count = torch.tensor([[p.evaluations, p.iterations] for p in problems], dtype=torch.int64).reshape(-1, 2)
     points = [p.best.x for p in problems]
     return LbfgsResult(
@@ -142,7 +142,7 @@ def _result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
 
 
 @dataclass(slots=True)
-class _Point:
+class _EvaluatedPoint:
     """An evaluated point of a line search."""
 
     step: float
@@ -172,7 +172,7 @@ class _Problem:
         self.evaluations = self.iterations = 0
         self.start_energy = math.inf
         self.status = LbfgsStatus.OUT_OF_BUDGET  # what it is until the search itself comes to an end
-        self.best = _Point(0.0, start, math.inf, np.full(start.shape, math.inf), 0.0)
+        self.best = _EvaluatedPoint(0.0, start, math.inf, np.full(start.shape, math.inf), 0.0)
         self.running = True
         self._search = self._descend(start)
         self.ask = next(self._search)
@@ -182,7 +182,7 @@ class _Problem:
         if not self.running:
             return
         self.evaluations += 1
-        point = _Point(0.0, self.ask, energy, gradient, 0.0)
+        point = _EvaluatedPoint(0.0, self.ask, energy, gradient, 0.0)
         if energy < self.best.energy and point.finite:
             self.best = point
         try:
@@ -192,9 +192,9 @@ class _Problem:
             self.running, self.status, self.ask = False, stop.value, self.best.x
 
     def _descend(self, start: NDArray) -> Generator[NDArray, tuple[float, Vector], LbfgsStatus]:
-        settings, pairs = self.settings, _Pairs(self.settings.memory)
+        settings, pairs = self.settings, _CurvaturePairs(self.settings.memory)
         energy, gradient = yield start
-        here = _Point(0.0, start, energy, gradient, 0.0)
+        here = _EvaluatedPoint(0.0, start, energy, gradient, 0.0)
         if not here.finite:
             return LbfgsStatus.NOT_FINITE
         self.start_energy = energy
@@ -202,7 +202,7 @@ class _Problem:
         while here.gradient_norm > settings.gradient_tolerance:
             if self.iterations == settings.max_iterations:
                 return LbfgsStatus.OUT_OF_BUDGET
-            direction, first = _direction(here, pairs, length)
+            direction, first = _descent_direction(here, pairs, length)
             found = yield from _line_search(here, direction, first, settings)
             if found is None:
                 if not pairs:
@@ -220,7 +220,7 @@ class _Problem:
         return LbfgsStatus.CONVERGED
 
 
-class _Pairs:
+class _CurvaturePairs:
     """Curvature pairs and the inverse Hessian they stand for."""
 
     def __init__(self, memory: int):
@@ -252,7 +252,7 @@ class _Pairs:
         return result
 
 
-def _direction(here: _Point, pairs: _Pairs, length: float) -> tuple[Vector, float]:
+def _descent_direction(here: _EvaluatedPoint, pairs: _CurvaturePairs, length: float) -> tuple[Vector, float]:
     """A descent direction and the first step along it; without a model, one of the given length."""
     if pairs:
         direction = -pairs.apply(here.gradient)
@@ -263,8 +263,8 @@ def _direction(here: _Point, pairs: _Pairs, length: float) -> tuple[Vector, floa
 
 
 def _line_search(
-    origin: _Point, direction: Vector, first: float, settings: LbfgsSettings
-) -> Generator[NDArray, tuple[float, Vector], _Point | None]:
+    origin: _EvaluatedPoint, direction: Vector, first: float, settings: LbfgsSettings
+) -> Generator[NDArray, tuple[float, Vector], _EvaluatedPoint | None]:
     """A point with enough decrease and enough curvature for a pair (weak Wolfe); None where no trial gains.
 
     `low` is the best step so far that decreases enough, `high` the shortest known to be too long.
@@ -273,15 +273,15 @@ def _line_search(
     slope = float(direction @ origin.gradient)
     # Energies are rounded to the caller's precision: a rise within that says nothing.
     noise = 2.0 * float(np.finfo(origin.x.dtype).eps) * abs(origin.energy)
-    low = base = _Point(0.0, origin.x, origin.energy, origin.gradient, slope)
-    high: _Point | None = None
+    low = base = _EvaluatedPoint(0.0, origin.x, origin.energy, origin.gradient, slope)
+    high: _EvaluatedPoint | None = None
     step = min(first, longest)
     for _ in range(settings.max_trials):
         x = (origin.x + step * direction).astype(origin.x.dtype)
         if np.array_equal(x, low.x):
             break  # the bracket is below the precision of the unknowns
         energy, gradient = yield x
-        trial = _Point(step, x, energy, gradient, float(direction @ gradient))
+        trial = _EvaluatedPoint(step, x, energy, gradient, float(direction @ gradient))
         if not trial.finite or energy > base.energy + settings.armijo * step * slope + noise:
             high = trial
         elif trial.slope >= settings.curvature * slope or step == longest:
@@ -292,7 +292,7 @@ def _line_search(
     return low if low is not base else None
 
 
-def _next_step(low: _Point, high: _Point | None) -> float:
+def _next_step(low: _EvaluatedPoint, high: _EvaluatedPoint | None) -> float:
     """Within the bracket by cubic interpolation, kept off its ends; beyond `low` if none is too long."""
     if high is None:
         return 4.0 * low.step
@@ -302,7 +302,7 @@ def _next_step(low: _Point, high: _Point | None) -> float:
     return low.step + min(max(_cubic_minimum(low, high), 0.1 * width), 0.8 * width)
 
 
-def _cubic_minimum(a: _Point, b: _Point) -> float:
+def _cubic_minimum(a: _EvaluatedPoint, b: _EvaluatedPoint) -> float:
     """Minimum, from a, of the cubic with the energies and slopes of both (Nocedal and Wright, 3.59)."""
     width = b.step - a.step
     bend = a.slope + b.slope - 3.0 * (b.energy - a.energy) / width

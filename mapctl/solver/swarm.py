@@ -68,7 +68,7 @@ class SwarmResult:
     """Best energy so far after every evaluation of the swarm."""
 
 
-def swarm(
+def run_swarm(
     cost: Cost,
     *,
     start: Float[Tensor, " n"],
@@ -85,13 +85,13 @@ def swarm(
     Raises RequestError where the start is no vector or out of bounds, or the cost answers in another shape.
     """
     meter = Meter() if meter is None else meter
-    track = _Track(cost, start, meter)
-    points = _draws(start, spread, bounds, min(settings.particles, meter.remaining), generator)
+    track = _BestTracker(cost, start, meter)
+    points = _sample_points(start, spread, bounds, min(settings.particles, meter.remaining), generator)
     if not len(points):
         return track.result()
     seed = torch.randint(2**32, (8,), generator=generator, device=generator.device).cpu().numpy()
-    limits = None if bounds is None else (_array(bounds[0]), _array(bounds[1]))
-    flight = _Flight(_array(points), settings, limits, np.random.RandomState(seed))
+    limits = None if bounds is None else (_to_numpy(bounds[0]), _to_numpy(bounds[1]))
+    flight = _ParticleSwarm(_to_numpy(points), settings, limits, np.random.RandomState(seed))
     for iteration in range(settings.iterations):
         if iteration:
             flight.move()
@@ -102,7 +102,7 @@ def swarm(
     return track.result()
 
 
-def best_of(
+def run_best_of_samples(
     cost: Cost,
     *,
     start: Float[Tensor, " n"],
@@ -119,14 +119,14 @@ def best_of(
     if count < 1:
         raise RequestError(f"the best of how many? at least 1, got {count}")
     meter = Meter() if meter is None else meter
-    track = _Track(cost, start, meter)
-    points = _draws(start, spread, bounds, min(count, meter.remaining), generator)
+    track = _BestTracker(cost, start, meter)
+    points = _sample_points(start, spread, bounds, min(count, meter.remaining), generator)
     if len(points):
         track.evaluate(points)
     return track.result()
 
 
-class _Track:
+class _BestTracker:
     """Evaluates points within the budget and keeps the best."""
 
     def __init__(self, cost: Cost, start: Tensor, meter: Meter):
@@ -148,26 +148,28 @@ class _Track:
             self._x, self._energy = points[best].clone(), float(energies[best])
         self._evaluations += len(points)
         self._history.append(self._energy)
-        return _array(energies)
+        return _to_numpy(energies)
 
     def result(self) -> SwarmResult:
         """So far."""
         return SwarmResult(self._x, self._energy, self._evaluations, tuple(self._history))
 
 
-class _Flight:
+class _ParticleSwarm:
     """pyswarms' swarm and topology."""
 
     def __init__(self, points: np.ndarray, settings: SwarmSettings, bounds: Any, random: np.random.RandomState):
         self._random, self._bounds = random, bounds
-        with _quiet_import():
+        with _suppress_logging_config():
             from pyswarms.backend.handlers import BoundaryHandler, VelocityHandler
             from pyswarms.backend.swarms import Swarm
             from pyswarms.backend.topology import Ring, Star
 
-            self._nearest, self._unclamped = BoundaryHandler("nearest"), VelocityHandler("unmodified")
+            self._boundary_handler, self._velocity_handler = BoundaryHandler("nearest"), VelocityHandler("unmodified")
             self._topology = Star() if settings.neighbours is None else Ring(static=False)
-        self._knows = {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
+        self._topology_options = (
+            {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
+        )
         weights = {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
         self._swarm: Any = Swarm(points, np.zeros_like(points), options=weights)  # pyright: ignore[reportCallIssue]
         self._swarm.pbest_cost = np.full(len(points), np.inf)
@@ -184,16 +186,20 @@ class _Flight:
 
         self._swarm.current_cost = energies
         self._swarm.pbest_pos, self._swarm.pbest_cost = compute_pbest(self._swarm)
-        self._swarm.best_pos, self._swarm.best_cost = self._topology.compute_gbest(self._swarm, **self._knows)
+        self._swarm.best_pos, self._swarm.best_cost = self._topology.compute_gbest(
+            self._swarm, **self._topology_options
+        )
 
     def move(self):
         """New velocities and positions."""
-        with _numpy_draws_from(self._random):
-            self._swarm.velocity = self._topology.compute_velocity(self._swarm, None, self._unclamped, self._bounds)
-        self._swarm.position = self._topology.compute_position(self._swarm, self._bounds, self._nearest)
+        with _use_numpy_state(self._random):
+            self._swarm.velocity = self._topology.compute_velocity(
+                self._swarm, None, self._velocity_handler, self._bounds
+            )
+        self._swarm.position = self._topology.compute_position(self._swarm, self._bounds, self._boundary_handler)
 
 
-def _draws(
+def _sample_points(
     start: Tensor, spread: Tensor | float, bounds: Bounds | None, count: float, generator: torch.Generator
 ) -> Float[Tensor, "count n"]:
     """The start and normal draws around it, inside the bounds."""
@@ -210,17 +216,17 @@ def _draws(
     return points.clamp(low, high)
 
 
-def _array(values: Tensor) -> np.ndarray:
+def _to_numpy(values: Tensor) -> np.ndarray:
     return values.detach().to("cpu", torch.float64).numpy()
 
 
-_LOGGING = threading.Lock()
+_LOGGING_LOCK = threading.Lock()
 
 
 @contextmanager
-def _quiet_import() -> Iterator[None]:
+def _suppress_logging_config() -> Iterator[None]:
     """While pyswarms is imported or its objects are made, what it configures is not applied."""
-    with _LOGGING:
+    with _LOGGING_LOCK:
         configure = logging.config.dictConfig
         logging.config.dictConfig = lambda config: None
         try:
@@ -230,7 +236,7 @@ def _quiet_import() -> Iterator[None]:
 
 
 @contextmanager
-def _numpy_draws_from(random: np.random.RandomState) -> Iterator[None]:
+def _use_numpy_state(random: np.random.RandomState) -> Iterator[None]:
     """numpy's global draws come from `random` and move it on; afterwards the global state is as it was."""
     before = np.random.get_state()
     np.random.set_state(random.get_state())

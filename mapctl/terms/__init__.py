@@ -2,33 +2,46 @@
 
 from mapctl.terms.base import Term
 from mapctl.terms.clearance import Clearance
-from mapctl.terms.foot_contact import Footing
-from mapctl.terms.jerk import Seam
+from mapctl.terms.foot_contact import FootContact
+from mapctl.terms.jerk import Jerk
 from mapctl.terms.keyframe import Keyframe
-from mapctl.terms.latent_prior import Noise
+from mapctl.terms.latent_prior import LatentPrior
 from mapctl.terms.likelihood import Likelihood
-from mapctl.terms.motion_tracking import Closeness
+from mapctl.terms.motion_tracking import MotionTracking
 from mapctl.terms.observation import Observation
 from mapctl.terms.path import Path
-from mapctl.terms.root_velocity import Travel
-from mapctl.terms.step_length import Steps
+from mapctl.terms.root_velocity import RootVelocity
+from mapctl.terms.step_length import StepLength
 from mapctl.terms.support import Support
 
-ALL = (Likelihood, Noise, Path, Footing, Seam, Closeness, Steps, Travel, Observation, Keyframe, Clearance, Support)
+ALL = (
+    Likelihood,
+    LatentPrior,
+    Path,
+    FootContact,
+    Jerk,
+    MotionTracking,
+    StepLength,
+    RootVelocity,
+    Observation,
+    Keyframe,
+    Clearance,
+    Support,
+)
 
 __all__ = [
     "ALL",
     "Clearance",
-    "Closeness",
-    "Footing",
+    "FootContact",
+    "Jerk",
     "Keyframe",
+    "LatentPrior",
     "Likelihood",
-    "Noise",
+    "MotionTracking",
     "Observation",
     "Path",
-    "Seam",
-    "Steps",
+    "RootVelocity",
+    "StepLength",
     "Support",
     "Term",
-    "Travel",
 ]

@@ -32,13 +32,13 @@ class Clearance:
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Nats over both toes."""
-        return 0.5 * (self._lacking(trial) / self.sigma).square().sum(-1)
+        return 0.5 * (self._height_deficit(trial) / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """By how much the lower toe is too low, metres; 0 where none is."""
-        return self._lacking(trial).amax(-1)
+        return self._height_deficit(trial).amax(-1)
 
-    def _lacking(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
+    def _height_deficit(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
         toes = [trial.skeleton.index(name) for name in TOES]
         speeds = torch.stack([torch.sqrt(trial.step(toe)[..., ::2].square().sum(-1) + 1e-12) for toe in toes], dim=-1)
         wanted = self.height * (speeds * trial.fps / self.speed).clamp(max=1)

@@ -14,7 +14,7 @@ TOES = ("leftToes", "rightToes")
 
 
 @dataclass(frozen=True)
-class Footing:
+class FootContact:
     """A toe that the prior calls planted does not travel and is at its rest height; no toe goes below it."""
 
     sigma_speed: float = 0.03

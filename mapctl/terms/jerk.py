@@ -10,7 +10,7 @@ from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)
-class Seam:
+class Jerk:
     """Jerk of the joints over the first frames of the window, measured together with the frames before it."""
 
     sigma: float = 400.0

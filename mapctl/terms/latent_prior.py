@@ -9,7 +9,7 @@ from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)
-class Noise:
+class LatentPrior:
     """Noise is small: latents of a rollout have sigma 1, noise on the network's input the paper's 0.05."""
 
     sigma: float = 1.0

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, Place, root_places
+from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
-class Closeness:
+class MotionTracking:
     """Poses near those of a target, and a walk near its walk.
 
     Poses are compared as joint positions seen from the hips, facing and all; the way over the ground is compared from
@@ -26,11 +26,11 @@ class Closeness:
     """Distance of a joint from the target's, seen from the hips, metres."""
     sigma_height: float = 0.03
     """Of the hips, metres."""
-    sigma_way: float = 0.15
+    sigma_trajectory: float = 0.15
     """Of the hips over the ground, from the window's beginning on, metres."""
-    sigma_turn: float = 0.15
+    sigma_heading: float = 0.15
     """Of the heading, from the window's beginning on, radians."""
-    joints_that_count: float = 6.0
+    effective_joints: float = 6.0
     """Independent joints that a body is worth: neighbours move together, so a body of 21 is not 21 observations."""
     name: str = "closeness"
     unit: str = "m"
@@ -38,12 +38,12 @@ class Closeness:
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Nats."""
         height = LAYOUT.pick(trial.features - self.target.to(trial.features), "root_height")[..., 0]
-        ground, turn = self._way(trial)
+        ground, turn = self._trajectory_error(trial)
         return 0.5 * (
-            self.joints_that_count * self._pose(trial).mean(-1) / self.sigma_pose**2
+            self.effective_joints * self._pose(trial).mean(-1) / self.sigma_pose**2
             + (height / self.sigma_height).square()
-            + ground.square().sum(-1) / self.sigma_way**2
-            + (turn / self.sigma_turn).square()
+            + ground.square().sum(-1) / self.sigma_trajectory**2
+            + (turn / self.sigma_heading).square()
         )
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
@@ -52,33 +52,33 @@ class Closeness:
 
     def _pose(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
         """Squared distances, m^2."""
-        own = _seen_from_hips(trial)
-        return (own - self._target_seen(trial).to(own)).square().sum(-1)
+        own = _hips_relative_positions(trial)
+        return (own - self._target_from_hips(trial).to(own)).square().sum(-1)
 
-    def _way(self, trial: Trial) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
+    def _trajectory_error(self, trial: Trial) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
         """Where the hips are (metres) and how far they turned (radians), less the target's, from one common place."""
         place = trial.start
-        ground, heading = root_places(self.target.to(trial.features), place)
+        ground, heading = integrate_root(self.target.to(trial.features), place)
         return trial.root_xz_world - ground, trial.heading - heading
 
-    def _target_seen(self, trial: Trial) -> Float[Tensor, "1 frames joints 3"]:
+    def _target_from_hips(self, trial: Trial) -> Float[Tensor, "1 frames joints 3"]:
         key = id(trial.skeleton)
-        if key not in self._seen:
-            origin = Place.origin(self.target.dtype)
+        if key not in self._target_cache:
+            origin = GroundPose.origin(self.target.dtype)
             still = trial.features.new_zeros(0, trial.skeleton.num_joints, 3).to(self.target.dtype)
             target = self.target.unsqueeze(0)
             bits = LAYOUT.pick(target, "contacts") > 0.5
             other = Trial(target, origin, target, target[..., 0], bits, still, trial.skeleton, trial.fps)
-            self._seen[key] = _seen_from_hips(other)
-        return self._seen[key]
+            self._target_cache[key] = _hips_relative_positions(other)
+        return self._target_cache[key]
 
     @cached_property
-    def _seen(self) -> dict[int, Tensor]:
+    def _target_cache(self) -> dict[int, Tensor]:
         """By skeleton; terms are asked many times about one window."""
         return {}
 
 
-def _seen_from_hips(trial: Trial) -> Float[Tensor, "batch frames joints 3"]:
+def _hips_relative_positions(trial: Trial) -> Float[Tensor, "batch frames joints 3"]:
     """Joint positions less the hips', in the heading frame."""
     relative = trial.joints_world - trial.joints_world[..., :1, :]
     sine, cosine = torch.sin(trial.heading)[..., None], torch.cos(trial.heading)[..., None]

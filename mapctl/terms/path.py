@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves import Curve
-from mapctl.curves.local_frame import CurveAxes, axes_near
+from mapctl.curves.local_frame import LocalFrame, find_local_frames
 from mapctl.numerics import gaussian
 from mapctl.terms.trial import Trial
 
@@ -47,19 +47,19 @@ class Path:
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Nats of sideways offset, its slow part, progress, and height in space."""
         places = self._places(trial)
-        near = self._near(places)
+        near = self._nearest_frame(places)
         # The curve is held in the gradient. Forward offsets are from the wanted place, the others from the nearest:
         # the straightened curve is at right angles to the other axes.
-        offsets = ((places - near.straightened).unsqueeze(-2) * near.axes).sum(-1)
+        offsets = ((places - near.tangent_extension).unsqueeze(-2) * near.axes).sum(-1)
         beyond = torch.nn.functional.softshrink(offsets[..., :1], self.free_sway)
         wrong = torch.cat([beyond, offsets[..., 1:]], dim=-1)
-        energy = (wrong / self._sigmas(places.dtype)).square().sum(-1)
-        return 0.5 * (energy + (self._slow(trial, offsets[..., 0]) / self.sigma_slow).square())
+        energy = (wrong / self._axis_sigmas(places.dtype)).square().sum(-1)
+        return 0.5 * (energy + (self._low_pass_offset(trial, offsets[..., 0]) / self.sigma_slow).square())
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Distance to the curve, metres."""
         places = self._places(trial)
-        return (places - self._near(places).place).norm(dim=-1)
+        return (places - self._nearest_frame(places).place).norm(dim=-1)
 
     def _places(self, trial: Trial) -> Float[Tensor, "batch frames dims"]:
         if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics
@@ -69,30 +69,32 @@ class Path:
     def _of_curve(self, places: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch dims"]:
         return places[..., ::2] if self.curve.dims == 2 else places
 
-    def _near(self, places: Tensor) -> CurveAxes:
-        return axes_near(self.curve, places, self.arcs, reach=_REACH)
+    def _nearest_frame(self, places: Tensor) -> LocalFrame:
+        return find_local_frames(self.curve, places, self.arcs, reach=_REACH)
 
-    def _sigmas(self, dtype: torch.dtype) -> Float[Tensor, " dims"]:
+    def _axis_sigmas(self, dtype: torch.dtype) -> Float[Tensor, " dims"]:
         """Of the offsets along the axes."""
         return torch.tensor((self.sigma_raw, self.sigma_progress, self.sigma_height)[: self.curve.dims], dtype=dtype)
 
-    def _slow(self, trial: Trial, sideways: Tensor) -> Tensor:
+    def _low_pass_offset(self, trial: Trial, sideways: Tensor) -> Tensor:
         """The offset smoothed over time; the frames before the window count, missing ones do not."""
         sigma = self.slow_seconds * trial.fps
-        known, weights = _smoother(self, trial.before, trial.skeleton.index(self.joint), sigma, sideways.dtype)
+        known, weights = _build_offset_smoother(
+            self, trial.before, trial.skeleton.index(self.joint), sigma, sideways.dtype
+        )
         return torch.addmm(known, sideways, weights)
 
-    def _sideways_before(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
+    def _past_sideways_offsets(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
         """Sideways offsets of the frames before the window, metres; arcs go on backwards at the first frame's pace."""
         step = self.arcs[1] - self.arcs[0] if len(self.arcs) > 1 else 0.0
         around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
         places = self._of_curve(past)
-        near = axes_near(self.curve, places[None], around, reach=_REACH)
+        near = find_local_frames(self.curve, places[None], around, reach=_REACH)
         return ((places - near.place[0]) * near.axes[0, :, 0]).sum(-1)
 
 
 @lru_cache(maxsize=8)
-def _smoother(
+def _build_offset_smoother(
     path: Path, before: Float[Tensor, "past joints 3"], joint: int, sigma_frames: float, dtype: torch.dtype
 ) -> tuple[Float[Tensor, " frames"], Float[Tensor, "frames frames"]]:
     """What the frames before a window add to its smoothed offsets, and the matrix that smooths its own.
@@ -100,6 +102,6 @@ def _smoother(
     The same at every evaluation of a window; tensors are compared by identity.
     """
     past = before[-round(3 * sigma_frames) :, joint].detach().to(dtype)
-    weights = gaussian.averaging(len(past) + len(path.arcs), sigma_frames, dtype)[len(past) :].T.contiguous()
-    known = path._sideways_before(past) @ weights[: len(past)] if len(past) else weights.new_zeros(len(path.arcs))
+    weights = gaussian.averaging_matrix(len(past) + len(path.arcs), sigma_frames, dtype)[len(past) :].T.contiguous()
+    known = path._past_sideways_offsets(past) @ weights[: len(past)] if len(past) else weights.new_zeros(len(path.arcs))
     return known, weights[len(past) :]

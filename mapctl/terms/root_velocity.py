@@ -17,7 +17,7 @@ from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
-class Travel:
+class RootVelocity:
     """The hips' slow velocity over the ground is the wanted one, and the body faces a wanted way."""
 
     velocities: Float[Tensor, "frames 2"]
@@ -62,7 +62,7 @@ class Travel:
         return torch.stack([along / self.sigma_speed, across / slip], dim=-2)
 
     def _missed(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        known, weights = _smoother(self, trial.before, trial.fps, trial.features.dtype)
+        known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
         places = trial.root_xz_world
         first = trial.start.position_xz.to(places.dtype).expand(len(places), 1, 2)
         velocities = torch.diff(places, dim=1, prepend=first) * trial.fps - self.velocities.to(places.dtype)
@@ -70,13 +70,13 @@ class Travel:
 
 
 @lru_cache(maxsize=8)
-def _smoother(
-    term: Travel, before: Float[Tensor, "past joints 3"], fps: float, dtype: torch.dtype
+def _build_velocity_smoother(
+    term: RootVelocity, before: Float[Tensor, "past joints 3"], fps: float, dtype: torch.dtype
 ) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, "frames frames"]]:
     """What the frames before a window add to its slow velocity error, and the matrix that smooths its own."""
     steps = torch.diff(before[:, 0, ::2].to(dtype), dim=0) * fps
     sigma_frames = term.slow_seconds * fps
     past = min(len(steps), len(term.velocities_before), round(3 * sigma_frames))
     owed = (steps[len(steps) - past :] - term.velocities_before[len(term.velocities_before) - past :]).to(dtype)
-    weights = gaussian.averaging(past + len(term.velocities), sigma_frames, dtype)[past:]
+    weights = gaussian.averaging_matrix(past + len(term.velocities), sigma_frames, dtype)[past:]
     return weights[:, :past] @ owed, weights[:, past:].contiguous()

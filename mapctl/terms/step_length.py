@@ -10,11 +10,11 @@ from torch import Tensor
 from mapctl.terms.foot_contact import TOES
 from mapctl.terms.trial import Trial
 
-Touch = tuple[int, int, int, int]
+TouchDown = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class Steps:
+class StepLength:
     """Where a toe touches down, it is a wanted distance from where the other one last stood.
 
     Touch-downs are the prior's own contact bits, as in footing; one whose partner last stood before the window is
@@ -38,7 +38,7 @@ class Steps:
 
     def _missed(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         missed = torch.zeros_like(trial.features[..., 0])
-        if not (touches := _touches(trial)):
+        if not (touches := _find_touch_downs(trial)):
             return missed
         toes = trial.joints_world[..., [trial.skeleton.index(name) for name in TOES], ::2]
         if len(trial.before):
@@ -51,7 +51,7 @@ class Steps:
         return missed.index_put((clip, frame), lengths - self.length, accumulate=True)
 
 
-def _touches(trial: Trial) -> list[Touch]:
+def _find_touch_downs(trial: Trial) -> list[TouchDown]:
     """Clip, frame and foot of each touch-down, and the frame in which the other foot last stood; -1 is before."""
     bits = trial.contacts
     past = trial.contacts_before.to(bits.device).expand(len(bits), 2).unsqueeze(1)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.features import LAYOUT, Place, root_places
+from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.kinematics import fast
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -19,7 +19,7 @@ class Trial:
 
     features: Float[Tensor, "batch frames size"]
     """Physical units."""
-    start: Place
+    start: GroundPose
     """Where the frame before the window stands; unbatched or with the batch's shape."""
     noise: Float[Tensor, "batch frames continuous"]
     """The random numbers the candidate was made with: latents of a rollout, or noise on the network's input."""
@@ -37,12 +37,12 @@ class Trial:
     """Left and right toe planted in the frame before the window; unbatched or with the batch's shape."""
 
     @cached_property
-    def _fast(self) -> bool:
-        return fast.serves(self.features, self.start, self.skeleton)
+    def _use_kernels(self) -> bool:
+        return fast.is_supported(self.features, self.start, self.skeleton)
 
     @cached_property
     def _root(self) -> tuple[Tensor, Tensor]:
-        places = fast.root_places if self._fast else root_places
+        places = fast.integrate_root_fast if self._use_kernels else integrate_root
         return places(self.features, self.start)
 
     @property
@@ -58,8 +58,8 @@ class Trial:
     @cached_property
     def joints_world(self) -> Float[Tensor, "batch frames joints 3"]:
         """World joint positions, metres, by forward kinematics of the whole body."""
-        if self._fast:
-            return fast.joints_world(self.features, self.root_xz_world, self.heading, self.skeleton)
+        if self._use_kernels:
+            return fast.compute_joints_world(self.features, self.root_xz_world, self.heading, self.skeleton)
         tilt_xz = LAYOUT.pick(self.features, "root_tilt")
         tilt = torch.stack([tilt_xz[..., 0], torch.zeros_like(self.heading), tilt_xz[..., 1]], dim=-1)
         vectors = torch.cat([tilt, LAYOUT.pick(self.features, "joint_rotations")], dim=-1).unflatten(-1, (-1, 3))

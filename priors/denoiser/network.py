@@ -15,22 +15,22 @@ from torch.nn.functional import gelu
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.numerics import gaussian
-from mapctl.recording import Capture, Cleaned, filled
+from mapctl.recording import Capture, Cleaned, fill_missing
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
 
-_OTHERS = CANONICAL.num_joints - 1
-_ANGLES = 2 + 3 * _OTHERS  # tilt and rotation vectors
-_INPUTS = 2 * _ANGLES + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1)
-_OUTPUTS = _ANGLES + 1 + 3 + 2
+_NON_ROOT_JOINTS = CANONICAL.num_joints - 1
+_ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
+_INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1)
+_OUTPUT_CHANNELS = _ANGLE_CHANNELS + 1 + 3 + 2
 
-_SMOOTH, _SLOW = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
-_FAINT, _FAINT_ROOT = 0.0044, 0.001  # radians and metres: noise that is as often true motion
+_SMOOTHING_SIGMA, _REFERENCE_SIGMA = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
+_NEGLIGIBLE_SIGMA, _NEGLIGIBLE_SIGMA_ROOT = 0.0044, 0.001  # radians and metres: noise that is as often true motion
 # One unit of what is seen and of what is changed, about their spread: radians, metres, metres a frame.
-_ANGLE, _PLACE, _PACE = 0.3, 0.02, 0.05
-_HIPS = 0.85  # metres: height of the canonical skeleton's hips while it walks
-_PIECE, _MARGIN = 512, 64  # frames cleaned at once, and beside them
+_ANGLE_UNIT, _POSITION_UNIT, _VELOCITY_UNIT = 0.3, 0.02, 0.05
+_HIPS_HEIGHT = 0.85  # metres: height of the canonical skeleton's hips while it walks
+_CHUNK_FRAMES, _MARGIN_FRAMES = 512, 64  # frames cleaned at once, and beside them
 
 
 @dataclass(frozen=True)
@@ -55,18 +55,20 @@ class DenoiserNetwork(nn.Module):
     def __init__(self, config: DenoiserConfig, *, bfloat16: bool = False):
         """With `bfloat16` the convolutions compute in it; what they are given and give back does not."""
         super().__init__()
-        self.config, self.reduced = config, bfloat16
-        self.first = nn.Conv1d(_INPUTS, config.width, config.kernel, padding=config.kernel // 2)
-        self.blocks = nn.ModuleList(_Block(config.width, config.kernel, dilation) for dilation in config.dilations)
-        self.last = nn.Linear(config.width, _OUTPUTS)
+        self.config, self.reduced_precision = config, bfloat16
+        self.first = nn.Conv1d(_INPUT_CHANNELS, config.width, config.kernel, padding=config.kernel // 2)
+        self.blocks = nn.ModuleList(
+            _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
+        )
+        self.last = nn.Linear(config.width, _OUTPUT_CHANNELS)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
     def forward(self, capture: Capture) -> Cleaned:
         """The proposal; frames that were not seen at all included."""
-        view = _View(capture)
+        view = _CaptureView(capture)
         inputs = view.inputs().transpose(1, 2)
-        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced):
+        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
             hidden = self.first(inputs)
             for block in self.blocks:
                 hidden = block(hidden)
@@ -74,7 +76,7 @@ class DenoiserNetwork(nn.Module):
         return view.changed(change.to(inputs.dtype))
 
 
-class _Block(nn.Module):
+class _ResidualBlock(nn.Module):
     """Normalise over channels, see neighbouring frames, mix; added to what came in."""
 
     def __init__(self, width: int, kernel: int, dilation: int):
@@ -90,50 +92,54 @@ class _Block(nn.Module):
         return hidden + self.across(gelu(self.along(normal)))
 
 
-class _View:
+class _CaptureView:
     """A capture as the network sees it: in the slow frame of the hips, where place and heading do not matter."""
 
     def __init__(self, capture: Capture):
         self.capture = capture
         sigma, sigma_root = capture.sigma, capture.sigma_root[:, None]
         # The share of a sight that noise explains; of what was not seen, all of it.
-        noise = (sigma.square() / (sigma.square() + _FAINT**2))[:, None]
-        self.doubt = torch.where(capture.seen, noise, 1.0)
-        root = (sigma_root.square() / (sigma_root.square() + _FAINT_ROOT**2))[:, None]
-        self.root_doubt = torch.where(capture.seen_root[..., None], root, 1.0)
+        noise = (sigma.square() / (sigma.square() + _NEGLIGIBLE_SIGMA**2))[:, None]
+        self.noise_share = torch.where(capture.seen, noise, 1.0)
+        root = (sigma_root.square() / (sigma_root.square() + _NEGLIGIBLE_SIGMA_ROOT**2))[:, None]
+        self.root_noise_share = torch.where(capture.seen_root[..., None], root, 1.0)
 
         batch, frames = capture.root.shape[:2]
         angles = capture.joints.transpose(1, 2).flatten(0, 1)
-        shown = filled(angles, capture.seen[..., 1:].transpose(1, 2).flatten(0, 1))
-        joints = shown.unflatten(0, (batch, _OTHERS)).transpose(1, 2).flatten(2)
+        shown = fill_missing(angles, capture.seen[..., 1:].transpose(1, 2).flatten(0, 1))
+        joints = shown.unflatten(0, (batch, _NON_ROOT_JOINTS)).transpose(1, 2).flatten(2)
         self.angles = torch.cat([capture.tilt, joints], dim=-1)
-        self.angle_doubt = torch.cat(
-            [self.doubt[..., :1].expand(batch, frames, 2), self.doubt[..., 1:].repeat_interleave(3, dim=-1)], dim=-1
+        self.angle_noise_share = torch.cat(
+            [
+                self.noise_share[..., :1].expand(batch, frames, 2),
+                self.noise_share[..., 1:].repeat_interleave(3, dim=-1),
+            ],
+            dim=-1,
         )
-        root = filled(capture.root, capture.seen_root)
-        self.slow_heading = _smooth(capture.heading[..., None], _SLOW)[..., 0]
-        self.slow_root = _smooth(root, _SLOW)
+        root = fill_missing(capture.root, capture.seen_root)
+        self.slow_heading = _smooth(capture.heading[..., None], _REFERENCE_SIGMA)[..., 0]
+        self.slow_root = _smooth(root, _REFERENCE_SIGMA)
         self.turn = (capture.heading - self.slow_heading)[..., None]
-        self.off = _turned(root - self.slow_root, -self.slow_heading)
+        self.off = _rotate_about_y(root - self.slow_root, -self.slow_heading)
 
     def inputs(self) -> Float[Tensor, "batch frames inputs"]:
         """Everything in units of about one."""
         capture = self.capture
-        rate = _rate(self.slow_heading[..., None])
-        way = _turned(_rate(self.slow_root), -self.slow_heading)
+        rate = _difference_frames(self.slow_heading[..., None])
+        way = _rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)
         level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
         known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
         return torch.cat(
             [
-                self.angles / _ANGLE,
-                _smooth(self.angles, _SMOOTH) / _ANGLE,
-                self.turn / _ANGLE,
-                _smooth(self.turn, _SMOOTH) / _ANGLE,
-                rate / _PACE,
-                self.off / _PLACE,
-                _smooth(self.off, _SMOOTH) / _PLACE,
-                way[..., ::2] / _PACE,
-                (self.slow_root[..., 1:2] - _HIPS) / _ANGLE,
+                self.angles / _ANGLE_UNIT,
+                _smooth(self.angles, _SMOOTHING_SIGMA) / _ANGLE_UNIT,
+                self.turn / _ANGLE_UNIT,
+                _smooth(self.turn, _SMOOTHING_SIGMA) / _ANGLE_UNIT,
+                rate / _VELOCITY_UNIT,
+                self.off / _POSITION_UNIT,
+                _smooth(self.off, _SMOOTHING_SIGMA) / _POSITION_UNIT,
+                way[..., ::2] / _VELOCITY_UNIT,
+                (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / _ANGLE_UNIT,
                 known.to(self.angles),
                 level[:, None].expand(-1, capture.frames, -1),
             ],
@@ -142,20 +148,24 @@ class _View:
 
     def changed(self, change: Float[Tensor, "batch frames outputs"]) -> Cleaned:
         """What was seen, smoothed and changed as far as it is in doubt."""
-        angles, turn, off, contacts = change.split([_ANGLES, 1, 3, 2], dim=-1)
-        angles = self.angles + self.angle_doubt * (_smooth(self.angles, _SMOOTH) - self.angles + _ANGLE * angles)
-        turn = self.turn + self.doubt[..., :1] * (_smooth(self.turn, _SMOOTH) - self.turn + _ANGLE * turn)
-        off = self.off + self.root_doubt * (_smooth(self.off, _SMOOTH) - self.off + _PLACE * off)
-        root = self.slow_root + _turned(off, self.slow_heading)
+        angles, turn, off, contacts = change.split([_ANGLE_CHANNELS, 1, 3, 2], dim=-1)
+        angles = self.angles + self.angle_noise_share * (
+            _smooth(self.angles, _SMOOTHING_SIGMA) - self.angles + _ANGLE_UNIT * angles
+        )
+        turn = self.turn + self.noise_share[..., :1] * (
+            _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + _ANGLE_UNIT * turn
+        )
+        off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + _POSITION_UNIT * off)
+        root = self.slow_root + _rotate_about_y(off, self.slow_heading)
         return Cleaned(root, self.slow_heading + turn[..., 0], angles, contacts)
 
 
-def _rate(values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
+def _difference_frames(values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
     """Change since the frame before."""
     return torch.diff(values, dim=1, prepend=values[:, :1])
 
 
-def _turned(vector: Float[Tensor, "batch frames 3"], angle: Float[Tensor, "batch frames"]) -> Tensor:
+def _rotate_about_y(vector: Float[Tensor, "batch frames 3"], angle: Float[Tensor, "batch frames"]) -> Tensor:
     """Vectors turned about +Y."""
     ground = rotations.rotate_ground(vector[..., ::2], angle)
     return torch.stack([ground[..., 0], vector[..., 1], ground[..., 1]], dim=-1)
@@ -163,7 +173,7 @@ def _turned(vector: Float[Tensor, "batch frames 3"], angle: Float[Tensor, "batch
 
 def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[Tensor, "batch frames width"]:
     """Gaussian along the frames, its weights adding up to one at the ends too."""
-    weight = gaussian.averaging(values.shape[1], sigma, values.dtype, values.device)
+    weight = gaussian.averaging_matrix(values.shape[1], sigma, values.dtype, values.device)
     return torch.einsum("ts,bsw->btw", weight, values)
 
 
@@ -181,11 +191,11 @@ class ConvDenoiser:
     def clean(self, capture: Capture) -> Cleaned:
         """The proposal for a capture of any length, piece by piece, each with a margin that it shares."""
         pieces = []
-        for start in range(0, capture.frames, _PIECE):
-            first, stop = max(0, start - _MARGIN), min(capture.frames, start + _PIECE + _MARGIN)
+        for start in range(0, capture.frames, _CHUNK_FRAMES):
+            first, stop = max(0, start - _MARGIN_FRAMES), min(capture.frames, start + _CHUNK_FRAMES + _MARGIN_FRAMES)
             with torch.no_grad():
                 cleaned = self.network(capture.slice(first, stop))
-            kept = slice(start - first, start - first + _PIECE)
+            kept = slice(start - first, start - first + _CHUNK_FRAMES)
             parts = cleaned.root, cleaned.heading, cleaned.angles, cleaned.contacts
             pieces.append([value[:, kept] for value in parts])
         root, heading, angles, contacts = (torch.cat(values, dim=1) for values in zip(*pieces, strict=True))
@@ -195,7 +205,7 @@ class ConvDenoiser:
 
 def load(name: str) -> ConvDenoiser:
     """The bundled denoiser by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.opened(name, "denoiser") as (tensors, card):
+    with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
         network = DenoiserNetwork(DenoiserConfig.of_card(card.config))
         network.load_state_dict(tensors)
     return ConvDenoiser(name, network.eval().requires_grad_(False), card)

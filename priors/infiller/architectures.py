@@ -17,21 +17,21 @@ Architecture = Literal["skips", "image", "vanilla", "manifold"]
 _LEAK = 0.2
 
 
-class Skips(nn.Module):
+class TemporalUNet(nn.Module):
     """Ours: five units down, five up, over time, with skips between those of the same length."""
 
     def __init__(self, inputs: int, outputs: int, widths: tuple[int, ...], kernel: int):
         super().__init__()
         self.first = nn.Conv1d(inputs, widths[0], kernel, padding=kernel // 2)
         ups = list(zip(widths[1:], widths[:-1], strict=True))
-        self.down = nn.ModuleList(_Unit(width, kernel) for width in widths)
+        self.down = nn.ModuleList(_ResidualUnit(width, kernel) for width in widths)
         self.wider = nn.ModuleList(nn.Conv1d(narrow, wide, 1) for wide, narrow in ups)
-        self.bottom = _Unit(widths[-1], kernel)
+        self.bottom = _ResidualUnit(widths[-1], kernel)
         self.lift = nn.ConvTranspose1d(widths[-1], widths[-1], 2, stride=2)
         self.narrower = nn.ModuleList(nn.ConvTranspose1d(wide, narrow, 2, stride=2) for wide, narrow in ups)
-        self.up = nn.ModuleList(_Unit(width, kernel) for width in widths)
+        self.up = nn.ModuleList(_ResidualUnit(width, kernel) for width in widths)
         self.last = nn.Conv1d(widths[0], outputs, 1)
-        _silence(self.last)
+        _initialise_zero(self.last)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch outputs frames"]:
         """Changes of the rows, in their own units; nothing before training."""
@@ -50,7 +50,7 @@ class Skips(nn.Module):
         return self.last(hidden)
 
 
-class _Unit(nn.Module):
+class _ResidualUnit(nn.Module):
     """Two convolutions over time, added to what came in."""
 
     def __init__(self, width: int, kernel: int):
@@ -58,7 +58,7 @@ class _Unit(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.one = nn.Conv1d(width, width, kernel, padding=kernel // 2)
         self.two = nn.Conv1d(width, width, kernel, padding=kernel // 2)
-        _silence(self.two)
+        _initialise_zero(self.two)
 
     def forward(self, hidden: Float[Tensor, "batch width frames"]) -> Float[Tensor, "batch width frames"]:
         # Over channels alone: a frame must not depend on how long the motion is.
@@ -66,7 +66,7 @@ class _Unit(nn.Module):
         return hidden + self.two(leaky_relu(self.one(normal), _LEAK))
 
 
-class Picture(nn.Module):
+class ImageAutoencoder(nn.Module):
     """The paper's: 3x3 filters over rows and frames, pooling, strided de-convolutions; or its vanilla baseline, with a
     single strided convolution in each unit.
     """
@@ -90,7 +90,7 @@ class Picture(nn.Module):
             if vanilla
             else nn.ModuleList(nn.Conv2d(b, a, 3, padding=1) for b, a in zip(reversed(widths), outs, strict=True))
         )
-        _begin_as_glorot(self)
+        _initialise_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
         """The rows anew."""
@@ -109,14 +109,14 @@ class Picture(nn.Module):
         return hidden[:, 0]
 
 
-class Manifold(nn.Module):
+class HoldenManifold(nn.Module):
     """One layer over time, as Holden et al. 2016 learn their motion manifold (the paper's second baseline)."""
 
     def __init__(self, rows: int, width: int = 256, kernel: int = 25):
         super().__init__()
         self.encode = nn.Conv1d(rows, width, kernel, padding=kernel // 2)
         self.decode = nn.Conv1d(width, rows, kernel, padding=kernel // 2)
-        _begin_as_glorot(self)
+        _initialise_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
         """The rows anew."""
@@ -124,13 +124,13 @@ class Manifold(nn.Module):
         return self.decode(hidden.repeat_interleave(2, dim=-1)[..., : rows.shape[-1]])
 
 
-def _silence(layer: nn.Module) -> None:
+def _initialise_zero(layer: nn.Module) -> None:
     """Its output is nothing, until training."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
 
 
-def _begin_as_glorot(network: nn.Module) -> None:
+def _initialise_glorot(network: nn.Module) -> None:
     """Glorot and Bengio's weights, no biases (section 3.3)."""
     for parameter in network.parameters():
         if parameter.dim() > 1:
@@ -143,8 +143,8 @@ PAPER_WIDTHS = (32, 64, 128, 256, 256)
 """Channels of the paper's units, so that a sample of 240 frames becomes its 3 x 8 x 256 (section 3.2)."""
 
 AUTOENCODERS: dict[str, Callable[[int], nn.Module]] = {
-    "image": lambda rows: Picture(PAPER_WIDTHS, vanilla=False),
-    "vanilla": lambda rows: Picture(PAPER_WIDTHS, vanilla=True),
-    "manifold": Manifold,
+    "image": lambda rows: ImageAutoencoder(PAPER_WIDTHS, vanilla=False),
+    "vanilla": lambda rows: ImageAutoencoder(PAPER_WIDTHS, vanilla=True),
+    "manifold": HoldenManifold,
 }
 """Networks that make all rows anew, by name: from the number of rows."""

@@ -8,20 +8,20 @@ from torch import Tensor, nn
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening import PositionImage, Proposed
-from mapctl.inbetweening.position_image import mirrored_places
+from mapctl.inbetweening import PositionImage, ProposedPositions
+from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
-from priors.infiller.architectures import AUTOENCODERS, Architecture, Skips
+from priors.infiller.architectures import AUTOENCODERS, Architecture, TemporalUNet
 
 _JOINTS = CANONICAL.num_joints
-_PLACES, _COURSE, _FEET = 3 * _JOINTS, 3, 2
-ROWS = _PLACES + _COURSE + _FEET
+_POSITION_ROWS, _REFERENCE_ROWS, _CONTACT_ROWS = 3 * _JOINTS, 3, 2
+IMAGE_ROWS = _POSITION_ROWS + _REFERENCE_ROWS + _CONTACT_ROWS
 """Of an image: joint positions, the reference's velocities, contacts."""
-_TOLD = _JOINTS + 1 + 2  # known, present, frames since and until any joint is known
-_PACE, _TURN = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
-_FAR = 60  # frames beyond which it is all one how far a known frame is
+_MASK_ROWS = _JOINTS + 1 + 2  # known, present, frames since and until any joint is known
+_VELOCITY_UNIT, _HEADING_UNIT = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
+_MAX_FRAMES_SINCE = 60  # frames beyond which it is all one how far a known frame is
 
 
 @dataclass(frozen=True)
@@ -52,51 +52,56 @@ class InfillerNetwork(nn.Module):
     def __init__(self, config: InfillerConfig, *, bfloat16: bool = False):
         """With `bfloat16` the convolutions compute in it; what they are given and give back does not."""
         super().__init__()
-        self.config, self.reduced = config, bfloat16
+        self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean", torch.zeros(_JOINTS, 3))
         self.register_buffer("std", torch.ones(_JOINTS, 3))
-        self.keeps = config.architecture == "skips"
-        if self.keeps:
-            self.net = Skips(ROWS + _TOLD, _PLACES + _FEET, config.widths, config.kernel)
+        self.keeps_observed = config.architecture == "skips"
+        if self.keeps_observed:
+            self.net = TemporalUNet(
+                IMAGE_ROWS + _MASK_ROWS, _POSITION_ROWS + _CONTACT_ROWS, config.widths, config.kernel
+            )
         else:
-            self.net = AUTOENCODERS[config.architecture](ROWS)
+            self.net = AUTOENCODERS[config.architecture](IMAGE_ROWS)
 
-    def forward(self, image: PositionImage) -> Proposed:
+    def forward(self, image: PositionImage) -> ProposedPositions:
         """Ours keeps known places to the bit; an autoencoder makes all of them anew (section 4.2)."""
         shown = torch.where(image.ever_known[:, None, :, None], image.places, self.mean)
         rows = self._rows(image, shown)
-        rows = torch.cat([rows, _told(image)], dim=-1) if self.keeps else rows
-        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced):
+        rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
             out = self.net(rows.transpose(1, 2)).transpose(1, 2).to(rows.dtype)
-        change, contacts = out[..., :_PLACES].unflatten(-1, (_JOINTS, 3)) * self.std, 4 * out[..., -_FEET:]
-        if not self.keeps:
-            return Proposed(self.mean + change, contacts)
-        return Proposed(torch.where(image.known[..., None], image.places, shown + change), contacts)
+        change, contacts = (
+            out[..., :_POSITION_ROWS].unflatten(-1, (_JOINTS, 3)) * self.std,
+            4 * out[..., -_CONTACT_ROWS:],
+        )
+        if not self.keeps_observed:
+            return ProposedPositions(self.mean + change, contacts)
+        return ProposedPositions(torch.where(image.known[..., None], image.places, shown + change), contacts)
 
     def _rows(self, image: PositionImage, shown: Tensor) -> Float[Tensor, "batch frames rows"]:
         """Of about unit size; an autoencoder's unknown places are 0, their mean (section 3.3)."""
         places = (shown - self.mean) / self.std
-        if not self.keeps:
+        if not self.keeps_observed:
             places = places * image.known[..., None]
         places = places * image.present[..., None, None]
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
-        step = rotations.rotate_ground(step, -image.heading) / _PACE
-        turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _TURN
+        step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
+        turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
         return torch.cat([places.flatten(-2), step, turn, 2 * image.contacts - 1], dim=-1)
 
 
-def _told(image: PositionImage) -> Float[Tensor, "batch frames told"]:
+def _encode_masks(image: PositionImage) -> Float[Tensor, "batch frames told"]:
     """What is known, and how long ago and how soon anything is."""
     some = image.known.any(dim=-1)
-    far = torch.stack([_since(some), _since(some.flip(1)).flip(1)], dim=-1)
+    far = torch.stack([_count_frames_since(some), _count_frames_since(some.flip(1)).flip(1)], dim=-1)
     return torch.cat([image.known.to(far), image.present[..., None].to(far), far], dim=-1)
 
 
-def _since(known: Tensor) -> Float[Tensor, "batch frames"]:
+def _count_frames_since(known: Tensor) -> Float[Tensor, "batch frames"]:
     """Frames since a known one, as a share of those that matter; 1 where there was none."""
     frame = torch.arange(known.shape[1], device=known.device)
-    last = torch.where(known, frame, -_FAR).cummax(dim=1).values
-    return (frame - last).clamp(max=_FAR) / _FAR
+    last = torch.where(known, frame, -_MAX_FRAMES_SINCE).cummax(dim=1).values
+    return (frame - last).clamp(max=_MAX_FRAMES_SINCE) / _MAX_FRAMES_SINCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +116,19 @@ class ConvInfiller:
     """What it was trained on."""
 
     @torch.no_grad()
-    def propose(self, image: PositionImage) -> Proposed:
+    def propose(self, image: PositionImage) -> ProposedPositions:
         """The whole motion, of any length: what the network makes of it and of its mirror image, on average."""
         one, other = self.network(image), self.network(image.mirrored())
-        places = (one.places + mirrored_places(other.places)) / 2
+        places = (one.places + mirror_positions(other.places)) / 2
         contacts = (one.contacts + other.contacts.flip(-1)) / 2
-        return Proposed(torch.where(image.known[..., None] & self.network.keeps, image.places, places), contacts)
+        return ProposedPositions(
+            torch.where(image.known[..., None] & self.network.keeps_observed, image.places, places), contacts
+        )
 
 
 def load(name: str = "infiller") -> ConvInfiller:
     """The bundled infiller, or a trained one by its file or run folder; CheckpointError for anything else."""
-    with checkpoints.opened(name, "infiller") as (tensors, card):
+    with checkpoints.open_checkpoint(name, "infiller") as (tensors, card):
         network = InfillerNetwork(InfillerConfig.of_card(card.config))
         network.load_state_dict(tensors)
     return ConvInfiller(name, network.eval().requires_grad_(False), card)

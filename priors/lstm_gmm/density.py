@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.protocols import Abilities, Plan, Starts
+from mapctl.protocols import DataLimits, DiscreteChoices, InitialStates
 from priors import checkpoints
 from priors.lstm_gmm import labels
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
@@ -28,7 +28,7 @@ class LstmGmmDensity:
     """How it was asked for."""
     reference: LstmGmm
     """The torch network: the specification, and the only path on a GPU."""
-    starts: Starts
+    starts: InitialStates
     """Moments of mocap to begin from."""
     card: checkpoints.Card
     """What the weights are."""
@@ -43,13 +43,13 @@ class LstmGmmDensity:
         return FastRollout(self.reference)
 
     @property
-    def _engine(self) -> "FastRollout | LstmGmm":
+    def _rollout_engine(self) -> "FastRollout | LstmGmm":
         return self.fast if self.use_fast else self.reference
 
     @property
-    def abilities(self) -> Abilities:
+    def abilities(self) -> DataLimits:
         """What the training data show."""
-        return Abilities(**self.card.abilities)
+        return DataLimits(**self.card.abilities)
 
     @property
     def feature_mean(self) -> Float[Tensor, " size"]:
@@ -80,7 +80,7 @@ class LstmGmmDensity:
         fitting = known.held.sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
         weight = self.starts.weight[rows]
-        picked = Starts(
+        picked = InitialStates(
             self.starts.state.pick(rows),
             self.starts.speed[rows],
             tuple(self.starts.names[i] for i in rows.tolist()),
@@ -88,19 +88,19 @@ class LstmGmmDensity:
         )
         return replace(self, reference=self.reference.told(full), starts=picked)
 
-    def told_as_start(self, start: int) -> "LstmGmmDensity":
+    def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
         """The same density told what its data say of the clip that a start was taken from, so that it goes on so."""
         held = labels.read(self.starts.names, self.card.data.get("labels", ""))
         names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
         known = [name for name in names if name in self.reference.config.labels]
         return replace(self, reference=self.reference.told(known))
 
-    def blurred(self, spread: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
+    def with_observation_noise(self, spread: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
         """The same density, scoring motion that was seen with errors of this spread (physical units); see LstmGmm."""
-        return replace(self, reference=self.reference.blurred(spread))
+        return replace(self, reference=self.reference.with_observation_noise(spread))
 
     @property
-    def usual_nats(self) -> float:
+    def reference_log_density(self) -> float:
         """Log density a frame (physical units, see mapctl.problem.density_selection) that 98 % of the windows of its
         own held-out data reach when blurred by `choosing.spread()`; minus infinity where the card does not say.
         """
@@ -122,12 +122,12 @@ class LstmGmmDensity:
         """A state with empty memory after one frame."""
         return self.reference.initial_state(previous)
 
-    def likely_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
+    def infer_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
         """The state, before them, that makes a motion's first frames likely (Eq. 26); see
         priors.lstm_gmm.state_inference."""
-        from priors.lstm_gmm.state_inference import likely_state
+        from priors.lstm_gmm.state_inference import infer_lstm_state
 
-        return likely_state(self.reference, self.starts.state, features)
+        return infer_lstm_state(self.reference, self.starts.state, features)
 
     def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
         """See Density."""
@@ -141,31 +141,31 @@ class LstmGmmDensity:
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
     ) -> tuple[Tensor, LstmState]:
         """See Density."""
-        return self._engine.sample(state, frames, generator, temperature=temperature)
+        return self._rollout_engine.sample(state, frames, generator, temperature=temperature)
 
-    def latents(self, features: Tensor, state: LstmState) -> tuple[Plan, Tensor]:
+    def latents(self, features: Tensor, state: LstmState) -> tuple[DiscreteChoices, Tensor]:
         """See Density."""
         return self.reference.latents(features, state)
 
-    def plan(self, state: LstmState, noise: Tensor) -> Plan:
+    def plan(self, state: LstmState, noise: Tensor) -> DiscreteChoices:
         """See Density."""
-        return self._engine.plan(state, noise)
+        return self._rollout_engine.plan(state, noise)
 
-    def rollout(self, state: LstmState, noise: Tensor, plan: Plan) -> tuple[Tensor, Tensor]:
+    def rollout(self, state: LstmState, noise: Tensor, plan: DiscreteChoices) -> tuple[Tensor, Tensor]:
         """See Density."""
-        return self._engine.rollout(state, noise, plan)
+        return self._rollout_engine.rollout(state, noise, plan)
 
 
 def load(name: str) -> LstmGmmDensity:
     """A bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.opened(name, "lstm-gmm", called="density") as (tensors, card):
-        starts = Starts(
+    with checkpoints.open_checkpoint(name, "lstm-gmm", called="density") as (tensors, card):
+        starts = InitialStates(
             LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
             tensors.pop("starts.speed"),
             tuple(card.data["starts"]),
             tensors.pop("starts.weight"),
         )
-        Abilities(**card.abilities)
+        DataLimits(**card.abilities)
         model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)
     return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)

@@ -61,14 +61,14 @@ def read(clips: Sequence[str], pattern: str) -> Labels:
         raise RequestError(f"labels must be a regular expression, got {pattern!r} ({error})") from error
     if not compiled.groupindex:
         raise RequestError(f"labels need named groups as in (?P<style>[a-z]+), got {pattern!r}")
-    found = [_of(compiled.search(name)) for name in clips]
+    found = [_parse_match(compiled.search(name)) for name in clips]
     names = tuple(sorted(set().union(*found)))
     if not names:
         raise RequestError(f"the labels {pattern!r} match no clip, such as {clips[0]!r}")
     return Labels(names, torch.tensor([[float(name in clip) for name in names] for clip in found]))
 
 
-def _of(match: re.Match[str] | None) -> set[str]:
+def _parse_match(match: re.Match[str] | None) -> set[str]:
     if match is None:
         return set()
     return {f"{group}={value}" for group, value in match.groupdict().items() if value}

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, FeatureLayout
-from mapctl.protocols import Plan
-from priors.config import NetworkConfig, check_least
+from mapctl.protocols import DiscreteChoices
+from priors.config import NetworkConfig, require_at_least
 
 NOISE_UNIT = 0.1
 """Level of input noise (normalised units) that the network is told as 1."""
@@ -50,7 +50,7 @@ class LstmGmmConfig(NetworkConfig):
     """What else it can be told of a motion, each yes or no: `gait=run`, `style=active`."""
 
     def __post_init__(self):
-        check_least(self, 1, "width", "components")
+        require_at_least(self, 1, "width", "components")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class LstmGmm(nn.Module):
                 model.fc1.bias += self.condition(known.to(self.mean))
         return model
 
-    def blurred(self, spread: Float[Tensor, " continuous"]) -> "LstmGmm":
+    def with_observation_noise(self, spread: Float[Tensor, " continuous"]) -> "LstmGmm":
         """A copy whose `log_prob` is of motion seen with independent errors of this spread (physical units).
 
         Sharp densities say nothing of how wrong a motion is that is off by more than they allow. What the errors add
@@ -279,7 +279,7 @@ class LstmGmm(nn.Module):
             drawn.append(frame)
         return torch.stack(drawn, dim=1), state
 
-    def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> Plan:
+    def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
         components, contacts = [], []
         with torch.no_grad():
@@ -290,10 +290,10 @@ class LstmGmm(nn.Module):
                 contacts.append(mixture.contact_logit > 0)
                 frame, _ = self._compose(mixture, components[-1], step, contacts[-1], mixing)
                 state = LstmState(frame, state.hidden, state.cell)
-        return Plan(torch.stack(components, 1), torch.stack(contacts, 1))
+        return DiscreteChoices(torch.stack(components, 1), torch.stack(contacts, 1))
 
     def rollout(
-        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: Plan
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """Features x = mu_k + R_k sigma_k noise under the plan, and each frame's log density under component k.
 
@@ -309,7 +309,7 @@ class LstmGmm(nn.Module):
             densities.append(density)
         return torch.stack(frames, 1), torch.stack(densities, 1)
 
-    def latents(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> tuple[Plan, Tensor]:
+    def latents(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> tuple[DiscreteChoices, Tensor]:
         """The plan and the noise (batch, frames, continuous) whose rollout is the features; inverse of `rollout`.
 
         Of each frame's components, the one that explains it best.
@@ -325,7 +325,7 @@ class LstmGmm(nn.Module):
             component = each.argmax(-1)
             chosen = component[..., None, None].expand(*component.shape, 1, noise.shape[-1])
             bits = self.layout.pick(features, "contacts") > 0.5
-            return Plan(component, bits), noise.gather(-2, chosen)[..., 0, :]
+            return DiscreteChoices(component, bits), noise.gather(-2, chosen)[..., 0, :]
 
     def _step(self, state: LstmState) -> tuple[Mixture, LstmState]:
         inputs = self.normalise(state.previous).unsqueeze(1)

@@ -15,11 +15,11 @@ from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, minimise
 from priors.lstm_gmm.network import LstmGmm, LstmState
 
-_LEAST_SPREAD = 0.05  # of a unit of the memory: some hardly move in the data
+_MIN_STD = 0.05  # of a unit of the memory: some hardly move in the data
 
 
 @dataclass(frozen=True)
-class BeginningSettings:
+class StateInferenceSettings:
     """How the state is looked for."""
 
     frames: int = 10
@@ -30,18 +30,21 @@ class BeginningSettings:
     """Of the search."""
 
 
-def likely_state(
-    model: LstmGmm, known: LstmState, features: Float[Tensor, "frames size"], settings: BeginningSettings | None = None
+def infer_lstm_state(
+    model: LstmGmm,
+    known: LstmState,
+    features: Float[Tensor, "frames size"],
+    settings: StateInferenceSettings | None = None,
 ) -> LstmState:
     """A state (batch of one) before `features` (physical units) that makes the first of them likely (Eq. 26).
 
     `known` are states that motion of the data left behind. The frame before the first is taken to be as the first.
     Never less likely, a prior of the memory included, than the best of `known`; the same input gives the same state.
     """
-    settings = settings or BeginningSettings()
+    settings = settings or StateInferenceSettings()
     first, wanted = features[:1], features[None, : settings.frames]
     memory = torch.cat([known.hidden, known.cell], dim=-1)
-    centre, spread = memory.mean(dim=1), memory.std(dim=1, correction=0).clamp_min(_LEAST_SPREAD)
+    centre, spread = memory.mean(dim=1), memory.std(dim=1, correction=0).clamp_min(_MIN_STD)
 
     def state_of(unknowns: Float[Tensor, "batch unknowns"]) -> LstmState:
         memory = centre[:, None] + spread[:, None] * unknowns.unflatten(-1, tuple(centre.shape)).transpose(0, 1)

@@ -11,19 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, Place
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 
 
-def end_effectors(
+def compute_end_effectors(
     features: Float[Tensor, "batch frames size"], joints: Sequence[str]
 ) -> Float[Tensor, "batch later channels"]:
     """For each frame but the first: positions (m) seen from the hips' ground point and heading, then velocities (m/s)
     over the ground on the way to it, in the same heading frame, so that a foot that stands has none.
     """
     batch = len(features)
-    origin = Place(features.new_zeros(batch, 2), features.new_zeros(batch))
+    origin = GroundPose(features.new_zeros(batch, 2), features.new_zeros(batch))
     continuous, bits = features[..., : LAYOUT.continuous], LAYOUT.pick(features, "contacts") > 0.5
     past = features.new_zeros(0, CANONICAL.num_joints, 3)
     trial = Trial(features, origin, continuous, features[..., 0], bits, past)
@@ -39,6 +39,6 @@ def end_effectors(
     return torch.stack([turned[..., 0], seen[..., 1], turned[..., 1]], dim=-1).flatten(2)
 
 
-def channels(joints: Sequence[str]) -> int:
-    """Width of `end_effectors`."""
+def count_channels(joints: Sequence[str]) -> int:
+    """Width of `compute_end_effectors`."""
     return 6 * len(joints)

@@ -17,7 +17,7 @@ from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
-from priors.refiner.end_effectors import channels, end_effectors
+from priors.refiner.end_effectors import compute_end_effectors, count_channels
 
 END_EFFECTORS = (
     "hips",
@@ -35,8 +35,8 @@ END_EFFECTORS = (
 )
 """Of the refiner and its critic: the paper's ends of the limbs, and knees, elbows and hips, which tremble too."""
 
-_BIT_LOGIT = 3.0  # log odds that a bit of the input is worth; the network may overrule it
-_PIECE = 600  # frames refined at once
+_CONTACT_LOGIT = 3.0  # log odds that a bit of the input is worth; the network may overrule it
+_CHUNK_FRAMES = 600  # frames refined at once
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,11 @@ class RefinerNetwork(nn.Module):
     reach_std: Tensor
 
     def __init__(self, config: RefinerConfig, *, mean: Tensor, std: Tensor, reach_mean: Tensor, reach_std: Tensor):
-        """Statistics of the features (size,) and of `end_effectors` (channels,); RuntimeError for other widths."""
+        """Statistics of the features (size,) and of `compute_end_effectors` (channels,); RuntimeError for other
+        widths."""
         super().__init__()
         self.config = config
-        reach = channels(config.joints)
+        reach = count_channels(config.joints)
         for name, values, width in (
             ("mean", mean, LAYOUT.size),
             ("std", std, LAYOUT.size),
@@ -97,14 +98,14 @@ class RefinerNetwork(nn.Module):
         self, features: Float[Tensor, "batch given size"], memory: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Float[Tensor, "batch refined size"], tuple[Tensor, Tensor]]:
         """Refined frames [lookahead + 1, given - lookahead), contact bits as probabilities, and the LSTM's memory."""
-        reach = (end_effectors(features, self.config.joints) - self.reach_mean) / self.reach_std
+        reach = (compute_end_effectors(features, self.config.joints) - self.reach_mean) / self.reach_std
         seen = torch.cat([((features - self.mean) / self.std)[:, 1:], reach], dim=-1)
         hidden, after = self.lstm(torch.relu(self.first(seen.transpose(1, 2))).transpose(1, 2), memory)
         change = self.last(hidden).to(features.dtype)
         own = features[:, self.before : features.shape[1] - self.config.lookahead]
         size, limit = LAYOUT.continuous, self.config.limit
         continuous = own[..., :size] + limit * torch.tanh(change[..., :size] / limit) * self.std[:size]
-        bits = torch.sigmoid(_BIT_LOGIT * (2 * own[..., size:] - 1) + change[..., size:])
+        bits = torch.sigmoid(_CONTACT_LOGIT * (2 * own[..., size:] - 1) + change[..., size:])
         return torch.cat([continuous, bits], dim=-1), after
 
 
@@ -129,17 +130,17 @@ class LstmRefiner:
         At both ends the motion is taken to go on as its outermost frame does.
         """
         ahead, held, memory = self.network.config.lookahead, None, None
-        for piece in _with_margin(pieces, before=self.network.before, after=ahead):
+        for piece in _pad_ends(pieces, before=self.network.before, after=ahead):
             held = piece if held is None else torch.cat([held, piece], dim=1)
             while held.shape[1] > self.network.before + ahead:
-                given = held[:, : self.network.before + ahead + _PIECE]
+                given = held[:, : self.network.before + ahead + _CHUNK_FRAMES]
                 with torch.no_grad():
                     refined, memory = self.network(given, memory)
                 held = held[:, refined.shape[1] :]
                 yield torch.cat([refined[..., : LAYOUT.continuous], (refined[..., LAYOUT.continuous :] > 0.5)], dim=-1)
 
 
-def _with_margin(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterator[Tensor]:
+def _pad_ends(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterator[Tensor]:
     last = None
     for piece in pieces:
         if piece.shape[1] == 0:
@@ -154,7 +155,7 @@ def _with_margin(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterat
 
 def load(name: str) -> LstmRefiner:
     """A bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.opened(name, "refiner") as (tensors, card):
+    with checkpoints.open_checkpoint(name, "refiner") as (tensors, card):
         statistics = {part: tensors[part] for part in ("mean", "std", "reach_mean", "reach_std")}
         network = RefinerNetwork(RefinerConfig.of_card(card.config), **statistics)
         network.load_state_dict(tensors)

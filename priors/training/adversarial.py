@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mapctl.features import LAYOUT
-from priors.refiner.end_effectors import channels, end_effectors
+from priors.refiner.end_effectors import compute_end_effectors, count_channels
 
-_FEET = ("leftFoot", "leftToes", "rightFoot", "rightToes")
+_FOOT_JOINTS = ("leftFoot", "leftToes", "rightFoot", "rightToes")
 
 
 class Critic(nn.Module):
@@ -29,26 +29,28 @@ class Critic(nn.Module):
         self.register_buffer("reach_mean", reach_mean.clone())
         self.register_buffer("reach_std", reach_std.clone())
         self.slow = slow
-        self.magnified = [len(joints) + number for number, name in enumerate(joints) if slow > 0 and name in _FEET]
-        seen = channels(joints) + 2 * len(self.magnified) + 2
+        self.magnified_columns = [
+            len(joints) + number for number, name in enumerate(joints) if slow > 0 and name in _FOOT_JOINTS
+        ]
+        seen = count_channels(joints) + 2 * len(self.magnified_columns) + 2
         self.first = nn.Conv1d(seen, width, 2 * around + 1)
         self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
         self.last = nn.Linear(2 * width, 1)
 
     def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
         """Log odds, frame by frame, that a window was captured; for the frames that have enough on either side."""
-        ends = end_effectors(features, self.joints)
+        ends = compute_end_effectors(features, self.joints)
         seen = [(ends - self.reach_mean) / self.reach_std, 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1]
-        if self.magnified:
+        if self.magnified_columns:
             # A foot that slides by 10 cm/s is a twentieth of the spread of feet's speeds, and what every viewer sees.
-            ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified, ::2]
+            ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified_columns, ::2]
             seen.append(0.5 * torch.asinh(ground / self.slow).flatten(2))
         seen = torch.cat(seen, dim=-1).transpose(1, 2)
         hidden, _ = self.lstm(torch.nn.functional.leaky_relu(self.first(seen), 0.2).transpose(1, 2))
         return self.last(hidden)[..., 0]
 
 
-class History:
+class HistoryBuffer:
     """Refined windows of earlier refiners, so that the critic does not forget faults that it once knew."""
 
     def __init__(self, windows: Float[Tensor, "size frames features"]):

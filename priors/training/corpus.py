@@ -22,14 +22,14 @@ from priors.tensor_files import write_tensors
 
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
-FEW = 5
+MIN_CLIPS_TO_SPLIT = 5
 """Clips under which parts of one clip are held out instead of whole clips."""
-SHORTEST = 75
+MIN_CLIP_FRAMES = 75
 """Frames that the longest clip of each part must have at least: free runs and starts warm up on it, 2.5 s."""
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedFile:
     """A file that cannot be used."""
 
     name: str
@@ -48,7 +48,7 @@ class Corpus:
     """Frames of each clip."""
     features: Float[Tensor, "frames size"]
     """All frames, float32, physical units."""
-    skipped: tuple[Skipped, ...] = ()
+    skipped: tuple[SkippedFile, ...] = ()
     """Files of the same folder that are not among the clips."""
 
     def identity(self) -> dict[str, str]:
@@ -87,33 +87,34 @@ class Split:
     """5 %, for the measures of the card; of few clips the very part that `validation` is."""
 
 
-def split(corpus: Corpus, seed: int) -> Split:
+def split_corpus(corpus: Corpus, seed: int) -> Split:
     """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part.
 
     Of fewer than FEW clips none can be spared: the end of the longest is held out, a tenth of all frames and SHORTEST
     at least, for validation and test alike. RequestError where a part has only clips too short to warm up on.
     """
     count = len(corpus.names)
-    if count < FEW:
+    if count < MIN_CLIPS_TO_SPLIT:
         return _split_by_frames(corpus)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
     held = max(1, round(0.05 * count))
     parts = order[2 * held :], order[:held], order[held : 2 * held]
     for part in parts:
-        if (longest := max(corpus.lengths[i] for i in part)) < SHORTEST:
+        if (longest := max(corpus.lengths[i] for i in part)) < MIN_CLIP_FRAMES:
             raise RequestError(
-                f"training and held-out clips must reach {SHORTEST} frames at {PRIOR_FPS} fps, got {longest} at most"
+                f"training and held-out clips must reach {MIN_CLIP_FRAMES} frames at {PRIOR_FPS} fps,"
+                f" got {longest} at most"
             )
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
 
 def _split_by_frames(corpus: Corpus) -> Split:
     at = corpus.lengths.index(longest := max(corpus.lengths))
-    held = max(SHORTEST, round(0.1 * len(corpus.features)))
+    held = max(MIN_CLIP_FRAMES, round(0.1 * len(corpus.features)))
     lengths = tuple(length - held * (number == at) for number, length in enumerate(corpus.lengths))
-    if longest < held or max(lengths) < SHORTEST:
+    if longest < held or max(lengths) < MIN_CLIP_FRAMES:
         raise RequestError(
-            f"training needs {SHORTEST} frames at {PRIOR_FPS} fps, and {held} to hold out in the longest clip;"
+            f"training needs {MIN_CLIP_FRAMES} frames at {PRIOR_FPS} fps, and {held} to hold out in the longest clip;"
             f" got clips of {', '.join(map(str, corpus.lengths))}"
         )
     clips = corpus.clips()
@@ -128,7 +129,7 @@ def _split_by_frames(corpus: Corpus) -> Split:
     return Split(train, end, end)
 
 
-def read(
+def read_corpus(
     data: Path, *, match: str, cache: Path, skip_first: bool = False, progress: Callable[[int, int], None] | None = None
 ) -> Corpus:
     """Every BVH below `data` whose path matches the pattern, as features at 30 fps; from the cache where it is fresh.
@@ -143,9 +144,9 @@ def read(
     files = [f for f in sorted(data.rglob("*.bvh")) if pattern.search(f.relative_to(data).as_posix())]
     if not files:
         raise RequestError(f"no .bvh below {data} matches {match!r}")
-    key = _fingerprint(data, files, skip_first)
+    key = _compute_cache_key(data, files, skip_first)
     stored = cache / f"corpus-{key}.safetensors"
-    if (kept := _read_cache(stored)) is not None and not _readable_now(kept.skipped, data, skip_first):
+    if (kept := _read_cache(stored)) is not None and not _has_become_readable(kept.skipped, data, skip_first):
         return kept
     corpus = _read_files(data, files, skip_first, progress or (lambda done, total: None))
     cache.mkdir(parents=True, exist_ok=True)
@@ -156,9 +157,9 @@ def read(
 def _read_files(data: Path, files: Sequence[Path], skip_first: bool, progress: Callable[[int, int], None]) -> Corpus:
     clips, names, skipped = [], [], []
     for number, file in enumerate(files, start=1):
-        name, found = file.relative_to(data).as_posix(), _usable(file, skip_first)
+        name, found = file.relative_to(data).as_posix(), _read_clip_or_reason(file, skip_first)
         if isinstance(found, str):
-            skipped.append(Skipped(name, found))
+            skipped.append(SkippedFile(name, found))
         else:
             clips.append(found)
             names.append(name)
@@ -169,10 +170,10 @@ def _read_files(data: Path, files: Sequence[Path], skip_first: bool, progress: C
     return Corpus(tuple(names), tuple(len(c) for c in clips), torch.cat(clips), tuple(skipped))
 
 
-def _usable(file: Path, skip_first: bool) -> Float[Tensor, "frames size"] | str:
+def _read_clip_or_reason(file: Path, skip_first: bool) -> Float[Tensor, "frames size"] | str:
     """The clip, or why there is none. What no reader foresaw is a reason too: one file must not end a run."""
     try:
-        return clip_features(file, skip_first=skip_first)
+        return read_clip_features(file, skip_first=skip_first)
     except (MapctlError, OSError) as error:
         # The list has the name already.
         return " ".join(str(error).split()).removeprefix(str(file)).lstrip(":, ")
@@ -180,12 +181,12 @@ def _usable(file: Path, skip_first: bool) -> Float[Tensor, "frames size"] | str:
         return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-def _readable_now(skipped: Sequence[Skipped], data: Path, skip_first: bool) -> bool:
+def _has_become_readable(skipped: Sequence[SkippedFile], data: Path, skip_first: bool) -> bool:
     """Whether a file can be used that could not, though it is the same: permissions, a network drive."""
-    return any(not isinstance(_usable(data / file.name, skip_first), str) for file in skipped)
+    return any(not isinstance(_read_clip_or_reason(data / file.name, skip_first), str) for file in skipped)
 
 
-def clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size"]:
+def read_clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size"]:
     """One file as features at 30 fps on the canonical joints; MapctlError, naming it, where that cannot be."""
     motion = load(file)
     if skip_first and motion.num_frames > 2:
@@ -200,7 +201,7 @@ def clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size
         raise MapctlError(f"{file}: {error}") from error
 
 
-def window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts"]:
+def find_window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts"]:
     """Index into the joined frames of every window that lies within one clip."""
     starts, first = [], 0
     for length in lengths:
@@ -212,21 +213,21 @@ def window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts
     return starts
 
 
-def folder_of_clips(corpus: Corpus) -> Int[Tensor, " clips"]:
+def number_clip_folders(corpus: Corpus) -> Int[Tensor, " clips"]:
     """By clip the number of the top folder that it lies in."""
     folders = [name.split("/")[0] for name in corpus.names]
     number = {folder: index for index, folder in enumerate(sorted(set(folders)))}
     return torch.tensor([number[folder] for folder in folders])
 
 
-def _fingerprint(data: Path, files: list[Path], skip_first: bool) -> str:
+def _compute_cache_key(data: Path, files: list[Path], skip_first: bool) -> str:
     """Of everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
-    parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known()), repr(ContactSettings()), str(skip_first)]
-    parts += [f"{f.relative_to(data)} {_state(f)}" for f in files]
+    parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known_rigs()), repr(ContactSettings()), str(skip_first)]
+    parts += [f"{f.relative_to(data)} {_read_file_stamp(f)}" for f in files]
     return sha256("\n".join(parts).encode(errors="surrogateescape")).hexdigest()[:16]
 
 
-def _state(file: Path) -> str:
+def _read_file_stamp(file: Path) -> str:
     """Size and time; of a link that leads nowhere nothing."""
     try:
         found = file.stat()
@@ -244,7 +245,7 @@ def _read_cache(stored: Path) -> Corpus | None:
                 tuple(index["names"]),
                 tuple(index["lengths"]),
                 file.get_tensor("features"),
-                tuple(Skipped(*row) for row in index["skipped"]),
+                tuple(SkippedFile(*row) for row in index["skipped"]),
             )
     except (OSError, SafetensorError, ValueError, KeyError, TypeError):
         return None

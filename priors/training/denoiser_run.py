@@ -6,7 +6,7 @@ from pathlib import Path
 from priors.denoiser.network import DenoiserConfig
 from priors.training.gathering import Progress
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, validate
-from priors.training.window_run import Kind, WindowRequest
+from priors.training.window_run import ModelKind, WindowRequest
 from priors.training.window_run import train as train_on_windows
 
 
@@ -20,11 +20,11 @@ class DenoiserRequest(WindowRequest[DenoiserConfig, DenoiserSettings]):
     """The recipe."""
 
 
-def _shape(config: DenoiserConfig) -> list[str]:
+def _format_shape(config: DenoiserConfig) -> list[str]:
     return [] if config.width == DenoiserConfig.width else [f"--width {config.width}"]
 
 
-KIND = Kind("denoiser", DenoiserTrainer, validate, _shape)
+KIND = ModelKind("denoiser", DenoiserTrainer, validate, _format_shape)
 
 
 def train(

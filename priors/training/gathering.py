@@ -7,17 +7,17 @@ from pathlib import Path
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
-from priors.training.corpus import Corpus, Skipped, Split, read, split
+from priors.training.corpus import Corpus, SkippedFile, Split, read_corpus, split_corpus
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
 
 _MOST_NAMED = 5
-_LIST = "skipped.txt"
+_SKIPPED_LIST = "skipped.txt"
 
 
 @dataclass(frozen=True)
-class Source:
+class DataSource:
     """Where motion comes from."""
 
     data: Path
@@ -34,7 +34,7 @@ class Source:
     """Of the split."""
 
 
-def gather(source: Source, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
+def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
     """The corpus and its parts; `warn` gets a line on files that were left out, RUN/skipped.txt has them all.
 
     RequestError where nothing is left, what is left cannot be split, or, if that is asked for, a file cannot be used.
@@ -44,34 +44,34 @@ def gather(source: Source, *, progress: Progress, warn: Progress) -> tuple[Corpu
         if done % 200 == 0 or done == total:
             progress(f"read {done} of {total} clips")
 
-    corpus = read(
+    corpus = read_corpus(
         source.data, match=source.match, cache=source.run / "cache", skip_first=source.skip_first, progress=news
     )
     if source.strict and corpus.skipped:
-        raise RequestError(f"--strict-data: {_listed(corpus.skipped, source.data)}")
-    parts = split(corpus, source.seed)
+        raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
+    parts = split_corpus(corpus, source.seed)
     if corpus.skipped:
-        rest = f"; all are in {source.run / _LIST}" if len(corpus.skipped) > _MOST_NAMED else ""
+        rest = f"; all are in {source.run / _SKIPPED_LIST}" if len(corpus.skipped) > _MOST_NAMED else ""
         of = len(corpus.names) + len(corpus.skipped)
-        warn(f"left out {len(corpus.skipped)} of {of} files: {_listed(corpus.skipped, source.data)}{rest}")
-        write_text(source.run / _LIST, "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
+        warn(f"left out {len(corpus.skipped)} of {of} files: {_list_skipped(corpus.skipped, source.data)}{rest}")
+        write_text(source.run / _SKIPPED_LIST, "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
     size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
-    progress(f"{size}; training on {len(parts.train.names)}{_held(parts)}")
+    progress(f"{size}; training on {len(parts.train.names)}{_describe_held_out(parts)}")
     return corpus, parts
 
 
-def of_card(corpus: Corpus) -> dict[str, dict[str, str]]:
+def describe_skipped(corpus: Corpus) -> dict[str, dict[str, str]]:
     """For a card's data: the files that were left out and why; nothing where there are none."""
     return {"skipped": {file.name: file.reason for file in corpus.skipped}} if corpus.skipped else {}
 
 
-def _listed(skipped: Sequence[Skipped], data: Path) -> str:
+def _list_skipped(skipped: Sequence[SkippedFile], data: Path) -> str:
     """The first few with their reasons, and how many more there are."""
     named = "; ".join(f"{data / file.name}: {file.reason}" for file in skipped[:_MOST_NAMED])
     return named + (f"; and {len(skipped) - _MOST_NAMED} more" if len(skipped) > _MOST_NAMED else "")
 
 
-def _held(parts: Split) -> str:
+def _describe_held_out(parts: Split) -> str:
     """What is held out where that is no whole clip."""
     if parts.validation is not parts.test:
         return ""

@@ -6,7 +6,7 @@ from pathlib import Path
 from priors.infiller.network import InfillerConfig
 from priors.training.gathering import Progress
 from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, validate
-from priors.training.window_run import Kind, WindowRequest
+from priors.training.window_run import ModelKind, WindowRequest
 from priors.training.window_run import train as train_on_windows
 
 
@@ -20,12 +20,12 @@ class InfillerRequest(WindowRequest[InfillerConfig, InfillerSettings]):
     """The recipe."""
 
 
-def _shape(config: InfillerConfig) -> list[str]:
+def _format_shape(config: InfillerConfig) -> list[str]:
     usual = InfillerConfig.architecture
     return [] if config.architecture == usual else [f"--architecture {config.architecture}"]
 
 
-KIND = Kind("infiller", InfillerTrainer, validate, _shape)
+KIND = ModelKind("infiller", InfillerTrainer, validate, _format_shape)
 
 
 def train(

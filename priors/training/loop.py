@@ -3,11 +3,11 @@
 import time
 from typing import Protocol, runtime_checkable
 
-from mapctl.runtime.interruption import Held, held_back
+from mapctl.runtime.interruption import DeferredSignals, defer_signals
 
 
 @runtime_checkable
-class Run(Protocol):
+class TrainingRun(Protocol):
     """A training run. Everything that a continuation needs is in what it saves."""
 
     @property
@@ -16,7 +16,7 @@ class Run(Protocol):
         ...
 
     @property
-    def judgement_due(self) -> bool:
+    def evaluation_due(self) -> bool:
         """Whether the weights as they are have still to be measured on held-out clips."""
         ...
 
@@ -33,20 +33,20 @@ class Run(Protocol):
         ...
 
 
-def go(run: Run, *, checkpoint_minutes: float) -> None:
+def run_to_end(run: TrainingRun, *, checkpoint_minutes: float) -> None:
     """To the end of the run. Ctrl-C or SIGTERM waits for the step under way, breaks a judgement off, saves a
     checkpoint and goes on as KeyboardInterrupt; sent again after a second, it does not wait for the step, and the last
     checkpoint is the one before.
     """
     saved, unsaved = time.monotonic(), False
-    with held_back() as held:
+    with defer_signals() as held:
         while True:
-            if run.judgement_due:
-                _judge(run, held)
+            if run.evaluation_due:
+                _evaluate_run(run, held)
                 unsaved = True
             overdue = time.monotonic() - saved > 60 * checkpoint_minutes
             if unsaved and (run.finished or overdue or held.wanted is not None):
-                _save(run, held)
+                _save_run(run, held)
                 saved, unsaved = time.monotonic(), False
             held.release()
             if run.finished:
@@ -55,15 +55,15 @@ def go(run: Run, *, checkpoint_minutes: float) -> None:
             unsaved = True
 
 
-def _judge(run: Run, held: Held) -> None:
+def _evaluate_run(run: TrainingRun, held: DeferredSignals) -> None:
     try:
-        with held.passing():
+        with held.let_through():
             run.judge()
     except KeyboardInterrupt:
-        _save(run, held)
+        _save_run(run, held)
         raise
 
 
-def _save(run: Run, held: Held) -> None:
-    with held.shut():
+def _save_run(run: TrainingRun, held: DeferredSignals) -> None:
+    with held.defer_all():
         run.save()

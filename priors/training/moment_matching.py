@@ -13,14 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, Place, ground_speed
+from mapctl.features import LAYOUT, GroundPose, ground_speed
 from mapctl.joint_roles import find_feet
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.terms.trial import Trial
-from priors.config import check_least
+from priors.config import require_at_least
 from priors.lstm_gmm.network import LstmGmm
 
-_PAST = 3  # frames of context that a third difference reaches back
+_PAST_FRAMES = 3  # frames of context that a third difference reaches back
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class MatchingSettings:
     """Weight of the features' means over the second half of the runs: squared difference in standard deviations."""
 
     def __post_init__(self):
-        check_least(self, _PAST, "batch", "context", "frames")
-        check_least(self, 1, "every")
+        require_at_least(self, _PAST_FRAMES, "batch", "context", "frames")
+        require_at_least(self, 1, "every")
 
 
-def mismatch(
+def free_run_moment_loss(
     model: LstmGmm, windows: Float[Tensor, "batch frames size"], settings: MatchingSettings, generator: torch.Generator
 ) -> Tensor:
     """How far free runs are from how the windows go on; differentiable in the network's weights.
@@ -67,8 +67,8 @@ def mismatch(
     length = windows.shape[1]
     context = min(settings.context, length // 2)
     frames = min(settings.frames, length - context)
-    if context < _PAST:
-        raise RequestError(f"free runs are matched in windows of at least {2 * _PAST} frames, got {length}")
+    if context < _PAST_FRAMES:
+        raise RequestError(f"free runs are matched in windows of at least {2 * _PAST_FRAMES} frames, got {length}")
     windows = windows[: settings.batch]
     state = model.advance(model.initial_state(windows[:, 0]), windows[:, 1:context])
     past, away = windows[:, :context], int(torch.randint(settings.wander + 1, (1,), generator=generator))
@@ -76,18 +76,18 @@ def mismatch(
         wandered, state = model.sample(state, away, generator)
         past = torch.cat([past, wandered], 1)
     made, _ = model.draw(state, frames, generator)
-    real = windows[:, context - _PAST : context + frames]
-    return compare(torch.cat([past[:, -_PAST:], made], 1), real, settings)
+    real = windows[:, context - _PAST_FRAMES : context + frames]
+    return moment_loss(torch.cat([past[:, -_PAST_FRAMES:], made], 1), real, settings)
 
 
-def compare(
+def moment_loss(
     made: Float[Tensor, "batch frames size"], real: Float[Tensor, "batch frames size"], settings: MatchingSettings
 ) -> Tensor:
     """Weighted squared log ratios of the moments; the first frames give differences their past and do not count."""
     ours, theirs = _Moments.of(made), _Moments.of(real)
     # Feet may be stiller than mocap's, not looser.
     feet = sum(_log_ratio(a, b).clamp(min=0).square() for a, b in zip(ours.feet, theirs.feet, strict=True))
-    pace = torch.stack([_log_ratio(made_, real_).mean() for made_, real_ in _by_pace(ours.pace, theirs.pace)])
+    pace = torch.stack([_log_ratio(made_, real_).mean() for made_, real_ in _pair_by_pace(ours.pace, theirs.pace)])
     return (
         settings.feet * feet
         + settings.jerk * _log_ratio(ours.jerk, theirs.jerk).square().mean()
@@ -118,26 +118,29 @@ class _Moments:
     @staticmethod
     def of(features: Float[Tensor, "batch frames size"]) -> "_Moments":
         batch = len(features)
-        origin = Place(features.new_zeros(batch, 2), features.new_zeros(batch))
+        origin = GroundPose(features.new_zeros(batch, 2), features.new_zeros(batch))
         continuous, bits = features[..., : LAYOUT.continuous], LAYOUT.pick(features, "contacts") > 0.5
         trial = Trial(features, origin, continuous, features[..., 0], bits, features.new_zeros(0, 21, 3))
         joints = trial.joints_world
         toes = joints[:, :, list(find_feet(CANONICAL))]
         steps = torch.diff(toes[..., ::2], dim=1).square().sum(-1) * trial.fps**2
-        held = (bits[:, 1:] & bits[:, :-1])[:, _PAST - 1 :].to(features.dtype)
+        held = (bits[:, 1:] & bits[:, :-1])[:, _PAST_FRAMES - 1 :].to(features.dtype)
         lift = (toes[:, 1:, :, 1] - TOE_REST_HEIGHT).square()
         jerk = torch.sqrt(torch.diff(joints, n=3, dim=1).square().sum(-1) + 1e-12) * trial.fps**3
         return _Moments(
-            feet=(_mean_where(held, steps[:, _PAST - 1 :]) + 1e-4, _mean_where(held, lift[:, _PAST - 1 :]) + 1e-5),
+            feet=(
+                _masked_mean(held, steps[:, _PAST_FRAMES - 1 :]) + 1e-4,
+                _masked_mean(held, lift[:, _PAST_FRAMES - 1 :]) + 1e-5,
+            ),
             jerk=jerk.mean((0, 1)) + 1.0,
-            pace=ground_speed(features[:, _PAST:]).mean(1) + 0.05,
-            spread=continuous[:, _PAST:].flatten(0, 1).std(0) + 1e-3,
-            change=torch.diff(continuous, dim=1)[:, _PAST - 1 :].abs().mean((0, 1)) + 1e-4,
+            pace=ground_speed(features[:, _PAST_FRAMES:]).mean(1) + 0.05,
+            spread=continuous[:, _PAST_FRAMES:].flatten(0, 1).std(0) + 1e-3,
+            change=torch.diff(continuous, dim=1)[:, _PAST_FRAMES - 1 :].abs().mean((0, 1)) + 1e-4,
             late=continuous[:, continuous.shape[1] // 2 :].mean((0, 1)),
         )
 
 
-def _mean_where(held: Tensor, values: Tensor) -> Tensor:
+def _masked_mean(held: Tensor, values: Tensor) -> Tensor:
     return (held * values).sum() / held.sum().clamp(min=1)
 
 
@@ -145,6 +148,6 @@ def _log_ratio(ours: Tensor, theirs: Tensor) -> Tensor:
     return torch.log(ours) - torch.log(theirs)
 
 
-def _by_pace(ours: Tensor, theirs: Tensor) -> list[tuple[Tensor, Tensor]]:
+def _pair_by_pace(ours: Tensor, theirs: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Our slowest quarter of the windows with mocap's slowest, and so on: walks must not make up for slow runs."""
     return list(zip(ours.sort().values.chunk(4), theirs.sort().values.chunk(4), strict=True))

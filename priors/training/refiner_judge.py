@@ -8,17 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import Place, decode
+from mapctl.features import GroundPose, decode
 from mapctl.metrics import measure
-from mapctl.metrics.realism import RealismSettings, canonical_positions, clip_windows
-from mapctl.metrics.realism.classifier import held_out_accuracy
+from mapctl.metrics.realism import RealismSettings, canonical_positions, cut_windows
+from mapctl.metrics.realism.classifier import compute_held_out_accuracy
 from priors import checkpoints
 from priors.refiner.network import LstmRefiner, RefinerNetwork
 from priors.training.corpus import Corpus, Split
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class RefinerEvaluator:
     """Measures refined samples beside the raw ones and mocap that training does not see."""
 
     raw: Float[Tensor, "count frames size"]
@@ -31,36 +31,36 @@ class Judge:
     """Of the classifier."""
 
     @staticmethod
-    def of(raw: Corpus, parts: Split, settings: RealismSettings) -> "Judge":
+    def of(raw: Corpus, parts: Split, settings: RealismSettings) -> "RefinerEvaluator":
         """Against validation and test clips."""
         clips = [c for part in (parts.validation, parts.test) for c in part.clips() if len(c) > settings.windows.frames]
-        motions = [decode(clip, Place.origin()) for clip in clips]
-        windows = [clip_windows(canonical_positions(motion), settings.windows) for motion in motions]
-        return Judge(torch.stack(raw.clips()), _means(clips), windows, settings)
+        motions = [decode(clip, GroundPose.origin()) for clip in clips]
+        windows = [cut_windows(canonical_positions(motion), settings.windows) for motion in motions]
+        return RefinerEvaluator(torch.stack(raw.clips()), _average_measures(clips), windows, settings)
 
     def __call__(self, network: RefinerNetwork) -> dict[str, float]:
         """Contact speed and jitter as ratios to mocap's, and the share told apart."""
         refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
         refined = refiner.refine(self.raw)
-        means = _means(list(refined))
+        means = _average_measures(list(refined))
         row = {
             f"{name}_ratio": means[name] / self.mocap[name]
             for name in ("contact_speed_cm_s", "jitter_m_s3")
             if self.mocap[name] > 0
         }
-        if min(len(refined), len(self.windows)) >= self.settings.fewest_clips:
+        if min(len(refined), len(self.windows)) >= self.settings.min_clips:
             made = [
-                clip_windows(canonical_positions(decode(clip, Place.origin())), self.settings.windows)
+                cut_windows(canonical_positions(decode(clip, GroundPose.origin())), self.settings.windows)
                 for clip in refined
             ]
             seeded = torch.Generator().manual_seed(0)
-            row["told_apart"] = held_out_accuracy(
+            row["told_apart"] = compute_held_out_accuracy(
                 made, self.windows, generator=seeded, settings=self.settings.classifier
             )
         return row
 
 
-def score(row: Mapping[str, float | None]) -> float:
+def compute_realism_gap(row: Mapping[str, float | None]) -> float:
     """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart.
 
     Infinite where a measure cannot be had, as of feet that never touch the floor.
@@ -72,9 +72,9 @@ def score(row: Mapping[str, float | None]) -> float:
     return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, told - 0.5)
 
 
-_NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.of_layout())
+_NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.layout_fields())
 
 
-def _means(clips: list[Tensor]) -> dict[str, float]:
-    rows = [measure(decode(clip, Place.origin())) for clip in clips]
+def _average_measures(clips: list[Tensor]) -> dict[str, float]:
+    rows = [measure(decode(clip, GroundPose.origin())) for clip in clips]
     return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}

@@ -19,15 +19,15 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.network import RefinerConfig
 from priors.training import loop, run_files
 from priors.training.corpus import Corpus
-from priors.training.gathering import Progress, Source, gather, of_card
-from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
-from priors.training.refiner_judge import Judge, score
+from priors.training.gathering import DataSource, Progress, describe_skipped, gather
+from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, RoundLosses
+from priors.training.refiner_judge import RefinerEvaluator, compute_realism_gap
 
 Row = dict[str, float | None]
 """Measures of held-out samples; None stands for what is not finite."""
 
-_WARM_UP = 60  # frames of a clip that the density has seen before it is let go
-_WON = 0.98  # share that the critic tells apart, over a report, from which it has won
+_WARM_UP_FRAMES = 60  # frames of a clip that the density has seen before it is let go
+_CRITIC_WON = 0.98  # share that the critic tells apart, over a report, from which it has won
 
 
 @dataclass(frozen=True)
@@ -77,56 +77,58 @@ def train(
     Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
     the same weights bit for bit on one machine.
     """
-    _check(request)
+    _check_request(request)
     prior = density.load(request.density)
     match = prior.card.data.get("match", "") if request.match is None else request.match
     seed = prior.card.data.get("split_seed", request.settings.seed)
-    source = Source(request.data, request.out, match, strict=request.strict_data, seed=seed)
+    source = DataSource(request.data, request.out, match, strict=request.strict_data, seed=seed)
     corpus, parts = gather(source, progress=progress, warn=warn)
     generator = torch.Generator().manual_seed(request.settings.seed)
     frames = round(request.seconds * 30)
-    raw = sampled(prior, parts.train, request.samples, frames, generator)
-    judge = Judge.of(sampled(prior, parts.train, request.judged, frames, generator), parts, request.realism)
+    raw = sample_corpus(prior, parts.train, request.samples, frames, generator)
+    judge = RefinerEvaluator.of(
+        sample_corpus(prior, parts.train, request.judged, frames, generator), parts, request.realism
+    )
     trainer = AdversarialTrainer(request.config, request.settings, parts.train, raw)
     data = corpus.identity() | {"density": request.density, "match": match}
-    run = _Run(request, trainer, judge, data, of_card(corpus), progress)
-    loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
+    run = _RefinerRun(request, trainer, judge, data, describe_skipped(corpus), progress)
+    loop.run_to_end(run, checkpoint_minutes=request.checkpoint_minutes)
     return run.export(prior, raw)
 
 
-def sampled(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, generator: torch.Generator) -> Corpus:
+def sample_corpus(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, generator: torch.Generator) -> Corpus:
     """Free runs of the density, each after two seconds of a clip; clips are drawn by their length.
 
     So the samples have the data's own shares of gaits and speeds, and the critic is left with their quality.
     """
-    clips = [clip for clip in corpus.clips() if len(clip) >= _WARM_UP]
+    clips = [clip for clip in corpus.clips() if len(clip) >= _WARM_UP_FRAMES]
     lengths = torch.tensor([float(len(clip)) for clip in clips])
     picked = torch.multinomial(lengths, count, replacement=True, generator=generator).tolist()
     state = prior.initial_state(torch.stack([clips[i][0] for i in picked]))
-    state = prior.advance(state, torch.stack([clips[i][1:_WARM_UP] for i in picked]))
+    state = prior.advance(state, torch.stack([clips[i][1:_WARM_UP_FRAMES] for i in picked]))
     features, _ = prior.sample(state, frames, generator)
     return Corpus(tuple(f"sample {k}" for k in range(count)), (frames,) * count, features.float().flatten(0, 1))
 
 
-class _Run:
+class _RefinerRun:
     """What `loop.go` does to a trainer, its guard and its checkpoints."""
 
     def __init__(
         self,
         request: RefinerRequest,
         trainer: AdversarialTrainer,
-        judge: Judge,
+        judge: RefinerEvaluator,
         data: dict[str, str],
         skipped: dict[str, dict[str, str]],
         progress: Progress,
     ):
         self.request, self.trainer, self.data, self.progress = request, trainer, data, progress
-        self.judge_samples, self.skipped = judge, skipped
+        self.evaluator, self.skipped = judge, skipped
         self.curve: list[Row] = []
-        self.losses: list[Losses] = []  # since the last line of news but one, where there has just been one
-        self.verdict: str | None = None
-        self.began = time.monotonic()
-        self.best = {name: value.clone() for name, value in trainer.averaged.state_dict().items()}
+        self.losses: list[RoundLosses] = []  # since the last line of news but one, where there has just been one
+        self.stop_reason: str | None = None
+        self.started_at = time.monotonic()
+        self.best = {name: value.clone() for name, value in trainer.averaged_refiner.state_dict().items()}
         if request.resume:
             self._load()
             progress(f"resumed at round {trainer.round}")
@@ -137,30 +139,30 @@ class _Run:
     @property
     def finished(self) -> bool:
         """At the end of the recipe, or where one side has won."""
-        return self.verdict is not None or self.trainer.round >= self.request.settings.rounds
+        return self.stop_reason is not None or self.trainer.round >= self.request.settings.rounds
 
     @property
-    def judgement_due(self) -> bool:
+    def evaluation_due(self) -> bool:
         """At some lines of news and at the end of the recipe."""
         measured = bool(self.curve) and self.curve[-1]["round"] == self.trainer.round
         last = self.trainer.round >= self.request.settings.rounds
-        at_last = last or (self._reported and self.trainer.round % self.request.judge_rounds == 0)
-        return at_last and not measured and self.verdict is None
+        at_last = last or (self._is_report_due and self.trainer.round % self.request.judge_rounds == 0)
+        return at_last and not measured and self.stop_reason is None
 
     @property
-    def _reported(self) -> bool:
+    def _is_report_due(self) -> bool:
         return self.trainer.round % self.request.report_rounds == 0
 
     def update(self) -> None:
         """One round."""
-        if self._reported:
+        if self._is_report_due:
             self.losses = []
         self.losses.append(self.trainer.train_round())
-        if self._reported or self.trainer.round >= self.request.settings.rounds:
-            self._report(time.monotonic() - self.began)
-        self.verdict = self._verdict()
-        if self.verdict is not None:
-            self.progress(f"{self.verdict}: training ends with the best refiner seen")
+        if self._is_report_due or self.trainer.round >= self.request.settings.rounds:
+            self._report(time.monotonic() - self.started_at)
+        self.stop_reason = self._find_stop_reason()
+        if self.stop_reason is not None:
+            self.progress(f"{self.stop_reason}: training ends with the best refiner seen")
 
     def export(self, prior: LstmGmmDensity, raw: Corpus) -> Path:
         """Write the best refiner in float16 with its card."""
@@ -176,9 +178,13 @@ class _Run:
                 **self.data,
                 **self.skipped,
             },
-            training={"settings": asdict(request.settings), "curve": self.curve, "command": command(request)},
-            quality=min(self.curve, key=score),
-            **checkpoints.Card.of_layout(),
+            training={
+                "settings": asdict(request.settings),
+                "curve": self.curve,
+                "command": format_refiner_command(request),
+            },
+            quality=min(self.curve, key=compute_realism_gap),
+            **checkpoints.Card.layout_fields(),
         )
         checkpoints.save(self.best, card, path)
         return path
@@ -189,20 +195,20 @@ class _Run:
             f" {self._mean('told'):.2f} told apart, {self.losses[-1].updates} updates, {seconds:.0f} s"
         )
 
-    def _verdict(self) -> str | None:
+    def _find_stop_reason(self) -> str | None:
         """Why to stop, if there is a reason."""
         if not self.losses[-1].finite:
             return f"training diverged at round {self.trainer.round}"
-        if len(self.losses) >= self.request.report_rounds and self._mean("told") > _WON:
+        if len(self.losses) >= self.request.report_rounds and self._mean("told") > _CRITIC_WON:
             return "the critic has won"
         return None
 
     def judge(self) -> None:
         """A row of the curve; the best refiner is kept."""
-        row = self.judge_samples(self.trainer.averaged)
-        if not self.curve or score(row) < min(score(before) for before in self.curve):
-            self.best = {name: value.clone() for name, value in self.trainer.averaged.state_dict().items()}
-        row |= {"round": self.trainer.round, "score": score(row)}
+        row = self.evaluator(self.trainer.averaged_refiner)
+        if not self.curve or compute_realism_gap(row) < min(compute_realism_gap(before) for before in self.curve):
+            self.best = {name: value.clone() for name, value in self.trainer.averaged_refiner.state_dict().items()}
+        row |= {"round": self.trainer.round, "score": compute_realism_gap(row)}
         row |= {f"{kind}_loss": self._mean(kind) for kind in ("refiner", "critic") if self.losses}
         self.curve.append({name: value if math.isfinite(value) else None for name, value in row.items()})
         self.progress(json.dumps(self.curve[-1]))
@@ -212,11 +218,11 @@ class _Run:
 
     def save(self) -> None:
         """A checkpoint, unless training went wrong since the last: what is resumed there comes to the same end."""
-        if self.verdict is not None:
+        if self.stop_reason is not None:
             return
         tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
         index = self._index() | {"losses": [asdict(loss) for loss in self.losses]}
-        run_files.write(self.request.out, step=self.trainer.round, tensors=tensors, index=index)
+        run_files.write_checkpoint(self.request.out, step=self.trainer.round, tensors=tensors, index=index)
 
     def _index(self) -> dict:
         request = self.request
@@ -230,18 +236,18 @@ class _Run:
     def _load(self) -> None:
         out = self.request.out
         try:
-            index, tensors = run_files.read(out)
+            index, tensors = run_files.read_checkpoint(out)
             for part in ("settings", "network", "data"):
-                run_files.check_same(out, part, then=index[part], now=self._index()[part])
-            self.curve = run_files.rows(index, "round")
-            self.losses = [Losses(**row) for row in index["losses"]]
+                run_files.check_unchanged(out, part, then=index[part], now=self._index()[part])
+            self.curve = run_files.parse_curve(index, "round")
+            self.losses = [RoundLosses(**row) for row in index["losses"]]
             self.best = {name: tensors[f"best.{name}"] for name in self.best}
             self.trainer.load_state(tensors)
-        except run_files.BROKEN as error:
-            raise run_files.unreadable(out, error) from error
+        except run_files.UNREADABLE_ERRORS as error:
+            raise run_files.make_unreadable_error(out, error) from error
 
 
-def command(request: RefinerRequest) -> str:
+def format_refiner_command(request: RefinerRequest) -> str:
     """What to type for the same run, for the card; options that are the defaults are left out."""
     paper, wanted = request.config == PAPER[0], request.settings
     default = PAPER[1] if paper else AdversarialSettings()
@@ -253,8 +259,8 @@ def command(request: RefinerRequest) -> str:
     return " ".join(parts + ["--bfloat16"] * wanted.bfloat16 + ["--paper"] * paper)
 
 
-def _check(request: RefinerRequest) -> None:
+def _check_request(request: RefinerRequest) -> None:
     """Before anything is read."""
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
-    run_files.check_begin(request.out, resume=request.resume)
+    run_files.check_run_folder(request.out, resume=request.resume)

@@ -9,23 +9,28 @@ from pathlib import Path
 import torch
 
 from mapctl.errors import RequestError
-from mapctl.features import Place, decode
-from mapctl.metrics import reference
-from mapctl.metrics.states import state_summary
+from mapctl.features import GroundPose, decode
+from mapctl.metrics import compute_reference
+from mapctl.metrics.states import summarise_states
 from priors import checkpoints
-from priors.config import check_least
+from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import loop, resume, run_files
-from priors.training.free_run import free_run
-from priors.training.gathering import Progress, Source, gather, of_card
-from priors.training.initial_states import abilities, choose
-from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings, validation_nats, window_nats
+from priors.training.free_run import measure_free_runs
+from priors.training.gathering import DataSource, Progress, describe_skipped, gather
+from priors.training.initial_states import measure_data_limits, select_initial_states
+from priors.training.recipes.lstm_gmm import (
+    DensityTrainer,
+    TrainingSettings,
+    compute_validation_nats,
+    compute_window_nats,
+)
 
 
 @dataclass(frozen=True)
-class TrainRequest:
+class DensityRequest:
     """What to train on, and how."""
 
     data: Path
@@ -62,10 +67,12 @@ class TrainRequest:
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
     def __post_init__(self):
-        check_least(self, 1, "starts", "report_steps", "validate_steps")
+        require_at_least(self, 1, "starts", "report_steps", "validate_steps")
 
 
-def train(request: TrainRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None) -> Path:
+def train(
+    request: DensityRequest, progress: Progress = lambda line: None, *, warn: Progress = lambda line: None
+) -> Path:
     """Train to the end of the recipe and write RUN/model.safetensors; returns its path. `warn` is told of files that
     cannot be used.
 
@@ -73,15 +80,15 @@ def train(request: TrainRequest, progress: Progress = lambda line: None, *, warn
     the same weights bit for bit on one machine. MapctlError where training diverges; the last checkpoint then stays as
     it was.
     """
-    device = _device(request.device)
+    device = _select_device(request.device)
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
-    run_files.check_begin(request.out, resume=request.resume)
-    source = Source(
+    run_files.check_run_folder(request.out, resume=request.resume)
+    source = DataSource(
         request.data, request.out, request.match, request.skip_first, request.strict_data, request.settings.seed
     )
     corpus, parts = gather(source, progress=progress, warn=warn)
-    trainer = _trainer(request, parts.train, device)
+    trainer = _make_trainer(request, parts.train, device)
     data = corpus.identity() | {
         "match": request.match,
         "split seed": str(request.settings.seed),
@@ -89,17 +96,21 @@ def train(request: TrainRequest, progress: Progress = lambda line: None, *, warn
         "init": request.init or "",
     }
     curve = _resume(request, trainer, data, progress)
-    loop.go(_Run(request, trainer, parts, curve, data, progress), checkpoint_minutes=request.checkpoint_minutes)
+    loop.run_to_end(
+        _DensityRun(request, trainer, parts, curve, data, progress), checkpoint_minutes=request.checkpoint_minutes
+    )
     return export(request, trainer, corpus, parts, curve)
 
 
-def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trainer:
+def _make_trainer(request: DensityRequest, corpus: corpora.Corpus, device: str) -> DensityTrainer:
     """A new network for the corpus' labels, or the one to begin with and its own labels."""
     known = labels.read(corpus.names, request.labels)
     if request.init is None:
-        return Trainer(replace(request.config, labels=known.names), request.settings, corpus, device, labels=known)
+        return DensityTrainer(
+            replace(request.config, labels=known.names), request.settings, corpus, device, labels=known
+        )
     before = density.load(request.init).reference
-    return Trainer(
+    return DensityTrainer(
         before.config,
         request.settings,
         corpus,
@@ -110,11 +121,11 @@ def _trainer(request: TrainRequest, corpus: corpora.Corpus, device: str) -> Trai
 
 
 def export(
-    request: TrainRequest, trainer: Trainer, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve
+    request: DensityRequest, trainer: DensityTrainer, corpus: corpora.Corpus, parts: corpora.Split, curve: resume.Curve
 ) -> Path:
     """Write the model in float16 with its starts and card."""
     model = trainer.model.cpu().eval()
-    found = choose(
+    found = select_initial_states(
         model, parts.train, count=request.starts, generator=torch.Generator().manual_seed(request.settings.seed)
     )
     tensors = dict(model.state_dict())
@@ -126,12 +137,12 @@ def export(
         "starts.weight": found.weight,
     }
     path = request.out / "model.safetensors"
-    checkpoints.save(tensors, _card(request, model, corpus, parts, curve, found.names), path)
+    checkpoints.save(tensors, _make_card(request, model, corpus, parts, curve, found.names), path)
     return path
 
 
-def _card(
-    request: TrainRequest,
+def _make_card(
+    request: DensityRequest,
     model: LstmGmm,
     corpus: corpora.Corpus,
     parts: corpora.Split,
@@ -141,19 +152,19 @@ def _card(
     data = {
         "clips": len(corpus.names),
         "frames": len(corpus.features),
-        **of_card(corpus),
+        **describe_skipped(corpus),
         "match": request.match,
         "labels": request.labels,
         "split_seed": request.settings.seed,
         "starts": list(starts),
         "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)},
     }
-    training = {"command": command(request), "settings": asdict(request.settings), "curve": curve}
+    training = {"command": format_density_command(request), "settings": asdict(request.settings), "curve": curve}
     quality = {
-        "test_nats_per_frame": validation_nats(model, parts.test),
-        "windows": window_nats(model, (parts.validation, parts.test)),
-        "mocap": _mocap(parts),
-        "data": state_summary(parts.train.features),
+        "test_nats_per_frame": compute_validation_nats(model, parts.test),
+        "windows": compute_window_nats(model, (parts.validation, parts.test)),
+        "mocap": _measure_mocap(parts),
+        "data": summarise_states(parts.train.features),
     }
     return checkpoints.Card(
         kind="lstm-gmm",
@@ -162,12 +173,12 @@ def _card(
         data=data,
         training=training,
         quality=quality,
-        abilities=asdict(abilities(parts.train)),
-        **checkpoints.Card.of_layout(),
+        abilities=asdict(measure_data_limits(parts.train)),
+        **checkpoints.Card.layout_fields(),
     )
 
 
-def command(request: TrainRequest) -> str:
+def format_density_command(request: DensityRequest) -> str:
     """What to type for the same run, for the card; options that are the defaults are left out."""
     plain, parts = TrainingSettings(), [f"mapctl train lstm-gmm --data DATA -o RUN --match '{request.match}'"]
     parts += [f"--labels '{request.labels}'"] if request.labels else []
@@ -180,20 +191,20 @@ def command(request: TrainRequest) -> str:
     return " ".join(parts) + (" --paper" if request.config.retain == 0 else "")
 
 
-def _mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
+def _measure_mocap(parts: corpora.Split) -> dict[str, dict[str, float]]:
     """What the clips kept from training show in every measure: mean, 2nd and 98th percentile (NaN left out)."""
-    held = [decode(clip, Place.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
-    table = {name: spread._asdict() for name, spread in reference(held).items()}
+    held = [decode(clip, GroundPose.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
+    table = {name: spread._asdict() for name, spread in compute_reference(held).items()}
     return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
 
 
-class _Run:
+class _DensityRun:
     """What `loop.go` does to a trainer, its curve and its checkpoints."""
 
     def __init__(
         self,
-        request: TrainRequest,
-        trainer: Trainer,
+        request: DensityRequest,
+        trainer: DensityTrainer,
         parts: corpora.Split,
         curve: resume.Curve,
         data: dict[str, str],
@@ -202,7 +213,7 @@ class _Run:
         self.request, self.trainer, self.parts, self.curve = request, trainer, parts, curve
         self.data, self.progress = data, progress
         self.losses: list[float] = []  # since the last line of news
-        self.began = time.monotonic()
+        self.started_at = time.monotonic()
 
     @property
     def finished(self) -> bool:
@@ -210,7 +221,7 @@ class _Run:
         return self.trainer.step >= self.request.settings.steps
 
     @property
-    def judgement_due(self) -> bool:
+    def evaluation_due(self) -> bool:
         """Every so many steps and at the end."""
         step, measured = self.trainer.step, (self.curve[-1]["step"] or 0) if self.curve else 0
         return step > measured and (self.finished or step % self.request.validate_steps == 0)
@@ -221,7 +232,7 @@ class _Run:
         losses.append(self.trainer.train_step())
         step = self.trainer.step
         if self.finished or step % self.request.report_steps == 0:
-            mean, seconds = sum(losses) / len(losses), time.monotonic() - self.began
+            mean, seconds = sum(losses) / len(losses), time.monotonic() - self.started_at
             self.progress(f"step {step}: {mean:.2f} nats, {seconds:.0f} s")
             losses.clear()
 
@@ -237,19 +248,19 @@ class _Run:
         resume.save(self.request.out, self.trainer, self.curve, self.data)
 
 
-def _validate(trainer: Trainer, parts: corpora.Split) -> dict[str, float | None]:
+def _validate(trainer: DensityTrainer, parts: corpora.Split) -> dict[str, float | None]:
     """Validation likelihood and the free-run health gate: likelihood does not predict stability (design, 11.2).
 
     None stands for what is not finite, as after a free run that exploded.
     """
     trainer.model.eval()
-    row = {"step": trainer.step, "validation_nats": validation_nats(trainer.model, parts.validation)}
-    row |= free_run(trainer.model, parts.validation)
+    row = {"step": trainer.step, "validation_nats": compute_validation_nats(trainer.model, parts.validation)}
+    row |= measure_free_runs(trainer.model, parts.validation)
     trainer.model.train()
     return {name: value if math.isfinite(value) else None for name, value in row.items()}
 
 
-def _resume(request: TrainRequest, trainer: Trainer, data: dict[str, str], progress: Progress) -> resume.Curve:
+def _resume(request: DensityRequest, trainer: DensityTrainer, data: dict[str, str], progress: Progress) -> resume.Curve:
     if not request.resume:
         request.out.mkdir(parents=True, exist_ok=True)
         return []
@@ -258,7 +269,7 @@ def _resume(request: TrainRequest, trainer: Trainer, data: dict[str, str], progr
     return curve
 
 
-def _device(wanted: str) -> str:
+def _select_device(wanted: str) -> str:
     if wanted not in ("auto", "cpu", "cuda"):
         raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
     if wanted == "cuda" and not torch.cuda.is_available():

@@ -11,37 +11,46 @@ from safetensors.torch import load_file
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.formats.atomic import atomic_path, check_folder
-from priors.checkpoints import as_json
+from priors.checkpoints import encode_json
 from priors.tensor_files import write_tensors
 
 _TENSORS, _INDEX = "checkpoint.safetensors", "checkpoint.json"
 
 # What json, safetensors and torch raise for files that are damaged or are something else.
-BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError, SafetensorError)
+UNREADABLE_ERRORS = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    IndexError,
+    RuntimeError,
+    SafetensorError,
+)
 
 
-def exists(run: Path) -> bool:
+def has_checkpoint(run: Path) -> bool:
     """Whether the run folder holds a checkpoint."""
     return (run / _INDEX).exists()
 
 
-def check_begin(run: Path, *, resume: bool) -> None:
+def check_run_folder(run: Path, *, resume: bool) -> None:
     """Before anything is read: the folder can be written, and holds a checkpoint if and only if it is to be resumed."""
     check_folder(run)
-    present = exists(run)
+    present = has_checkpoint(run)
     if resume and not present:
         raise CheckpointError(f"{run} holds no checkpoint to resume from")
     if present and not resume:
         raise RequestError(f"{run} already holds a run; pass --resume to continue it, or choose another folder")
 
 
-def write(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor], index: Mapping[str, Any]) -> None:
+def write_checkpoint(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor], index: Mapping[str, Any]) -> None:
     """The index names the tensors' file of its own step, so a kill between the two leaves a pair that fits.
 
     RequestError where they cannot be written, as on a full disk; the last pair is then as it was.
     """
     name = f"step-{step}-{_TENSORS}"
-    text = as_json({"tensors": name, "step": step, **index}, run / _INDEX)
+    text = encode_json({"tensors": name, "step": step, **index}, run / _INDEX)
     with atomic_path(run / _INDEX) as scratch:
         scratch.write_text(text, encoding="utf-8")
         write_tensors(run / name, tensors)
@@ -50,26 +59,26 @@ def write(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor], index: M
             old.unlink()
 
 
-def read(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+def read_checkpoint(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Index and tensors; one of BROKEN where they cannot be read."""
     index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
     return index, load_file(run / index["tensors"])
 
 
-def rows(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:
+def parse_curve(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:
     """The curve that an index holds; one of BROKEN unless every row says at what `count` it was measured."""
     return [{**row, count: int(row[count])} for row in index["curve"]]
 
 
-def last_step(run: Path) -> int | None:
+def read_last_step(run: Path) -> int | None:
     """Of the run folder's checkpoint; None where there is none that can be read."""
     try:
         return int(json.loads((run / _INDEX).read_text(encoding="utf-8"))["step"])
-    except BROKEN:
+    except UNREADABLE_ERRORS:
         return None
 
 
-def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, torch.Tensor]:
+def flatten_optimiser(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, torch.Tensor]:
     """What an optimiser keeps of each weight, flat."""
     return {
         f"{prefix}.{number}.{key}": torch.as_tensor(value)
@@ -78,10 +87,10 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str
     }
 
 
-def optimiser_state(
+def unflatten_optimiser(
     optimiser: torch.optim.Optimizer, prefix: str, tensors: Mapping[str, torch.Tensor]
 ) -> dict[str, Any]:
-    """For `load_state_dict`, from what `optimiser_tensors` gave; KeyError unless it is whole."""
+    """For `load_state_dict`, from what `flatten_optimiser` gave; KeyError unless it is whole."""
     state: dict[int, dict[str, torch.Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith(f"{prefix}."):
@@ -94,13 +103,13 @@ def optimiser_state(
     return {"state": state, "param_groups": groups}
 
 
-def check_same(run: Path, part: str, *, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def check_unchanged(run: Path, part: str, *, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """CheckpointError that names what has changed since the run was begun."""
     changed = [f"{name}: {then.get(name)} then, {value} now" for name, value in now.items() if then.get(name) != value]
     if changed:
         raise CheckpointError(f"{run}: the run was begun with other {part} ({'; '.join(changed)})")
 
 
-def unreadable(run: Path, error: Exception) -> CheckpointError:
+def make_unreadable_error(run: Path, error: Exception) -> CheckpointError:
     """For a checkpoint that raised one of BROKEN."""
     return CheckpointError(f"{run}: no readable checkpoint ({' '.join(f'{type(error).__name__}: {error}'.split())})")

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from priors.training import run_files
 
-_WARM_UP = 0.05  # share of the steps in which the learning rate rises
-_LONGEST_GRADIENT = 1.0
+_WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
+_MAX_GRADIENT_NORM = 1.0
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -35,11 +35,11 @@ class Trainer(ABC, Generic[Network]):
     def train_step(self) -> dict[str, float]:
         """One update; the parts of its loss."""
         for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate * warm_cosine(self.step, self.steps)
+            group["lr"] = self.learning_rate * warmup_cosine(self.step, self.steps)
         parts = self.losses()
         self.optimiser.zero_grad()
         parts["loss"].backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
         self.optimiser.step()
         self.step += 1
         return {name: float(value.detach()) for name, value in parts.items()}
@@ -47,21 +47,21 @@ class Trainer(ABC, Generic[Network]):
     def state(self) -> dict[str, Tensor]:
         """Everything that a bit-exact continuation needs, but the step."""
         tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= run_files.optimiser_tensors(self.optimiser, "optimiser")
+        tensors |= run_files.flatten_optimiser(self.optimiser, "optimiser")
         return tensors | {"generator": self.generator.get_state()}
 
     def load_state(self, tensors: dict[str, Tensor], step: int) -> None:
         """Inverse of `state`; KeyError or RuntimeError for tensors that are not its."""
         own = {n.removeprefix("network."): t for n, t in tensors.items() if n.startswith("network.")}
         self.network.load_state_dict(own)
-        self.optimiser.load_state_dict(run_files.optimiser_state(self.optimiser, "optimiser", tensors))
+        self.optimiser.load_state_dict(run_files.unflatten_optimiser(self.optimiser, "optimiser", tensors))
         self.generator.set_state(tensors["generator"])
         self.step = step
 
 
-def warm_cosine(step: int, steps: int) -> float:
+def warmup_cosine(step: int, steps: int) -> float:
     """Share of the highest learning rate: rising, then along a cosine to nothing."""
-    rise = max(1, round(_WARM_UP * steps))
+    rise = max(1, round(_WARM_UP_SHARE * steps))
     if step < rise:
         return (step + 1) / rise
     return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))

@@ -15,12 +15,12 @@ from priors import checkpoints
 from priors.config import NetworkConfig
 from priors.training import corpus as corpora
 from priors.training import loop, run_files
-from priors.training.gathering import Progress, Source, gather, of_card
+from priors.training.gathering import DataSource, Progress, describe_skipped, gather
 from priors.training.trainer import Trainer
 
 
 @runtime_checkable
-class Settings(Protocol):
+class RecipeSettings(Protocol):
     """A recipe: a frozen dataclass with at least these fields."""
 
     @property
@@ -35,7 +35,7 @@ class Settings(Protocol):
 
 
 C = TypeVar("C", bound=NetworkConfig)
-S = TypeVar("S", bound=Settings)
+S = TypeVar("S", bound=RecipeSettings)
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class WindowRequest(Generic[C, S]):
 
 
 @dataclass(frozen=True)
-class Kind(Generic[C, S]):
+class ModelKind(Generic[C, S]):
     """What tells one model's training from another's."""
 
     name: str
@@ -86,7 +86,7 @@ class Kind(Generic[C, S]):
 
 def train(
     request: WindowRequest[C, S],
-    kind: Kind[C, S],
+    kind: ModelKind[C, S],
     progress: Progress = lambda line: None,
     *,
     warn: Progress = lambda line: None,
@@ -99,42 +99,42 @@ def train(
     """
     if not request.data.is_dir():
         raise RequestError(f"{request.data} is not a folder of BVH files")
-    run_files.check_begin(request.out, resume=request.resume)
-    source = Source(
+    run_files.check_run_folder(request.out, resume=request.resume)
+    source = DataSource(
         request.data, request.out, request.match, request.skip_first, request.strict_data, request.settings.seed
     )
     corpus, parts = gather(source, progress=progress, warn=warn)
-    run = _Run(request, kind, corpus, parts, progress)
-    loop.go(run, checkpoint_minutes=request.checkpoint_minutes)
+    run = _WindowRun(request, kind, corpus, parts, progress)
+    loop.run_to_end(run, checkpoint_minutes=request.checkpoint_minutes)
     return run.export()
 
 
-class _Run(Generic[C, S]):
+class _WindowRun(Generic[C, S]):
     """What `loop.go` does to a trainer, its curve and its checkpoints."""
 
     def __init__(
         self,
         request: WindowRequest[C, S],
-        kind: Kind[C, S],
+        kind: ModelKind[C, S],
         corpus: corpora.Corpus,
         parts: corpora.Split,
         progress: Progress,
     ):
         self.request, self.kind, self.parts, self.progress = request, kind, parts, progress
-        self.data, self.skipped = corpus.identity(), of_card(corpus)
+        self.data, self.skipped = corpus.identity(), describe_skipped(corpus)
         self.trainer = kind.trainer(request.config, request.settings, parts.train)
         self.curve: list[dict[str, float]] = []
-        self.news: list[dict[str, float]] = []  # since the last line
-        self.began = time.monotonic()
+        self.recent_losses: list[dict[str, float]] = []  # since the last line
+        self.started_at = time.monotonic()
         if request.resume:
             self._load()
             progress(f"resumed at step {self.trainer.step}")
         else:
             request.out.mkdir(parents=True, exist_ok=True)
             if request.init is not None:
-                self._begin_with(request.init)
+                self._load_initial_weights(request.init)
 
-    def _begin_with(self, name: str) -> None:
+    def _load_initial_weights(self, name: str) -> None:
         """Another model's weights; CheckpointError if they are not of this network."""
         tensors, card = checkpoints.load(checkpoints.locate(name))
         if card.kind != self.kind.name or card.config != self.request.config.as_card():
@@ -148,21 +148,21 @@ class _Run(Generic[C, S]):
         return self.trainer.step >= self.request.settings.steps
 
     @property
-    def judgement_due(self) -> bool:
+    def evaluation_due(self) -> bool:
         """Every so many steps and at the end."""
         step, measured = self.trainer.step, self.curve[-1]["step"] if self.curve else 0
         return step > measured and (self.finished or step % self.request.validate_steps == 0)
 
     def update(self) -> None:
         """One step; MapctlError where its loss is no number."""
-        trainer, news = self.trainer, self.news
+        trainer, news = self.trainer, self.recent_losses
         news.append(trainer.train_step())
         if not math.isfinite(news[-1]["loss"]):
             raise MapctlError(f"training diverged at step {trainer.step}; the last checkpoint is as it was")
         if self.finished or trainer.step % self.request.report_steps == 0:
             means = {name: sum(row[name] for row in news) / len(news) for name in news[0]}
             told = ", ".join(f"{name} {value:.3f}" for name, value in means.items())
-            self.progress(f"step {trainer.step}: {told}, {time.monotonic() - self.began:.0f} s")
+            self.progress(f"step {trainer.step}: {told}, {time.monotonic() - self.started_at:.0f} s")
             news.clear()
 
     def judge(self) -> None:
@@ -187,12 +187,12 @@ class _Run(Generic[C, S]):
                 "held_out": held,
             },
             training={
-                "settings": _fields(request.settings),
+                "settings": _settings_to_dict(request.settings),
                 "curve": self.curve,
-                "command": command(request, self.kind),
+                "command": format_window_command(request, self.kind),
             },
             quality={"test": self.kind.validate(self.trainer.network, self.parts.test, request.settings)},
-            **checkpoints.Card.of_layout(),
+            **checkpoints.Card.layout_fields(),
         )
         checkpoints.save(self.trainer.network.state_dict(), card, path)
         return path
@@ -200,22 +200,22 @@ class _Run(Generic[C, S]):
     def save(self) -> None:
         """A checkpoint."""
         index = {**self._recipe(), "curve": self.curve}
-        run_files.write(self.request.out, step=self.trainer.step, tensors=self.trainer.state(), index=index)
+        run_files.write_checkpoint(self.request.out, step=self.trainer.step, tensors=self.trainer.state(), index=index)
 
     def _load(self) -> None:
         out = self.request.out
         try:
-            index, tensors = run_files.read(out)
+            index, tensors = run_files.read_checkpoint(out)
             for part, now in self._recipe().items():
-                run_files.check_same(out, part, then=index[part], now=now)
-            self.curve = run_files.rows(index, "step")
+                run_files.check_unchanged(out, part, then=index[part], now=now)
+            self.curve = run_files.parse_curve(index, "step")
             self.trainer.load_state(tensors, int(index["step"]))
-        except run_files.BROKEN as error:
-            raise run_files.unreadable(out, error) from error
+        except run_files.UNREADABLE_ERRORS as error:
+            raise run_files.make_unreadable_error(out, error) from error
 
     def _recipe(self) -> dict[str, dict]:
         """What must not change between a run's parts, as JSON gives it back."""
-        settings = json.loads(json.dumps(_fields(self.request.settings)))
+        settings = json.loads(json.dumps(_settings_to_dict(self.request.settings)))
         return {
             "settings": settings,
             "network": self.request.config.as_card(),
@@ -224,12 +224,12 @@ class _Run(Generic[C, S]):
         }
 
 
-def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
+def format_window_command(request: WindowRequest[C, S], kind: ModelKind[C, S]) -> str:
     """What to type for the same run, for the card; options that are the defaults are left out."""
     parts = [f"mapctl train {kind.name} --data DATA -o RUN"]
     parts += [f"--match '{request.match}'"] if request.match else []
     parts += ["--skip-first"] * request.skip_first + kind.shape(request.config)
-    given, usual = _fields(request.settings), _fields(type(request.settings)())
+    given, usual = _settings_to_dict(request.settings), _settings_to_dict(type(request.settings)())
     for name in ("steps", "batch", "window", "learning_rate", "seed"):
         if given[name] != usual[name]:
             parts.append(f"--{name.replace('_', '-')} {given[name]:g}")
@@ -237,6 +237,6 @@ def command(request: WindowRequest[C, S], kind: Kind[C, S]) -> str:
     return " ".join(parts + ["--bfloat16"] * given["bfloat16"])
 
 
-def _fields(settings: Any) -> dict[str, Any]:
+def _settings_to_dict(settings: Any) -> dict[str, Any]:
     """Of a recipe, which a protocol cannot tell to be a dataclass."""
     return asdict(settings)

@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.features import LAYOUT, Place, local_rotations, root_places
+from mapctl.features import LAYOUT, GroundPose, decode_local_rotations, integrate_root
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.interpolation import led, slerped
+from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.skeleton import CANONICAL
-from priors.training.corpus import Corpus, folder_of_clips
+from priors.training.corpus import Corpus, number_clip_folders
 
 _TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
-_AT_ONCE = 50_000  # frames
+_CHUNK_FRAMES = 50_000  # frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,14 @@ class Window:
     def image(self, known: Bool[Tensor, "batch frames joints"]) -> PositionImage:
         """With gaps, in which the guess is slerp's."""
         known = known & self.present[..., None]
-        places = slerped(self.places, self.quats, known)
+        places = interpolate_positions(self.places, self.quats, known)
         return PositionImage.of_world(
-            places, led(self.heading, known), self.contacts, known=known, present=self.present, toes=_TOES
+            places,
+            interpolate_heading(self.heading, known),
+            self.contacts,
+            known=known,
+            present=self.present,
+            toes=_TOES,
         )
 
 
@@ -48,29 +53,29 @@ class PositionWindows:
         """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each."""
         self.frames = frames
         self.lengths = torch.tensor(corpus.lengths)
-        self.firsts = torch.cumsum(self.lengths, 0) - self.lengths
-        origin = Place(torch.zeros(2), torch.zeros(()))
-        roots = [root_places(clip, origin) for clip in corpus.clips()]
+        self.clip_starts = torch.cumsum(self.lengths, 0) - self.lengths
+        origin = GroundPose(torch.zeros(2), torch.zeros(()))
+        roots = [integrate_root(clip, origin) for clip in corpus.clips()]
         self.ground = torch.cat([ground for ground, _ in roots])
         self.heading = torch.cat([heading for _, heading in roots])
         self.contacts = LAYOUT.pick(corpus.features, "contacts")
-        self.local = torch.cat([local_places(part) for part in corpus.features.split(_AT_ONCE)])
-        self.quats = torch.cat([tilted_rotations(part) for part in corpus.features.split(_AT_ONCE)])
-        folder = folder_of_clips(corpus)
+        self.local = torch.cat([compute_local_positions(part) for part in corpus.features.split(_CHUNK_FRAMES)])
+        self.quats = torch.cat([heading_free_rotations(part) for part in corpus.features.split(_CHUNK_FRAMES)])
+        folder = number_clip_folders(corpus)
         share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, self.lengths.float())
-        self.chances = self.lengths / share[folder] ** evenness
-        self.partners = CANONICAL.mirror_partners()
+        self.probabilities = self.lengths / share[folder] ** evenness
+        self.mirror_joints = CANONICAL.mirror_partners()
 
     def moments(self) -> tuple[Float[Tensor, "joints 3"], Float[Tensor, "joints 3"]]:
         """Mean and standard deviation of each place, seen from its own root, of a motion and its mirror image."""
         flip = self.local.new_tensor([-1.0, 1.0, 1.0])
         mean, square = self.local.mean(dim=0), self.local.square().mean(dim=0)
-        mean, square = (mean + flip * mean[self.partners]) / 2, (square + square[self.partners]) / 2
+        mean, square = (mean + flip * mean[self.mirror_joints]) / 2, (square + square[self.mirror_joints]) / 2
         return mean, (square - mean.square()).clamp_min(0).sqrt()
 
     def draw(self, batch: int, generator: torch.Generator) -> Window:
         """So many windows, clips by chance and moments evenly."""
-        clip = torch.multinomial(self.chances, batch, replacement=True, generator=generator)
+        clip = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
         spare = self.lengths[clip] - self.frames  # a shorter clip begins anywhere in the window
         lead = (torch.rand(batch, generator=generator) * (spare.abs() + 1)).long() * torch.sign(spare)
         return self.at(clip, lead, mirrored=torch.rand(batch, generator=generator) < 0.5)
@@ -81,23 +86,23 @@ class PositionWindows:
         """From these frames of these clips on; frames before a clip's first and after its last are not present."""
         frame = first[:, None] + torch.arange(self.frames)
         present = (frame >= 0) & (frame < self.lengths[clip][:, None])
-        index = self.firsts[clip][:, None] + frame.clamp_min(0).minimum(self.lengths[clip][:, None] - 1)
+        index = self.clip_starts[clip][:, None] + frame.clamp_min(0).minimum(self.lengths[clip][:, None] - 1)
         local, heading, contacts = self.local[index], self.heading[index], self.contacts[index]
         ground, side = self.ground[index], torch.where(mirrored, -1.0, 1.0)[:, None]
         flip = torch.stack([side, torch.ones_like(side), torch.ones_like(side)], dim=-1)
-        local = torch.where(mirrored[:, None, None, None], local[:, :, self.partners], local) * flip[:, :, None]
+        local = torch.where(mirrored[:, None, None, None], local[:, :, self.mirror_joints], local) * flip[:, :, None]
         contacts = torch.where(mirrored[:, None, None], contacts.flip(-1), contacts)
         heading, ground = heading * side, ground * flip[..., ::2]
         turned = rotations.rotate_ground(local[..., ::2], heading[..., None]) + ground[:, :, None]
         places = torch.stack([turned[..., 0], local[..., 1], turned[..., 1]], dim=-1)
         quats = self.quats[index]
-        over = quats[:, :, self.partners] * quats.new_tensor([1.0, -1.0, -1.0, 1.0])
+        over = quats[:, :, self.mirror_joints] * quats.new_tensor([1.0, -1.0, -1.0, 1.0])
         quats = torch.where(mirrored[:, None, None, None], over, quats)
         quats[:, :, 0] = rotations.multiply(rotations.about_y(heading), quats[:, :, 0])
         return Window(places, quats, heading, contacts, present)
 
 
-def local_places(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 3"]:
+def compute_local_positions(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 3"]:
     """Joint positions on canonical bones over the hips' ground point, seen along their heading, metres."""
     tilt, joints = LAYOUT.pick(features, "root_tilt"), LAYOUT.pick(features, "joint_rotations")
     hips = torch.stack([tilt[:, 0], torch.zeros_like(tilt[:, 0]), tilt[:, 1]], dim=-1)
@@ -107,6 +112,6 @@ def local_places(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frame
     return kinematics.positions_from_matrices(CANONICAL, turns) + up
 
 
-def tilted_rotations(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 4"]:
+def heading_free_rotations(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 4"]:
     """Local rotations (xyzw), the hips' without their heading."""
-    return local_rotations(features, torch.zeros(len(features)))
+    return decode_local_rotations(features, torch.zeros(len(features)))

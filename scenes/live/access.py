@@ -22,10 +22,10 @@ _LOGGER = "websockets.server"  # of the library, which viser leaves as it is
 _NOT_FRAMED = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
 _REFUSAL = b"Only the page of mapctl live itself may do that.\n"
 
-_Answer = Callable[[Any, Request], Response | None]
+_RequestHandler = Callable[[Any, Request], Response | None]
 
 
-def may_come(headers: Headers, port: int) -> bool:
+def is_own_page(headers: Headers, port: int) -> bool:
     """Whether a request is from a page of this server.
 
     It names this server as its host; it says no other origin; and it says this one if it wants a WebSocket, which
@@ -41,7 +41,7 @@ def may_come(headers: Headers, port: int) -> bool:
 
 
 @contextmanager
-def only_own_pages() -> Iterator[None]:
+def restrict_to_own_pages() -> Iterator[None]:
     """A viser server that is made in here refuses all but its own pages, with status 403.
 
     viser has no place to say so: it gives websockets neither `origins` nor a `process_request` of ours. What it calls
@@ -49,8 +49,8 @@ def only_own_pages() -> Iterator[None]:
     """
     serve = websockets_server.serve
 
-    def guarded(handler: Any, host: str, port: int, *, process_request: _Answer, **options: Any) -> Any:
-        return serve(handler, host, port, process_request=_guarded(process_request, port), **options)
+    def guarded(handler: Any, host: str, port: int, *, process_request: _RequestHandler, **options: Any) -> Any:
+        return serve(handler, host, port, process_request=_guard_request(process_request, port), **options)
 
     websockets_server.serve = guarded
     try:
@@ -59,9 +59,9 @@ def only_own_pages() -> Iterator[None]:
         websockets_server.serve = serve
 
 
-def _guarded(answer: _Answer, port: int) -> _Answer:
+def _guard_request(answer: _RequestHandler, port: int) -> _RequestHandler:
     def answered(connection: Any, request: Request) -> Response | None:
-        if not may_come(request.headers, port):
+        if not is_own_page(request.headers, port):
             about = Headers({"Content-Length": str(len(_REFUSAL)), "Content-Type": "text/plain"})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", about, _REFUSAL)
         response = answer(connection, request)
@@ -72,7 +72,7 @@ def _guarded(answer: _Answer, port: int) -> _Answer:
     return answered
 
 
-class Quiet:
+class ServerErrorReporter:
     """What goes wrong within the server, over what a browser sent or while it went away, told in a line each.
 
     asyncio and websockets would print tracebacks. Each message is a task and each browser a connection of its own, so
@@ -82,28 +82,28 @@ class Quiet:
     def __init__(self, loop: asyncio.AbstractEventLoop, tell: Callable[[str], None]):
         self._tell = tell
         self._logger = logging.getLogger(_LOGGER)
-        self._logger.addFilter(self._heard)
+        self._logger.addFilter(self._filter_record)
         loop.call_soon_threadsafe(loop.set_exception_handler, self._handle)
 
     def close(self) -> None:
         """Leave the library's log as it was."""
-        self._logger.removeFilter(self._heard)
+        self._logger.removeFilter(self._filter_record)
 
     def _handle(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
         if not isinstance(error, WebSocketException | asyncio.CancelledError):  # who goes away is no fault
-            self._tell(f"a browser sent what cannot be understood: {one_line(error or context.get('message', ''))}")
+            self._tell(f"a browser sent what cannot be understood: {format_error(error or context.get('message', ''))}")
 
-    def _heard(self, record: logging.LogRecord) -> bool:
+    def _filter_record(self, record: logging.LogRecord) -> bool:
         if record.exc_info is None:
             return True
         error = record.exc_info[1]
         if error is not None and not isinstance(error, WebSocketException | OSError | EOFError):
-            self._tell(f"a browser's connection ended: {one_line(error)}")
+            self._tell(f"a browser's connection ended: {format_error(error)}")
         return False
 
 
-def one_line(error: object) -> str:
+def format_error(error: object) -> str:
     """An exception's kind and text, without line ends; 200 characters at most."""
     kind = f"{type(error).__name__}: " if isinstance(error, BaseException) else ""
     return f"{kind}{' '.join(str(error).split())}"[:200].rstrip(": ")

@@ -7,28 +7,32 @@ import viser
 
 from mapctl.features import PRIOR_FPS
 from mapctl.mesh import colours
-from mapctl.runtime.live_protocol import Delivered, LiveCharacter
+from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
 from scenes.live import ground
-from scenes.live.inputs import Orders
-from scenes.live.realtime import Pace
+from scenes.live.inputs import SteeringInputs
+from scenes.live.realtime import RealtimeMonitor
 from scenes.live.recording import Recording
-from scenes.live.skinned_character import Puppet
+from scenes.live.skinned_character import SkinnedCharacter
 
 
-class Member:
+class LiveActor:
     """A LiveCharacter with its mannequin, orders, pace and recording."""
 
-    def __init__(self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, orders: Orders):
+    def __init__(
+        self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, orders: SteeringInputs
+    ):
         """`number` counts from 0; its nodes hang below the node `world`."""
         self.name = f"character {number + 1}"
         self.character, self.orders, self.first = character, orders, orders
-        self.pace = Pace()
+        self.pace = RealtimeMonitor()
         self.recording: Recording | None = None
         self.gone = ""  # why it is no more
         self.place = np.zeros(2)
-        self._puppet = Puppet(scene, f"{world}/character{number + 1}", character.skeleton, colours.default(number))
-        self._marks = ground.Marks(scene, f"{world}/marks{number + 1}", character.skeleton)
-        self._waiting: deque[tuple[float, Delivered, int]] = deque()
+        self._puppet = SkinnedCharacter(
+            scene, f"{world}/character{number + 1}", character.skeleton, colours.default_colour(number)
+        )
+        self._marks = ground.GroundMarks(scene, f"{world}/marks{number + 1}", character.skeleton)
+        self._waiting: deque[tuple[float, FrameChunk, int]] = deque()
 
     def command(self) -> None:
         """Tell the character its orders."""
@@ -42,7 +46,7 @@ class Member:
         self.command()
         self.character.reset()
 
-    def take(self, delivered: Delivered, now: float) -> None:
+    def take(self, delivered: FrameChunk, now: float) -> None:
         """Keep what came until it is due, record it."""
         if self.recording is not None:
             self.recording.add(delivered)
@@ -58,7 +62,7 @@ class Member:
         if due is not None:
             self._pose(*due[1:])
 
-    def _pose(self, delivered: Delivered, frame: int) -> None:
+    def _pose(self, delivered: FrameChunk, frame: int) -> None:
         self._puppet.pose(delivered.root[frame], delivered.quats[frame])
         self.place = delivered.root[frame, ::2]
         joints = delivered.motion(self.character.skeleton).joint_positions()[frame].numpy()

@@ -18,23 +18,23 @@ from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.runtime.live_protocol import LiveCharacter
 from scenes.live import ground
-from scenes.live.access import Quiet, one_line, only_own_pages
-from scenes.live.actor import Member
-from scenes.live.controls import Panel
-from scenes.live.inputs import Bounds, Orders
-from scenes.live.notifications import Notices
-from scenes.live.readouts import Gauges
-from scenes.live.recording import FORMATS, Made, Recording, as_some_file, keep
+from scenes.live.access import ServerErrorReporter, format_error, restrict_to_own_pages
+from scenes.live.actor import LiveActor
+from scenes.live.controls import ControlPanel
+from scenes.live.inputs import InputLimits, SteeringInputs
+from scenes.live.notifications import Notifications
+from scenes.live.readouts import Readouts
+from scenes.live.recording import FORMATS, RecordedFile, Recording, encode_with_fallback, save_without_replacing
 
 HOST = "127.0.0.1"
 """Nobody but this machine can connect."""
 _TICK = 1 / 60
-_GAUGES_EVERY = 15  # ticks
-_TYPING = 1.0  # seconds after the last key in a field before it is put right
+_READOUT_TICKS = 15  # ticks
+_TYPING_SECONDS = 1.0  # seconds after the last key in a field before it is put right
 _WORLD = "/world"
 
 
-class Show:
+class LiveApp:
     """A Deck. Everything but the loop itself runs when the loop gets to it, on one thread; what fails there is said in
     the page and on the console, and ends nothing else.
     """
@@ -42,30 +42,34 @@ class Show:
     def __init__(
         self,
         characters: Sequence[LiveCharacter],
-        orders: Sequence[Orders],
+        orders: Sequence[SteeringInputs],
         *,
         port: int,
         fastest: float,
         labels: Mapping[str, Sequence[str]],
     ):
         """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group."""
-        with redirect_stdout(io.StringIO()), only_own_pages():  # viser greets in a box of its own
+        with redirect_stdout(io.StringIO()), restrict_to_own_pages():  # viser greets in a box of its own
             self.server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
-        self._bounds = Bounds(math.floor(10 * fastest) / 10, labels)
+        self._bounds = InputLimits(math.floor(10 * fastest) / 10, labels)
         scene, gui = self.server.scene, self.server.gui
-        self._notices = Notices(self.server)
-        self._quiet = Quiet(self.server.get_event_loop(), self._notices.console)
-        _set_stage(self.server)
+        self._notices = Notifications(self.server)
+        self._quiet = ServerErrorReporter(self.server.get_event_loop(), self._notices.console)
+        _set_up_stage(self.server)
         self._world = scene.add_frame(_WORLD, show_axes=False)
         ground.add_grid(scene, f"{_WORLD}/grid")
         self._path = ground.DrawnPath(scene, f"{_WORLD}/path")
-        self._members = [Member(scene, _WORLD, k, *pair) for k, pair in enumerate(zip(characters, orders, strict=True))]
+        self._members = [
+            LiveActor(scene, _WORLD, k, *pair) for k, pair in enumerate(zip(characters, orders, strict=True))
+        ]
         self._chosen, self._is_paused = 0, False
         self._typed_at: float | None = None
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._panel = Panel(gui, self, characters=len(characters), bounds=self._bounds, below=self._notices.below)
+        self._panel = ControlPanel(
+            gui, self, characters=len(characters), bounds=self._bounds, below=self._notices.below
+        )
         self._panel.show(self._members[0].orders)
-        self._gauges = Gauges(gui)
+        self._gauges = Readouts(gui)
         scene.on_click()(lambda event: self._draw_at(event.ray_origin, event.ray_direction))
 
     @property
@@ -80,19 +84,22 @@ class Show:
                 return
             began = time.perf_counter()
             while not self._todo.empty():
-                self._try(self._todo.get())
+                self._run_safely(self._todo.get())
             with self.server.atomic():
-                self._try(lambda now=began: self._show_due(now))
-            if tick % _GAUGES_EVERY == 0:
-                self._try(lambda now=began: self._look_after(now))
+                self._run_safely(lambda now=began: self._show_due(now))
+            if tick % _READOUT_TICKS == 0:
+                self._run_safely(lambda now=began: self._run_housekeeping(now))
             time.sleep(max(0.0, _TICK - (time.perf_counter() - began)))
 
-    def keep_recordings(self, folder: Path) -> list[Path]:
+    def save_recordings(self, folder: Path) -> list[Path]:
         """Write what is being recorded, as BVH files that replace none."""
         pending = [member.recording for member in self._members if member.recording and member.recording.pieces]
         for member in self._members:
             member.recording = None
-        return [keep(as_some_file(recording.motion(), FORMATS[0]), folder) for recording in pending]
+        return [
+            save_without_replacing(encode_with_fallback(recording.motion(), FORMATS[0]), folder)
+            for recording in pending
+        ]
 
     def close(self) -> None:
         """End characters and page."""
@@ -106,35 +113,35 @@ class Show:
         """See Deck."""
 
         def ordered() -> None:
-            self._order(changes)
-            self._panel.show(self._member_chosen.orders)
+            self._apply_order(changes)
+            self._panel.show(self._chosen_member.orders)
 
-        self._soon(ordered)
+        self._enqueue(ordered)
 
     def typed(self, **changes: Any) -> None:
         """See Deck."""
 
         def ordered() -> None:
-            self._order(changes)
-            self._panel.enable(self._member_chosen.orders)
+            self._apply_order(changes)
+            self._panel.enable(self._chosen_member.orders)
             self._typed_at = time.perf_counter()
 
-        self._soon(ordered)
+        self._enqueue(ordered)
 
     def nudge(self, **by: float) -> None:
         """See Deck."""
 
         def ordered() -> None:
-            orders = self._member_chosen.orders
+            orders = self._chosen_member.orders
             wanted = {name: getattr(orders, name) + step for name, step in by.items()}
             if "speed" in wanted:
                 wanted["speed"] = min(self._bounds.fastest, max(0.0, wanted["speed"]))
             if "heading" in wanted:
                 wanted["heading"] = math.remainder(wanted["heading"], 360)
-            self._order(wanted)
-            self._panel.show(self._member_chosen.orders)
+            self._apply_order(wanted)
+            self._panel.show(self._chosen_member.orders)
 
-        self._soon(ordered)
+        self._enqueue(ordered)
 
     def choose(self, character: int) -> None:
         """See Deck."""
@@ -144,10 +151,10 @@ class Show:
                 raise MapctlError(f"there is no character {character + 1}")
             self._chosen = character
             self._gauges.forget()
-            self._panel.show(self._member_chosen.orders)
+            self._panel.show(self._chosen_member.orders)
             self._label_recording()
 
-        self._soon(chosen)
+        self._enqueue(chosen)
 
     def toggle_pause(self) -> None:
         """See Deck."""
@@ -157,9 +164,9 @@ class Show:
             self._panel.paused.label = "Go on" if self._is_paused else "Pause"
             for member in self._members:
                 member.pace.forget()
-                self._try(lambda one=member: one.character.pause(self._is_paused))
+                self._run_safely(lambda one=member: one.character.pause(self._is_paused))
 
-        self._soon(toggled)
+        self._enqueue(toggled)
 
     def reset(self) -> None:
         """See Deck."""
@@ -167,76 +174,76 @@ class Show:
         def begun_anew() -> None:
             for member in self._members:
                 self._notices.state(f"gone {member.name}", None)
-                self._try(member.reset)
+                self._run_safely(member.reset)
             self._gauges.forget()
-            self._panel.show(self._member_chosen.orders)
+            self._panel.show(self._chosen_member.orders)
 
-        self._soon(begun_anew)
+        self._enqueue(begun_anew)
 
     def walk_path(self) -> None:
         """See Deck."""
 
         def walked() -> None:
-            member = self._member_chosen
+            member = self._chosen_member
             try:
                 member.character.walk(list(self._path.points), member.orders.speed or 1.2)
             except MapctlError as error:
                 self._notices.event("No path to walk", str(error), console=False)
 
-        self._soon(walked)
+        self._enqueue(walked)
 
     def clear_path(self) -> None:
         """See Deck."""
-        self._soon(self._path.clear)
+        self._enqueue(self._path.clear)
 
     def toggle_recording(self, client: viser.ClientHandle | None) -> None:
         """See Deck."""
 
         def toggled() -> None:
-            member = self._member_chosen
+            member = self._chosen_member
             if member.recording is None:
                 member.recording = Recording(member.character.skeleton)
             else:
                 recording, member.recording = member.recording, None
                 ending = self._panel.ending.value if self._panel.ending.value in FORMATS else FORMATS[0]
-                threading.Thread(target=self._hand_out, args=(recording, ending, client), daemon=True).start()
+                threading.Thread(target=self._export_recording, args=(recording, ending, client), daemon=True).start()
             self._label_recording()
 
-        self._soon(toggled)
+        self._enqueue(toggled)
 
     @property
-    def _member_chosen(self) -> Member:
+    def _chosen_member(self) -> LiveActor:
         return self._members[self._chosen]
 
-    def _soon(self, action: Callable[[], None]) -> None:
+    def _enqueue(self, action: Callable[[], None]) -> None:
         """Browsers speak on a thread of their own; what they ask for waits for the loop."""
         self._todo.put(action)
 
-    def _try(self, action: Callable[[], None]) -> None:
+    def _run_safely(self, action: Callable[[], None]) -> None:
         """Whatever goes wrong here is said, and is no reason not to go on."""
         try:
             action()
         except Exception as error:
             self._notices.fault(error)
 
-    def _order(self, changes: Mapping[str, Any]) -> None:
-        member = self._member_chosen
+    def _apply_order(self, changes: Mapping[str, Any]) -> None:
+        member = self._chosen_member
         member.orders, refusals = self._bounds.changed(member.orders, changes)
         for name in changes:
             self._notices.held(name, getattr(member.orders, name))
-        self._notices.refused(refusals)
+        self._notices.show_refusals(refusals)
         member.command()
 
     def _show_due(self, now: float) -> None:
         for member in self._members:
             if not member.gone:
-                self._try(lambda one=member: self._receive(one, now))
+                self._run_safely(lambda one=member: self._receive(one, now))
             if not self._is_paused:
-                self._try(lambda one=member: one.show_due(now))
-        x, z = self._member_chosen.place if self._panel.follow.value else (0.0, 0.0)
+                self._run_safely(lambda one=member: one.show_due(now))
+        x, z = self._chosen_member.place if self._panel.follow.value else (0.0, 0.0)
         self._world.position = (-x, 0.0, -z)  # the world goes past the camera, which stays the viewer's own
 
-    def _receive(self, member: Member, now: float) -> None:
+    def _receive(self, member: LiveActor, now: float) -> None:
         try:
             arrived = member.character.poll()
         except MapctlError as error:
@@ -249,21 +256,21 @@ class Show:
             member.take(delivered, now)
             for note in delivered.notes:
                 self._notices.event(member.name.capitalize(), note)
-            if member is self._member_chosen:
+            if member is self._chosen_member:
                 self._gauges.add(delivered, PRIOR_FPS)
 
-    def _look_after(self, now: float) -> None:
+    def _run_housekeeping(self, now: float) -> None:
         """What need not be done every time."""
         self._gauges.show()
-        self._notices.pass_on(now)
-        if self._typed_at is not None and now - self._typed_at > _TYPING:
+        self._notices.expire_refusal(now)
+        if self._typed_at is not None and now - self._typed_at > _TYPING_SECONDS:
             self._typed_at = None
-            self._panel.show(self._member_chosen.orders)
+            self._panel.show(self._chosen_member.orders)
         for member in self._members:
             if not member.gone and not self._is_paused:
-                self._watch(member, now)
+                self._report_pace(member, now)
 
-    def _watch(self, member: Member, now: float) -> None:
+    def _report_pace(self, member: LiveActor, now: float) -> None:
         """Say that a character does not keep up, and that it does again."""
         changed, slow = member.pace.judge(now), member.pace.slow
         said = f"{member.name} is too slow for this machine: {member.pace.text(now)}" if slow else None
@@ -276,37 +283,39 @@ class Show:
         """A point of the path where somebody clicked, a ray of two times three numbers if the browser is well."""
 
         def added() -> None:
-            ray = ground.as_ray(ray_origin, ray_direction)
+            ray = ground.parse_ray(ray_origin, ray_direction)
             shift = np.asarray(self._world.position)
-            if self._panel.draw.value and (place := ground.on_the_ground(ray[0] - shift, ray[1])) is not None:
+            if self._panel.draw.value and (place := ground.intersect_ground(ray[0] - shift, ray[1])) is not None:
                 self._path.add(*place)
 
-        self._soon(added)
+        self._enqueue(added)
 
     def _label_recording(self) -> None:
-        self._panel.record.label = "Record" if self._member_chosen.recording is None else "Stop and save"
+        self._panel.record.label = "Record" if self._chosen_member.recording is None else "Stop and save"
 
-    def _hand_out(self, recording: Recording, ending: str, client: viser.ClientHandle | None) -> None:
+    def _export_recording(self, recording: Recording, ending: str, client: viser.ClientHandle | None) -> None:
         torch.set_num_threads(1)
         try:
-            made = as_some_file(recording.motion(), ending)
+            made = encode_with_fallback(recording.motion(), ending)
             if made.ending != ending:
-                self._notices.event(f"No {ending} could be made, here is a {made.ending}", made.why)
+                self._notices.event(f"No {ending} could be made, here is a {made.ending}", made.fallback_reason)
             self._send(made, client)
         except Exception as error:
-            self._notices.event("Nothing saved", one_line(error))
+            self._notices.event("Nothing saved", format_error(error))
 
-    def _send(self, made: Made, client: viser.ClientHandle | None) -> None:
+    def _send(self, made: RecordedFile, client: viser.ClientHandle | None) -> None:
         """To the browser that asked; to all others if it is gone; to the current folder if nobody is left."""
         others = self.server.get_clients()
         if client is None or client.client_id not in others:
             if not others:
-                return self._notices.console(f"nobody is left to take the recording: {keep(made, Path.cwd())}")
+                return self._notices.console(
+                    f"nobody is left to take the recording: {save_without_replacing(made, Path.cwd())}"
+                )
             return self.server.send_file_download(made.name, made.content, save_immediately=True)
         return client.send_file_download(made.name, made.content, save_immediately=True)
 
 
-def _set_stage(server: viser.ViserServer) -> None:
+def _set_up_stage(server: viser.ViserServer) -> None:
     """Up, theme and camera."""
     server.scene.set_up_direction("+y")
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")

@@ -1,4 +1,5 @@
-"""The controls of the live viewer. What somebody does becomes a call on `Deck`; the panel itself decides nothing.
+"""The controls of the live viewer. What somebody does becomes a call on `ViewerActions`; the panel itself decides
+nothing.
 
 Callbacks are coroutines: those run in the order in which browsers did things, others on threads in any order.
 """
@@ -9,15 +10,15 @@ from typing import Any, Protocol, runtime_checkable
 import viser
 
 from mapctl.intent.steering import STEP_LENGTHS
-from scenes.live.inputs import AS_IT_LIKES, Bounds, Orders
+from scenes.live.inputs import UNCONDITIONED, InputLimits, SteeringInputs
 from scenes.live.recording import FORMATS
 
-_FASTER, _TURN = 0.2, 15.0  # m/s and degrees of one press of a key
-_STEP = 0.65  # metres, where measured steps begin
+_SPEED_STEP, _HEADING_STEP = 0.2, 15.0  # m/s and degrees of one press of a key
+_DEFAULT_STEP_LENGTH = 0.65  # metres, where measured steps begin
 
 
 @runtime_checkable
-class Deck(Protocol):
+class ViewerActions(Protocol):
     """What the panel can ask for."""
 
     def order(self, **changes: Any) -> None:
@@ -57,40 +58,42 @@ class Deck(Protocol):
         ...
 
 
-class Panel:
+class ControlPanel:
     """Sliders, lists, buttons and keys, shared by all browsers."""
 
-    def __init__(self, gui: viser.GuiApi, deck: Deck, *, characters: int, bounds: Bounds, below: Callable[[], None]):
+    def __init__(
+        self, gui: viser.GuiApi, deck: ViewerActions, *, characters: int, bounds: InputLimits, below: Callable[[], None]
+    ):
         """`below` adds what is shown below the controls that steer."""
         self._deck = deck
         self._who = None
         if characters > 1:
             self._who = gui.add_dropdown("Character", [str(k + 1) for k in range(characters)])
-            self._on(self._who, lambda value: deck.choose(int(value) - 1))
+            self._bind_control(self._who, lambda value: deck.choose(int(value) - 1))
         with gui.add_folder("Steer"):
-            self._steering(gui, bounds)
+            self._add_steering(gui, bounds)
             below()
         with gui.add_folder("Path"):
             self.draw = gui.add_checkbox("Draw by clicking on the ground", False)
-            _press(gui.add_button("Walk it", icon=viser.Icon.ROUTE), deck.walk_path)
-            _press(gui.add_button("Clear", icon=viser.Icon.ERASER), deck.clear_path)
+            _bind_button(gui.add_button("Walk it", icon=viser.Icon.ROUTE), deck.walk_path)
+            _bind_button(gui.add_button("Clear", icon=viser.Icon.ERASER), deck.clear_path)
         with gui.add_folder("Play"):
             self.follow = gui.add_checkbox("Follow the character", True)
             self.paused = gui.add_button("Pause")
-            _press(self.paused, deck.toggle_pause)
-            _press(gui.add_button("Reset"), deck.reset)
+            _bind_button(self.paused, deck.toggle_pause)
+            _bind_button(gui.add_button("Reset"), deck.reset)
         with gui.add_folder("Record"):
             self.ending = gui.add_dropdown("File", list(FORMATS))
             self.record = gui.add_button("Record", color="red")
-            _press_from(self.record, deck.toggle_recording)
-        self._keys(gui)
+            _bind_client_button(self.record, deck.toggle_recording)
+        self._add_hotkeys(gui)
 
     @property
-    def who(self) -> Any:
+    def character_list(self) -> Any:
         """The list of characters; there is one only for several."""
         return self._who
 
-    def show(self, orders: Orders) -> None:
+    def show(self, orders: SteeringInputs) -> None:
         """Put the controls where the orders are, without giving them anew."""
         self.speed.value, self.heading.value = orders.speed, round(orders.heading)
         self.strafe.value, self.measured.value = orders.facing is not None, orders.step_length is not None
@@ -99,43 +102,44 @@ class Panel:
         if orders.step_length is not None:
             self.step_length.value = orders.step_length
         for group, handle in self.told.items():
-            handle.value = orders.told.get(group, AS_IT_LIKES)
+            handle.value = orders.told.get(group, UNCONDITIONED)
         self.enable(orders)
 
-    def enable(self, orders: Orders) -> None:
+    def enable(self, orders: SteeringInputs) -> None:
         """Let the controls that mean something be used; their values stay."""
         for handle, disabled in ((self.facing, orders.facing is None), (self.step_length, orders.step_length is None)):
             if handle.disabled != disabled:
                 handle.disabled = disabled
 
-    def _steering(self, gui: viser.GuiApi, bounds: Bounds) -> None:
+    def _add_steering(self, gui: viser.GuiApi, bounds: InputLimits) -> None:
         self.speed = gui.add_slider("Speed, m/s", 0.0, bounds.fastest, 0.1, min(1.2, bounds.fastest))
         # Floats throughout: a browser's 1e300 as an int could not be sent on, and would end everybody's connection.
         self.heading = gui.add_slider("Heading, degrees", -180.0, 180.0, 1.0, 0.0, hint="0 is +Z, 90 is +X")
         self.strafe = gui.add_checkbox("Face a fixed way", False)
         self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0, disabled=True)
         self.measured = gui.add_checkbox("Measured steps", False)
-        self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, _STEP, disabled=True)
+        self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, _DEFAULT_STEP_LENGTH, disabled=True)
         self.told = {
-            group: gui.add_dropdown(group.capitalize(), [AS_IT_LIKES, *names]) for group, names in bounds.labels.items()
+            group: gui.add_dropdown(group.capitalize(), [UNCONDITIONED, *names])
+            for group, names in bounds.labels.items()
         }
         typed = self._deck.typed
-        self._on(self.speed, lambda value: typed(speed=value))
-        self._on(self.heading, lambda value: typed(heading=value))
-        self._on(self.strafe, lambda value: typed(facing=self.facing.value if value else None))
-        self._on(self.facing, lambda value: typed(facing=value) if self.strafe.value else None)
-        self._on(self.measured, lambda value: typed(step_length=self.step_length.value if value else None))
-        self._on(self.step_length, lambda value: typed(step_length=value) if self.measured.value else None)
+        self._bind_control(self.speed, lambda value: typed(speed=value))
+        self._bind_control(self.heading, lambda value: typed(heading=value))
+        self._bind_control(self.strafe, lambda value: typed(facing=self.facing.value if value else None))
+        self._bind_control(self.facing, lambda value: typed(facing=value) if self.strafe.value else None)
+        self._bind_control(self.measured, lambda value: typed(step_length=self.step_length.value if value else None))
+        self._bind_control(self.step_length, lambda value: typed(step_length=value) if self.measured.value else None)
         for group, handle in self.told.items():
-            self._on(handle, lambda value, of=group: typed(told={of: value}))
+            self._bind_control(handle, lambda value, of=group: typed(told={of: value}))
 
-    def _keys(self, gui: viser.GuiApi) -> None:
+    def _add_hotkeys(self, gui: viser.GuiApi) -> None:
         deck = self._deck
         keys: tuple[tuple[Any, str, Callable[[], None]], ...] = (
-            ("W", "Faster", lambda: deck.nudge(speed=_FASTER)),
-            ("S", "Slower", lambda: deck.nudge(speed=-_FASTER)),
-            ("A", "Turn left", lambda: deck.nudge(heading=_TURN)),
-            ("D", "Turn right", lambda: deck.nudge(heading=-_TURN)),
+            ("W", "Faster", lambda: deck.nudge(speed=_SPEED_STEP)),
+            ("S", "Slower", lambda: deck.nudge(speed=-_SPEED_STEP)),
+            ("A", "Turn left", lambda: deck.nudge(heading=_HEADING_STEP)),
+            ("D", "Turn right", lambda: deck.nudge(heading=-_HEADING_STEP)),
             ("X", "Stand", lambda: deck.order(speed=0.0)),
             ("B", "Turn round", lambda: deck.nudge(heading=180.0)),
             ("P", "Pause or go on", deck.toggle_pause),
@@ -143,9 +147,9 @@ class Panel:
             ("G", "Walk the drawn path", deck.walk_path),
         )
         for key, label, action in keys:
-            _trigger(gui.add_command(label, hotkey=key), action)
+            _bind_hotkey(gui.add_command(label, hotkey=key), action)
 
-    def _on(self, handle: Any, action: Callable[[Any], None]) -> None:
+    def _bind_control(self, handle: Any, action: Callable[[Any], None]) -> None:
         """Act when somebody moves a control, on what it shows then; not when the panel itself does."""
 
         @handle.on_update
@@ -154,17 +158,17 @@ class Panel:
                 action(handle.value)
 
 
-def _press(button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
-    _press_from(button, lambda client: action())
+def _bind_button(button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
+    _bind_client_button(button, lambda client: action())
 
 
-def _press_from(button: viser.GuiButtonHandle, action: Callable[[viser.ClientHandle | None], None]) -> None:
+def _bind_client_button(button: viser.GuiButtonHandle, action: Callable[[viser.ClientHandle | None], None]) -> None:
     @button.on_click
     async def _(event: viser.GuiEvent) -> None:
         action(event.client)
 
 
-def _trigger(command: viser.CommandHandle, action: Callable[[], None]) -> None:
+def _bind_hotkey(command: viser.CommandHandle, action: Callable[[], None]) -> None:
     @command.on_trigger
     async def _(event: Any) -> None:
         action()

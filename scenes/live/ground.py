@@ -14,10 +14,10 @@ from mapctl.mesh.primitives import Array
 from mapctl.skeleton import Skeleton
 
 _PATH_HEIGHT, _MARK_HEIGHT = 0.012, 0.008  # metres over the ground, so that neither flickers
-_FIGURES = (0.5, 1.0)  # shares of the forecast at which it is shown as a stick figure
+_FIGURE_SHARES = (0.5, 1.0)  # shares of the forecast at which it is shown as a stick figure
 _SPACING = 0.05  # metres between the points of a path as it is shown, or more where it is long
-_FAR = 1e5  # metres from the origin beyond which nobody looks
-_MOST_SHOWN, _MOST_DRAWN = 1500, 200  # points of a path as it is shown, and as it is drawn
+_MAX_COORDINATE = 1e5  # metres from the origin beyond which nobody looks
+_MAX_SHOWN_POINTS, _MAX_DRAWN_POINTS = 1500, 200  # points of a path as it is shown, and as it is drawn
 
 
 def add_grid(scene: viser.SceneApi, name: str) -> None:
@@ -31,24 +31,24 @@ def add_grid(scene: viser.SceneApi, name: str) -> None:
         cell_thickness=0.8,
         section_thickness=1.4,
         fade_distance=40.0,
-        cell_color=_bytes(colours.GRID),
-        section_color=_bytes(colours.GRID),
+        cell_color=_to_rgb_bytes(colours.GRID),
+        section_color=_to_rgb_bytes(colours.GRID),
     )
 
 
-class Marks:
+class GroundMarks:
     """Planted feet and forecast of one character."""
 
     def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton):
         self._scene, self._name, self._parents = scene, name, skeleton.parents
         self._toes = [skeleton.names.index(side) for side in ("leftToes", "rightToes")]
-        vertices, faces = _disc()
+        vertices, faces = _build_disc()
         self._feet = [
             scene.add_mesh_simple(
                 f"{name}/foot{k}",
                 vertices,
                 faces,
-                color=_bytes(colour),
+                color=_to_rgb_bytes(colour),
                 opacity=0.6,
                 visible=False,
                 side="double",
@@ -71,9 +71,9 @@ class Marks:
         way = joints[:, 0] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, _PATH_HEIGHT, 0.0])
         segments = [np.stack([way[:-1], way[1:]], axis=1)]
         bones = [(child, parent) for child, parent in enumerate(self._parents) if parent >= 0]
-        segments += [joints[round(share * (len(joints) - 1))][np.array(bones)] for share in _FIGURES]
+        segments += [joints[round(share * (len(joints) - 1))][np.array(bones)] for share in _FIGURE_SHARES]
         lines = np.concatenate(segments).astype(np.float32)
-        self._scene.add_line_segments(f"{self._name}/forecast", lines, _bytes(colours.TRAIL), thickness=0.012)
+        self._scene.add_line_segments(f"{self._name}/forecast", lines, _to_rgb_bytes(colours.TRAIL), thickness=0.012)
 
 
 class DrawnPath:
@@ -86,40 +86,44 @@ class DrawnPath:
 
     def add(self, x: float, z: float) -> None:
         """One more point, metres. RequestError where there are very many."""
-        if len(self.points) >= _MOST_DRAWN:
-            raise RequestError(f"a drawn path has at most {_MOST_DRAWN} points")
+        if len(self.points) >= _MAX_DRAWN_POINTS:
+            raise RequestError(f"a drawn path has at most {_MAX_DRAWN_POINTS} points")
         self.points.append((x, z))
-        self._show()
+        self._redraw()
 
     def clear(self) -> None:
         """No points."""
         self.points.clear()
-        self._show()
+        self._redraw()
 
-    def _show(self) -> None:
+    def _redraw(self) -> None:
         for handle in self._shown:
             handle.remove()
         self._shown = [
-            self._scene.add_icosphere(f"{self._name}/point{k}", 0.05, color=_bytes(colours.WISH), position=(x, 0.02, z))
+            self._scene.add_icosphere(
+                f"{self._name}/point{k}", 0.05, color=_to_rgb_bytes(colours.TARGET), position=(x, 0.02, z)
+            )
             for k, (x, z) in enumerate(self.points)
         ]
-        if (line := _smooth(self.points)) is not None:
+        if (line := _sample_curve(self.points)) is not None:
             segments = np.stack([line[:-1], line[1:]], axis=1).astype(np.float32)
             self._shown.append(
-                self._scene.add_line_segments(f"{self._name}/line", segments, _bytes(colours.WISH), thickness=0.025)
+                self._scene.add_line_segments(
+                    f"{self._name}/line", segments, _to_rgb_bytes(colours.TARGET), thickness=0.025
+                )
             )
 
 
-def as_ray(origin: Any, direction: Any) -> Array:
+def parse_ray(origin: Any, direction: Any) -> Array:
     """(2, 3) of what a browser says; RequestError where that is no ray near the stage."""
     with suppress(TypeError, ValueError):
         ray = np.array([origin, direction], dtype=np.float64)
-        if ray.shape == (2, 3) and np.isfinite(ray).all() and np.abs(ray).max() <= _FAR:
+        if ray.shape == (2, 3) and np.isfinite(ray).all() and np.abs(ray).max() <= _MAX_COORDINATE:
             return ray
     raise RequestError("a click that is nowhere")
 
 
-def on_the_ground(origin: Array, direction: Array) -> tuple[float, float] | None:
+def intersect_ground(origin: Array, direction: Array) -> tuple[float, float] | None:
     """x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m."""
     if direction[1] > -1e-3:
         return None
@@ -127,23 +131,23 @@ def on_the_ground(origin: Array, direction: Array) -> tuple[float, float] | None
     return (float(origin[0] + far * direction[0]), float(origin[2] + far * direction[2])) if 0 < far < 100 else None
 
 
-def _smooth(points: Sequence[tuple[float, float]]) -> Array | None:
+def _sample_curve(points: Sequence[tuple[float, float]]) -> Array | None:
     try:
         curve = curves.through(np.array(points, dtype=np.float64).reshape(-1, 2))
     except RequestError:
         return None  # one point, or all in one place: no curve yet
-    arcs = np.linspace(0, curve.length, min(_MOST_SHOWN, max(2, round(curve.length / _SPACING))))
+    arcs = np.linspace(0, curve.length, min(_MAX_SHOWN_POINTS, max(2, round(curve.length / _SPACING))))
     places = np.array([curve.point(float(arc)).tolist() for arc in arcs])
     return np.insert(places, 1, _PATH_HEIGHT, axis=1)
 
 
-def _disc(radius: float = 0.085, corners: int = 24) -> tuple[Array, Array]:
+def _build_disc(radius: float = 0.085, corners: int = 24) -> tuple[Array, Array]:
     turn = np.arange(corners) * 2 * np.pi / corners
     rim = np.stack([radius * np.sin(turn), np.zeros(corners), radius * np.cos(turn)], axis=-1)
     index = np.arange(1, corners + 1)
     return np.vstack([np.zeros(3), rim]), np.stack([np.zeros(corners, int), index, np.roll(index, -1)], axis=-1)
 
 
-def _bytes(colour: str) -> tuple[int, int, int]:
+def _to_rgb_bytes(colour: str) -> tuple[int, int, int]:
     red, green, blue = (round(255 * float(share)) for share in colours.rgb(colour))
     return red, green, blue

@@ -7,14 +7,14 @@ from typing import Any
 
 from mapctl.intent.steering import STEP_LENGTHS, Command
 
-AS_IT_LIKES = "any"
+UNCONDITIONED = "any"
 """The choice that tells a prior nothing."""
-_FIELDS = ("speed", "heading", "facing", "step_length")
-_SHOWN = {"speed": ("speed", "m/s"), "step_length": ("step length", "m")}
+_NUMBER_FIELDS = ("speed", "heading", "facing", "step_length")
+_WORDS_AND_UNITS = {"speed": ("speed", "m/s"), "step_length": ("step length", "m")}
 
 
 @dataclass(frozen=True)
-class Orders:
+class SteeringInputs:
     """What one character is to do, as the panel shows it."""
 
     speed: float = 1.2
@@ -50,7 +50,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Bounds:
+class InputLimits:
     """What can be asked of a prior."""
 
     fastest: float
@@ -60,21 +60,21 @@ class Bounds:
     steps: tuple[float, float] = STEP_LENGTHS
     """Shortest and longest, metres."""
 
-    def changed(self, orders: Orders, changes: Mapping[str, Any]) -> tuple[Orders, list[Refusal]]:
+    def changed(self, orders: SteeringInputs, changes: Mapping[str, Any]) -> tuple[SteeringInputs, list[Refusal]]:
         """The orders after changes by name, each brought to the nearest that can be; what is no number changes nothing.
 
         `told` names a label by group, AS_IT_LIKES none; groups that it does not name stay as they are.
         """
         found, refused = {}, list[Refusal]()
         for name, asked in changes.items():
-            held = self._label(orders.told, asked) if name == "told" else self._number(orders, name, asked)
-            if (text := self._why(name, asked, held)) is not None:
+            held = self._label(orders.told, asked) if name == "told" else self._limit_number(orders, name, asked)
+            if (text := self._explain_refusal(name, asked, held)) is not None:
                 refused.append(Refusal(name, held, text))
             found[name] = held
         return replace(orders, **found), refused
 
-    def _number(self, orders: Orders, name: str, asked: Any) -> float | None:
-        if name not in _FIELDS or not _is_number(asked):
+    def _limit_number(self, orders: SteeringInputs, name: str, asked: Any) -> float | None:
+        if name not in _NUMBER_FIELDS or not _is_number(asked):
             may_be_none = name in ("facing", "step_length") and asked is None
             return None if may_be_none else getattr(orders, name)
         if name in ("heading", "facing"):
@@ -83,21 +83,21 @@ class Bounds:
         return min(highest, max(lowest, float(asked)))
 
     def _label(self, told: Mapping[str, str], asked: Any) -> dict[str, str]:
-        known = {group: (AS_IT_LIKES, *labels) for group, labels in self.labels.items()}
+        known = {group: (UNCONDITIONED, *labels) for group, labels in self.labels.items()}
         heard = {group: label for group, label in dict(asked).items() if label in known.get(group, ())}
-        return {group: label for group, label in {**told, **heard}.items() if label != AS_IT_LIKES}
+        return {group: label for group, label in {**told, **heard}.items() if label != UNCONDITIONED}
 
     def _range(self, name: str) -> tuple[float, float]:
         return (0.0, self.fastest) if name == "speed" else self.steps
 
-    def _why(self, name: str, asked: Any, held: Any) -> str | None:
+    def _explain_refusal(self, name: str, asked: Any, held: Any) -> str | None:
         """The sentence, None where it holds as it was asked."""
         if name == "told":
             return next(
                 (
                     f"{label!r} is not a {group} that this prior knows."
                     for group, label in dict(asked).items()
-                    if held.get(group, AS_IT_LIKES) != label
+                    if held.get(group, UNCONDITIONED) != label
                 ),
                 None,
             )
@@ -106,9 +106,9 @@ class Bounds:
         if not _is_number(asked):
             held = "none" if held is None else f"{held:g}"
             return f"{name.replace('_', ' ').capitalize()}: {str(asked)[:20]!r} is no number; {held} holds."
-        if name not in _SHOWN:
+        if name not in _WORDS_AND_UNITS:
             return f"A {name} of {asked:g} degrees is the same as {held:g}."
-        words, unit = _SHOWN[name]
+        words, unit = _WORDS_AND_UNITS[name]
         low, high = self._range(name)
         way = "raised" if held > asked else "lowered"
         return f"A {words} of {asked:g} {unit} was {way} to {held:g}: it can be {low:g} to {high:g} {unit}."

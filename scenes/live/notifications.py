@@ -7,15 +7,15 @@ from contextlib import suppress
 import viser
 
 from mapctl.errors import MapctlError
-from scenes.live.access import one_line
+from scenes.live.access import format_error
 from scenes.live.inputs import Refusal
 
-_READ = 8.0  # seconds for which a refusal is shown
-_AGAIN = 10.0  # seconds before the same is said again
-_TOAST = 8.0
+_REFUSAL_SECONDS = 8.0  # seconds for which a refusal is shown
+_REPEAT_SECONDS = 10.0  # seconds before the same is said again
+_EVENT_SECONDS = 8.0
 
 
-class Notices:
+class Notifications:
     """Lasting states on top of the panel, refusals below the controls, events as notes that pass."""
 
     def __init__(self, server: viser.ViserServer):
@@ -37,9 +37,9 @@ class Notices:
             self._states.pop(key, None)
         else:
             self._states[key] = text
-        _put(self._top, "\n\n".join(f"⚠️ {text}" for text in self._states.values()))
+        _set_text(self._top, "\n\n".join(f"⚠️ {text}" for text in self._states.values()))
 
-    def refused(self, refusals: list[Refusal]) -> None:
+    def show_refusals(self, refusals: list[Refusal]) -> None:
         """What was asked for and cannot be."""
         if refusals:
             self._shown = refusals[-1], time.perf_counter()
@@ -52,9 +52,9 @@ class Notices:
         if self._shown is not None and self._shown[0].name == name and self._shown[0].held != value:
             self._show_refusal("")
 
-    def pass_on(self, now: float) -> None:
+    def expire_refusal(self, now: float) -> None:
         """Take away what was shown long enough."""
-        if self._shown is not None and now - self._shown[1] > _READ:
+        if self._shown is not None and now - self._shown[1] > _REFUSAL_SECONDS:
             self._show_refusal("")
 
     def event(self, title: str, body: str, *, console: bool = True) -> None:
@@ -65,14 +65,14 @@ class Notices:
             self._print(f"{title}: {body}")
         for client in list(self._server.get_clients().values()):
             with suppress(Exception):  # it may have gone just now
-                client.add_notification(title, body, auto_close_seconds=_TOAST)
+                client.add_notification(title, body, auto_close_seconds=_EVENT_SECONDS)
 
     def fault(self, error: BaseException) -> None:
         """An error of the project's own, or of an input that nobody thought of; everything goes on."""
         if isinstance(error, MapctlError):
             self.event("Not done", str(error))  # what was asked cannot be
         else:
-            self.event("Something went wrong", one_line(error))
+            self.event("Something went wrong", format_error(error))
 
     def console(self, text: str) -> None:
         """A line on standard error; the same once in a while only."""
@@ -83,18 +83,18 @@ class Notices:
         if not text:
             self._shown = None
         if self._refusals is not None:
-            _put(self._refusals, text)
+            _set_text(self._refusals, text)
 
     def _is_new(self, text: str) -> bool:
         now = time.perf_counter()
-        self._said = {said: at for said, at in self._said.items() if now - at < _AGAIN}
+        self._said = {said: at for said, at in self._said.items() if now - at < _REPEAT_SECONDS}
         return self._said.setdefault(text, now) == now
 
     def _print(self, text: str) -> None:
         print(f"mapctl: {text}", file=sys.stderr, flush=True)
 
 
-def _put(handle: viser.GuiMarkdownHandle, text: str) -> None:
+def _set_text(handle: viser.GuiMarkdownHandle, text: str) -> None:
     if handle.content != text:
         handle.content = text
     if handle.visible != bool(text):

@@ -8,14 +8,14 @@ import viser
 import viser.uplot as uplot
 
 from mapctl.mesh import colours
-from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.live_protocol import FrameChunk
 
-_SECONDS = 10.0  # that the plots look back
-_SLOW = 15  # frames over which the speed that is shown is taken
-_INKS = (colours.LEFT, colours.RIGHT, colours.WISH, "#2f9e62", "#7d55c7", "#8d6346")
+_PLOT_SECONDS = 10.0  # that the plots look back
+_SPEED_FRAMES = 15  # frames over which the speed that is shown is taken
+_PLOT_COLOURS = (colours.LEFT, colours.RIGHT, colours.TARGET, "#2f9e62", "#7d55c7", "#8d6346")
 
 
-class Gauges:
+class Readouts:
     """Text and two plots, of one character at a time."""
 
     def __init__(self, gui: viser.GuiApi):
@@ -26,18 +26,18 @@ class Gauges:
         self._plots: list[viser.GuiUplotHandle] = []
         self._rows: deque[tuple[float, ...]] = deque()
         self._names: tuple[str, ...] = ()
-        self._places: deque[np.ndarray] = deque(maxlen=_SLOW + 1)
+        self._places: deque[np.ndarray] = deque(maxlen=_SPEED_FRAMES + 1)
         self.forget()
 
     def forget(self) -> None:
         """Begin anew: another character, or the same from its start."""
         self._rows.clear()
         self._places.clear()
-        self._last: Delivered | None = None
+        self._last: FrameChunk | None = None
         self.frames = self.late = 0
         self.speed = 0.0
 
-    def add(self, delivered: Delivered, fps: float) -> None:
+    def add(self, delivered: FrameChunk, fps: float) -> None:
         """One more step."""
         count = len(delivered.root)
         self.frames += count
@@ -54,7 +54,7 @@ class Gauges:
             self._rows.clear()
         wanted = float(np.hypot(*delivered.wish))
         self._rows.append((delivered.seconds, wanted, self.speed, *delivered.energies.values()))
-        while self._rows[-1][0] - self._rows[0][0] > _SECONDS:
+        while self._rows[-1][0] - self._rows[0][0] > _PLOT_SECONDS:
             self._rows.popleft()
 
     def show(self) -> None:
@@ -65,7 +65,7 @@ class Gauges:
         count = max(1, len(last.root))
         self._text.content = (
             f"speed {self.speed:.2f} m/s, wanted {self._rows[-1][1]:.2f}\n\n"
-            f"{1000 * last.compute / count:.1f} ms a frame, {last.evaluations} evaluations a step\n\n"
+            f"{1000 * last.compute_seconds / count:.1f} ms a frame, {last.evaluations} evaluations a step\n\n"
             f"{self.late} of {self.frames} frames late"
         )
         table = np.array(self._rows)
@@ -74,13 +74,15 @@ class Gauges:
             labels = [("wanted", "got"), self._names]
             titles = ("Speed, m/s", "Ledger, nats a frame")
             with self._folder:
-                self._plots = [self._plot(*row) for row in zip(titles, data, labels, strict=True)]
+                self._plots = [self._add_plot(*row) for row in zip(titles, data, labels, strict=True)]
         for plot, values in zip(self._plots, data, strict=True):
             plot.data = values
 
-    def _plot(self, title: str, data: tuple[np.ndarray, ...], names: Sequence[str]) -> viser.GuiUplotHandle:
+    def _add_plot(self, title: str, data: tuple[np.ndarray, ...], names: Sequence[str]) -> viser.GuiUplotHandle:
         series = [uplot.Series(label="s")]
-        series += [uplot.Series(label=name, stroke=ink, width=2) for name, ink in zip(names, _INKS, strict=False)]
+        series += [
+            uplot.Series(label=name, stroke=ink, width=2) for name, ink in zip(names, _PLOT_COLOURS, strict=False)
+        ]
         return self._gui.add_uplot(
             data,
             tuple(series),

@@ -2,15 +2,22 @@
 
 from collections import deque
 
-from mapctl.runtime.live_protocol import Delivered
+from mapctl.runtime.live_protocol import FrameChunk
 
-_SOON, _LONG, _OVER = 1.0, 5.0, 2.0  # seconds: of the quick look, of the long one, and without a late frame to be well
-_HALF, _FIFTH = 0.5, 0.2  # shares of late frames that are too many in the quick and in the long look
-_SILENT = 0.8  # seconds without a frame that tell the same
-_FEWEST = 6  # frames of which a share is taken: two steps
+_SHORT_SECONDS, _LONG_SECONDS, _RECOVERY_SECONDS = (
+    1.0,
+    5.0,
+    2.0,
+)  # seconds: of the quick look, of the long one, and without a late frame to be well
+_MAX_SHORT_SHARE, _MAX_LONG_SHARE = (
+    0.5,
+    0.2,
+)  # shares of late frames that are too many in the quick and in the long look
+_SILENT_SECONDS = 0.8  # seconds without a frame that tell the same
+_MIN_SHARE_FRAMES = 6  # frames of which a share is taken: two steps
 
 
-class Pace:
+class RealtimeMonitor:
     """What the last seconds brought of one character.
 
     It is too slow where half of the last second's frames came late, a fifth of the last five seconds', or none for most
@@ -25,40 +32,48 @@ class Pace:
         """Begin anew: it was paused or reset, so what is missing is not late."""
         self._rows.clear()
 
-    def add(self, now: float, delivered: Delivered) -> None:
+    def add(self, now: float, delivered: FrameChunk) -> None:
         """One more step, at a value of time.perf_counter."""
         self._rows.append((now, delivered.seconds, len(delivered.root), delivered.late_frames, delivered.evaluations))
-        while self._rows[-1][0] - self._rows[0][0] > _LONG:
+        while self._rows[-1][0] - self._rows[0][0] > _LONG_SECONDS:
             self._rows.popleft()
 
     def judge(self, now: float) -> bool:
         """Whether it has begun or ceased to be too slow."""
         if not self._rows:
             return False
-        quick, long = self._share(now - _SOON), self._share(now - _LONG)
-        silent = now - self._rows[-1][0] > _SILENT
+        quick, long = self._compute_late_share(now - _SHORT_SECONDS), self._compute_late_share(now - _LONG_SECONDS)
+        silent = now - self._rows[-1][0] > _SILENT_SECONDS
         if self.slow:
-            changed = not silent and self._share(now - _OVER) == 0 and self._rows[0][0] <= now - _OVER
+            changed = (
+                not silent
+                and self._compute_late_share(now - _RECOVERY_SECONDS) == 0
+                and self._rows[0][0] <= now - _RECOVERY_SECONDS
+            )
         else:
-            changed = silent or quick >= _HALF or (long >= _FIFTH and now - self._rows[0][0] > _LONG - _SOON)
+            changed = (
+                silent
+                or quick >= _MAX_SHORT_SHARE
+                or (long >= _MAX_LONG_SHARE and now - self._rows[0][0] > _LONG_SECONDS - _SHORT_SECONDS)
+            )
         self.slow ^= changed
-        while changed and not self.slow and self._rows[0][0] <= now - _OVER:
+        while changed and not self.slow and self._rows[0][0] <= now - _RECOVERY_SECONDS:
             self._rows.popleft()  # what is over is not judged again
         return changed
 
     def text(self, now: float) -> str:
         """How slow, for a person."""
         first, last = self._rows[0], self._rows[-1]
-        if (silent := now - last[0]) > _SILENT:
+        if (silent := now - last[0]) > _SILENT_SECONDS:
             return f"no frame for {silent:.0f} s"
-        late = f"{100 * self._share(now - _LONG):.0f} % of its frames come late"
-        recent = [row for row in self._rows if row[0] > now - _SOON] or [last]
+        late = f"{100 * self._compute_late_share(now - _LONG_SECONDS):.0f} % of its frames come late"
+        recent = [row for row in self._rows if row[0] > now - _SHORT_SECONDS] or [last]
         searched = sum(row[4] for row in recent) / len(recent)
         rate = (last[1] - first[1]) / max(1e-9, last[0] - first[0])
         slowly = f"it plays at {100 * rate:.0f} % of real time, " if len(self._rows) > 2 and 0 < rate < 0.97 else ""
         return f"{slowly}{late}, {searched:.0f} evaluations a step"
 
-    def _share(self, since: float) -> float:
+    def _compute_late_share(self, since: float) -> float:
         """Of late frames among those that came since then; 0 of very few."""
         frames = sum(row[2] for row in self._rows if row[0] > since)
-        return sum(row[3] for row in self._rows if row[0] > since) / frames if frames >= _FEWEST else 0.0
+        return sum(row[3] for row in self._rows if row[0] > since) / frames if frames >= _MIN_SHARE_FRAMES else 0.0

@@ -11,8 +11,8 @@ import torch
 from mapctl import formats
 from mapctl.errors import MapctlError, RequestError
 from mapctl.motion import Motion
-from mapctl.rotations import sign_continuous
-from mapctl.runtime.live_protocol import Delivered
+from mapctl.rotations import make_sign_continuous
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import spawn
 from mapctl.skeleton import Skeleton
 
@@ -26,7 +26,7 @@ class Recording:
     skeleton: Skeleton
     pieces: list[Motion] = field(default_factory=list)
 
-    def add(self, delivered: Delivered) -> None:
+    def add(self, delivered: FrameChunk) -> None:
         """Keep them."""
         self.pieces.append(delivered.motion(self.skeleton))
 
@@ -35,19 +35,19 @@ class Recording:
         if not self.pieces:
             raise RequestError("nothing was recorded")
         root = torch.cat([piece.root_position for piece in self.pieces])
-        quats = sign_continuous(torch.cat([piece.local_quat_xyzw for piece in self.pieces]))
+        quats = make_sign_continuous(torch.cat([piece.local_quat_xyzw for piece in self.pieces]))
         return Motion(self.skeleton, self.pieces[0].fps, root, quats)
 
 
 @dataclass(frozen=True)
-class Made:
+class RecordedFile:
     """A recording as a file."""
 
     ending: str
     """Of FORMATS."""
     content: bytes
     """All of it."""
-    why: str = ""
+    fallback_reason: str = ""
     """Why it is not of the ending that was asked for, if so."""
 
     @property
@@ -56,17 +56,17 @@ class Made:
         return f"mapctl.{self.ending}"
 
 
-def as_some_file(motion: Motion, ending: str) -> Made:
+def encode_with_fallback(motion: Motion, ending: str) -> RecordedFile:
     """The content of a file of that ending, or of a BVH where none can be made, so that no recording is lost."""
     try:
-        return Made(ending, as_file(motion, ending))
+        return RecordedFile(ending, encode_motion(motion, ending))
     except Exception as error:
         if ending == FORMATS[0]:
             raise
-        return Made(FORMATS[0], as_file(motion, FORMATS[0]), str(error))
+        return RecordedFile(FORMATS[0], encode_motion(motion, FORMATS[0]), str(error))
 
 
-def keep(made: Made, folder: Path) -> Path:
+def save_without_replacing(made: RecordedFile, folder: Path) -> Path:
     """Write it into a folder, under a name that nobody has: mapctl.bvh, mapctl-2.bvh, ..."""
     for number in itertools.count(1):
         path = folder / (made.name if number == 1 else f"mapctl-{number}.{made.ending}")
@@ -76,7 +76,7 @@ def keep(made: Made, folder: Path) -> Path:
     raise AssertionError  # there is always another number
 
 
-def as_file(motion: Motion, ending: str) -> bytes:
+def encode_motion(motion: Motion, ending: str) -> bytes:
     """The content of a file of one of FORMATS. A film is drawn in a process of its own, which takes a while."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"motion.{ending}"
@@ -85,14 +85,14 @@ def as_file(motion: Motion, ending: str) -> bytes:
             return path.read_bytes()
         kept = Path(folder) / "motion.npz"
         formats.save(motion, kept)
-        painter = spawn(_film, kept, path)
+        painter = spawn(_render_film, kept, path)
         painter.join()
         if not path.is_file():
             raise MapctlError("the film could not be drawn; `mapctl render` on a recorded BVH says why")
         return path.read_bytes()
 
 
-def _film(source: Path, out: Path) -> None:
+def _render_film(source: Path, out: Path) -> None:
     from scenes.film import film
 
     film([(formats.load(source), None)], out)

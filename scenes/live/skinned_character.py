@@ -6,22 +6,22 @@ import viser
 from trimesh.visual import ColorVisuals
 
 from mapctl.mesh.primitives import Array
-from mapctl.mesh.skinning import Skin, at_rest, skin
+from mapctl.mesh.skinning import Skin, at_rest, build_skin
 from mapctl.skeleton import Skeleton
 
 
-class Puppet:
+class SkinnedCharacter:
     """The mannequin of a skeleton below a node of a scene."""
 
     def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton, colour: str):
         """`colour` is the torso's."""
-        body, paths = skin(at_rest(skeleton), colour), []
+        body, paths = build_skin(at_rest(skeleton), colour), []
         self._joints: list[viser.FrameHandle] = []
         for joint, parent in enumerate(skeleton.parents):
             paths.append(f"{paths[parent] if parent >= 0 else name}/{skeleton.names[joint]}")
             offset = skeleton.offsets[joint].numpy()
             self._joints.append(scene.add_frame(paths[joint], show_axes=False, position=offset))
-            if (part := _part(body, joint)) is not None:
+            if (part := _extract_part(body, joint)) is not None:
                 scene.add_mesh_trimesh(f"{paths[joint]}/skin", part)
 
     def pose(self, root: Array, quats: Array) -> None:
@@ -31,7 +31,7 @@ class Puppet:
             handle.wxyz = (w, x, y, z)
 
 
-def _part(body: Skin, joint: int) -> trimesh.Trimesh | None:
+def _extract_part(body: Skin, joint: int) -> trimesh.Trimesh | None:
     """The triangles that hang on a joint, None if there are none."""
     faces = body.faces[body.joint[body.faces[:, 0]] == joint]
     if not len(faces):

@@ -16,7 +16,7 @@ from scenes.film import film
 
 _JOINTS = ("leftUpperArm", "rightLowerArm", "leftUpperLeg", "rightLowerLeg", "chest")
 _BEFORE, _AFTER = "#bbbbbb", "#4c78a8"
-_APART = 1.4  # metres between the two of a film
+_SIDE_OFFSET = 1.4  # metres between the two of a film
 
 
 def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig | None = None) -> None:
@@ -33,7 +33,7 @@ def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig 
     rows = figure.subplots(len(_JOINTS) + 4, 1, sharex=True)
     for row, name in zip(rows, _JOINTS, strict=False):
         for motion, colour in ((before, _BEFORE), (after, _AFTER)):
-            row.plot(seconds, _angle(motion, name), color=colour, linewidth=1)
+            row.plot(seconds, _compute_joint_angle(motion, name), color=colour, linewidth=1)
         row.set_ylabel(f"{name}\ndegrees")
     for side, name in enumerate(("leftToes", "rightToes")):
         height, speed = rows[len(_JOINTS) + 2 * side], rows[len(_JOINTS) + 2 * side + 1]
@@ -50,7 +50,7 @@ def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig 
         figure.savefig(scratch, format="png", dpi=90)
 
 
-def side_by_side(
+def film_side_by_side(
     capture: Motion,
     clean: Motion,
     path: str | PathLike[str],
@@ -60,7 +60,7 @@ def side_by_side(
 ) -> None:
     """Film the capture, grey, and the result beside it."""
     before, after = (retarget.to_canonical(motion, rig)[0] for motion in (capture, clean))
-    aside = torch.tensor([_APART, 0.0, 0.0], dtype=torch.float64)
+    aside = torch.tensor([_SIDE_OFFSET, 0.0, 0.0], dtype=torch.float64)
     film(
         [(after, None), (replace(before, root_position=before.root_position + aside), None, "#999999")],
         path,
@@ -68,7 +68,7 @@ def side_by_side(
     )
 
 
-def _angle(motion: Motion, name: str) -> np.ndarray:
+def _compute_joint_angle(motion: Motion, name: str) -> np.ndarray:
     """From the T-pose, degrees."""
     quats = motion.local_quat_xyzw[:, motion.skeleton.index(name)]
     return torch.rad2deg(rotations.to_rotation_vector(quats).norm(dim=-1)).numpy()

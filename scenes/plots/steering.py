@@ -8,7 +8,7 @@ import numpy as np
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
 from mapctl.intent.steering import CommandTrack
-from mapctl.metrics.travel import travelled, wanted
+from mapctl.metrics.travel import compute_low_pass_velocity, sample_commands
 from mapctl.motion import Motion
 
 
@@ -19,8 +19,8 @@ def plot(motion: Motion, track: CommandTrack, path: str | PathLike[str]) -> None
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RequestError(f"plots need matplotlib ({error}): pip install 'mapctl[render]'") from error
-    way = travelled(motion)
-    speed, heading = wanted(track, way.seconds.tolist())
+    way = compute_low_pass_velocity(motion)
+    speed, heading = sample_commands(track, way.seconds.tolist())
     figure = Figure(figsize=(11, 5), layout="constrained")
     FigureCanvasAgg(figure)
     above, below = figure.subplots(2, 1, sharex=True)

@@ -10,10 +10,10 @@ import numpy as np
 
 from mapctl.errors import MapctlError
 from mapctl.mesh import colours
-from mapctl.mesh.primitives import Array, Surface, merge
+from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from scenes.cameras import View
 from scenes.content import Content
-from scenes.overlays import shadow
+from scenes.overlays import build_shadow
 from scenes.renderers.lighting import shade
 
 _NEAR, _FAR = 0.3, 400.0
@@ -29,7 +29,7 @@ class OffscreenPainter:
     name = "pyrender (EGL)"
 
     def __init__(self):
-        self._gl, self._renderer = _graphics()
+        self._gl, self._renderer = _open_graphics()
         gl = self._gl
         self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
         self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_NEAR, zfar=_FAR))
@@ -40,9 +40,9 @@ class OffscreenPainter:
         """The picture, (height, width, 3) uint8."""
         eye = view.pose[:3, 3]
         bodies = [figure.surface() for figure in content.figures]
-        shadows = [shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
+        shadows = [build_shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
         groups = (([*content.ground, *shadows], self._sheer), (bodies, self._solid))
-        nodes = [self._scene.add(self._mesh(group, material, eye)) for group, material in groups if group]
+        nodes = [self._scene.add(self._build_mesh(group, material, eye)) for group, material in groups if group]
         camera = self._camera.camera
         camera.yfov, camera.aspectRatio = view.fov, view.width / view.height
         self._scene.set_pose(self._camera, view.pose)
@@ -52,9 +52,9 @@ class OffscreenPainter:
             self._scene.remove_node(node)
         return picture
 
-    def _mesh(self, surfaces: Sequence[Surface], material: object, eye: Array):
+    def _build_mesh(self, surfaces: Sequence[Surface], material: object, eye: Array):
         """All surfaces as one mesh: a draw call costs more than a body's triangles, and the order stays."""
-        surface = merge(surfaces)
+        surface = merge_surfaces(surfaces)
         primitive = self._gl.Primitive(
             positions=surface.vertices, indices=surface.faces, color_0=shade(surface, eye), material=material
         )
@@ -62,7 +62,7 @@ class OffscreenPainter:
 
 
 @cache
-def _graphics() -> tuple[ModuleType, Any]:
+def _open_graphics() -> tuple[ModuleType, Any]:
     """pyrender and its one renderer. Deleting one cuts off all others, so none is deleted and none added."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     if not hasattr(np, "infty"):
@@ -71,12 +71,12 @@ def _graphics() -> tuple[ModuleType, Any]:
         import pyrender
 
         return pyrender, pyrender.OffscreenRenderer(64, 64)
-    except _no_graphics() as error:
+    except _list_graphics_errors() as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise NoGraphicsError(f"no OpenGL without a window ({reason})") from error
 
 
-def _no_graphics() -> tuple[type[Exception], ...]:
+def _list_graphics_errors() -> tuple[type[Exception], ...]:
     """What a missing library, driver or display raises somewhere between Python and EGL."""
     plain = (ImportError, OSError, AttributeError, AssertionError, ValueError, RuntimeError, TypeError)
     try:

@@ -10,42 +10,42 @@ from scenes.renderers.offscreen import NoGraphicsError, OffscreenPainter
 from scenes.renderers.stick_figure import StickPainter
 
 RendererName = Literal["auto", "egl", "stick"]
-VARIABLE = "MAPCTL_RENDERER"
+RENDERER_VARIABLE = "MAPCTL_RENDERER"
 """Environment variable with the renderer where none is asked for."""
 
 _PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libgles2"
 _log = logging.getLogger("mapctl.scenes")
 
 
-def painter(name: RendererName | None = None) -> Painter:
+def select_painter(name: RendererName | None = None) -> Painter:
     """The painter of a name; None takes the one in MAPCTL_RENDERER, else `auto`.
 
     `auto` falls back to stick figures and logs one line that says what is missing; `egl` raises
     NoGraphicsError. RequestError for other names, and where not even matplotlib is installed.
     """
-    wanted = name or os.environ.get(VARIABLE) or "auto"
+    wanted = name or os.environ.get(RENDERER_VARIABLE) or "auto"
     if wanted not in ("auto", "egl", "stick"):
         raise RequestError(f"the renderer must be auto, egl or stick, got {wanted!r}")
     if wanted == "stick":
-        return _sticks()
+        return _make_stick_painter()
     try:
         return OffscreenPainter()
     except NoGraphicsError as error:
         if wanted == "egl":
             raise
         _log.warning("%s; drawing stick figures. On Debian: apt-get install %s", error, _PACKAGES)
-        return _sticks()
+        return _make_stick_painter()
 
 
 def back_end() -> str:
     """One line for people: what films would be made with here, and why not better."""
     try:
-        return painter("egl").name
+        return select_painter("egl").name
     except NoGraphicsError as error:
         return f"{StickPainter.name}: {error}"
 
 
-def _sticks() -> Painter:
+def _make_stick_painter() -> Painter:
     try:
         return StickPainter()
     except ImportError as error:

@@ -68,7 +68,7 @@ def _draw_shadow(axes, view: View, figure: Figure) -> None:
 
 def _draw_figure(axes, view: View, figure: Figure) -> None:
     ends, radii, rgb = figure.body.sticks(figure.frame)
-    _draw_lines(axes, view, ends, radii, colours.mix(rgb, colours.rgb(colours.BACKGROUND), figure.fade))
+    _draw_lines(axes, view, ends, radii, colours.blend_colours(rgb, colours.rgb(colours.BACKGROUND), figure.fade))
 
 
 def _draw_lines(axes, view: View, ends: Array, radii: Array, shown: Array) -> None:

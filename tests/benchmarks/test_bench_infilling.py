@@ -9,9 +9,9 @@ from helpers import run, walk
 from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infiller
 
 from controllers.benchmarks import infilling
-from controllers.benchmarks.infilling import TASKS, Task, middle, on_canonical_bones, table
+from controllers.benchmarks.infilling import TASKS, Task, benchmark_infilling, scale_to_canonical_bones, slice_middle
 from mapctl import retarget
-from mapctl.inbetweening import Proposed
+from mapctl.inbetweening import ProposedPositions
 from priors import checkpoints
 from priors.infiller.network import ConvInfiller
 
@@ -51,7 +51,7 @@ def rows():
     networks, told = {"skips": tiny_infiller(drawn=0.1), "vanilla": vanilla()}, []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(infilling, "TASKS", SOME)
-        rows = table(
+        rows = benchmark_infilling(
             [walk(40, turn_rate=-1.0, seed=2)],
             networks,
             ours="skips",
@@ -86,7 +86,9 @@ def test_bones_are_rigid_but_for_networks_as_they_are(rows):
 def test_an_untrained_network_is_interpolation_and_no_better(clips, monkeypatch):
     """It gives back the guess that it was shown: were that the truth, it would be perfect."""
     monkeypatch.setattr(infilling, "TASKS", SOME[1:2])
-    found, again = (rows_of(table(clips, {"skips": tiny_infiller()}, ours="skips"), "gap") for _ in range(2))
+    found, again = (
+        rows_of(benchmark_infilling(clips, {"skips": tiny_infiller()}, ours="skips"), "gap") for _ in range(2)
+    )
     assert found == again
     assert found["interpolation"]["error_cm"] > 0.5
     assert found["skips, raw"]["error_cm"] == pytest.approx(found["interpolation"]["error_cm"], rel=1e-5)
@@ -101,7 +103,7 @@ class Keeping:
     def propose(self, image):
         """As it was shown."""
         self.images.append(image)
-        return Proposed(image.places, torch.zeros_like(image.contacts))
+        return ProposedPositions(image.places, torch.zeros_like(image.contacts))
 
 
 @pytest.mark.parametrize("task", [SOME[1], SOME[3]], ids=lambda task: task.name)
@@ -109,9 +111,9 @@ def test_networks_are_not_shown_what_is_missing(clips, monkeypatch, task):
     """What is known is the truth, and what is not is some way from it."""
     monkeypatch.setattr(infilling, "TASKS", (task,))
     keeping = Keeping()
-    table(clips[:1], {"skips": keeping}, ours="skips")
+    benchmark_infilling(clips[:1], {"skips": keeping}, ours="skips")
     image = keeping.images[0]
-    truth = middle(on_canonical_bones(clips[0]), task.frames).joint_positions().float()
+    truth = slice_middle(scale_to_canonical_bones(clips[0]), task.frames).joint_positions().float()
     places = image.to_world(image.places)[0]
     known = image.known[0]
     assert (~known).any()
@@ -120,7 +122,7 @@ def test_networks_are_not_shown_what_is_missing(clips, monkeypatch, task):
 
 
 def test_tasks_that_no_clip_is_long_enough_for_have_no_rows(clips):
-    rows = table([clips[0].slice(0, 20)], {"skips": tiny_infiller()}, ours="skips")
+    rows = benchmark_infilling([clips[0].slice(0, 20)], {"skips": tiny_infiller()}, ours="skips")
     assert rows == []
 
 
@@ -138,11 +140,11 @@ def test_clips_come_to_canonical_bones_and_the_priors_rate_from_any_size():
         skeleton=replace(motion.skeleton, offsets=1.3 * motion.skeleton.offsets),
         root_position=1.3 * motion.root_position,
     )
-    first, second = (on_canonical_bones(each) for each in (motion, large))
+    first, second = (scale_to_canonical_bones(each) for each in (motion, large))
     assert (first.num_frames, float(first.fps)) == (60, 30)
     assert torch.allclose(first.joint_positions(), second.joint_positions(), atol=1e-9)
-    assert middle(first, 20).num_frames == 20
-    assert torch.equal(middle(first, 20).root_position, first.root_position[20:40])
+    assert slice_middle(first, 20).num_frames == 20
+    assert torch.equal(slice_middle(first, 20).root_position, first.root_position[20:40])
 
 
 @pytest.fixture
@@ -151,7 +153,7 @@ def folder(tmp_path):
     for number, motion in enumerate([walk(50, turn_rate=0.5), walk(45, turn_rate=-1.0)]):
         path = tmp_path / "data" / "bandai" / f"a_walk_{number}.bvh"
         path.parent.mkdir(parents=True, exist_ok=True)
-        retarget.from_canonical(motion, retarget.map_rig(motion.skeleton)).save(path)
+        retarget.from_canonical(motion, retarget.identify_rig(motion.skeleton)).save(path)
     held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
     told = replace(card(), data={"held_out": held})
     checkpoints.save(network(drawn=0.1).state_dict(), told, tmp_path / "ours.safetensors")

@@ -7,7 +7,12 @@ import torch
 from helpers import walk
 from tiny_infiller import tiny_infiller
 
-from controllers.benchmarks.lost_joints import LIMBS_LOST, at_pose, lost_joints, mean_rotations
+from controllers.benchmarks.lost_joints import (
+    MISSING_LIMBS,
+    benchmark_missing_joints,
+    mean_rotations,
+    replace_joint_rotations,
+)
 from mapctl.skeleton import CANONICAL
 
 
@@ -33,10 +38,12 @@ def test_turns_about_one_axis_have_their_middle_as_mean_and_every_clip_counts_al
     assert 2 * torch.atan2(found[:, 1].abs(), found[:, 3].abs()) == pytest.approx(0.6, abs=1e-9)
 
 
-@pytest.mark.parametrize("joints", LIMBS_LOST.values(), ids=LIMBS_LOST)
+@pytest.mark.parametrize("joints", MISSING_LIMBS.values(), ids=MISSING_LIMBS)
 def test_only_the_lost_joints_and_what_hangs_on_them_go_to_a_mean_pose(joints):
     clip = walk(20, seed=1)
-    moved = (at_pose(clip, joints, mean_rotations([clip])).joint_positions() - clip.joint_positions()).norm(dim=-1)
+    moved = (
+        replace_joint_rotations(clip, joints, mean_rotations([clip])).joint_positions() - clip.joint_positions()
+    ).norm(dim=-1)
     lost = [CANONICAL.index(name) for name in joints]
     others = [joint for joint in range(CANONICAL.num_joints) if joint not in lost]
     assert moved[:, lost].mean(dim=0).min() > 1e-3
@@ -44,8 +51,8 @@ def test_only_the_lost_joints_and_what_hangs_on_them_go_to_a_mean_pose(joints):
 
 
 def test_a_row_for_every_kind_and_limb_and_none_for_clips_that_are_too_short():
-    rows = lost_joints({"walks": [walk(130), walk(150, seed=3)], "short": [walk(60)]}, tiny_infiller())
-    assert [(row["method"], row["clips"]) for row in rows] == [("MAP on walks", 2)] * len(LIMBS_LOST)
+    rows = benchmark_missing_joints({"walks": [walk(130), walk(150, seed=3)], "short": [walk(60)]}, tiny_infiller())
+    assert [(row["method"], row["clips"]) for row in rows] == [("MAP on walks", 2)] * len(MISSING_LIMBS)
     for row in rows:
         assert row["ratio"] == pytest.approx(row["error_cm"] / row["mean_pose_cm"])
         # A clip's own mean is the best fixed pose in rotations: no other clip's can be much better in places.
@@ -53,4 +60,4 @@ def test_a_row_for_every_kind_and_limb_and_none_for_clips_that_are_too_short():
 
 
 def test_no_clips_are_no_rows():
-    assert lost_joints({"walks": []}, tiny_infiller()) == []
+    assert benchmark_missing_joints({"walks": []}, tiny_infiller()) == []

@@ -5,13 +5,13 @@ import math
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
-from controllers.benchmarks.tweening import FRAMES, table
+from controllers.benchmarks.tweening import TWEEN_FRAMES, benchmark_tweening
 
 
 def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough():
-    kinds = {"walks": [walk(FRAMES, cadence=1.2)], "short": [walk(60)]}
+    kinds = {"walks": [walk(TWEEN_FRAMES, cadence=1.2)], "short": [walk(60)]}
     seen = []
-    rows = table(kinds, tiny_infiller(drawn=0.02), [tiny_density()], progress=lambda *at: seen.append(at))
+    rows = benchmark_tweening(kinds, tiny_infiller(drawn=0.02), [tiny_density()], progress=lambda *at: seen.append(at))
     assert seen == [(1, 2), (2, 2)]
     assert [(row["kind"], row["what"], row["by"]) for row in rows] == [
         ("walks", "keys", "chosen"),

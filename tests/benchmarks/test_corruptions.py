@@ -5,8 +5,15 @@ import torch
 from captures import apart_deg, error_cm, on_rig
 from helpers import generator
 
-from controllers.benchmarks.corruptions import CONDITIONS, misplaced, noisy, sliding, true_contacts, without_arm
-from mapctl.recording.masks import masked
+from controllers.benchmarks.corruptions import (
+    CONDITIONS,
+    add_drift,
+    add_noise,
+    detect_true_contacts,
+    drop_arm,
+    perturb_positions,
+)
+from mapctl.recording.masks import expand_valid_masks
 
 
 @pytest.fixture(scope="module", params=["canonical", "bandai", "daz"])
@@ -30,7 +37,7 @@ def test_every_condition_keeps_rig_frames_and_rate_and_is_seeded(motion, name):
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_masks_fit_the_recording(motion, name):
     spoilt = CONDITIONS[name](motion, generator(1))
-    joints, root = masked(spoilt.motion, spoilt.masks)  # refuses what does not fit
+    joints, root = expand_valid_masks(spoilt.motion, spoilt.masks)  # refuses what does not fit
     assert not root.any()
     if "lost" not in name:
         assert not spoilt.masks
@@ -43,11 +50,11 @@ def test_masks_fit_the_recording(motion, name):
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_as_many_joints_are_lost_as_the_condition_says(motion, share):
     spoilt = CONDITIONS[f"{100 * share:g} % of joints lost"](motion, generator(1))
-    assert float(masked(motion, spoilt.masks)[0].double().mean()) == pytest.approx(share, rel=0.1)
+    assert float(expand_valid_masks(motion, spoilt.masks)[0].double().mean()) == pytest.approx(share, rel=0.1)
 
 
 def test_noise_is_that_which_was_asked_for(motion):
-    spoilt = noisy(motion, generator(), degrees=3.0, centimetres=1.5, spikes=0.0).motion
+    spoilt = add_noise(motion, generator(), degrees=3.0, centimetres=1.5, spikes=0.0).motion
     moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
     away = apart_deg(motion.local_quat_xyzw, spoilt.local_quat_xyzw)
     assert float((away[:, moves].square().mean() / 3).sqrt()) == pytest.approx(3, rel=0.03)
@@ -58,7 +65,7 @@ def test_noise_is_that_which_was_asked_for(motion):
 
 
 def test_misplaced_joints_keep_their_bones(motion):
-    spoilt = misplaced(motion, generator(), centimetres=5.0).motion
+    spoilt = perturb_positions(motion, generator(), centimetres=5.0).motion
     parents = list(motion.skeleton.parents)
 
     def bones(one):
@@ -71,13 +78,13 @@ def test_misplaced_joints_keep_their_bones(motion):
 
 
 def test_a_lost_arm_is_lost_in_the_middle(motion):
-    masks = without_arm(motion, generator(), seconds=2.0).masks
+    masks = drop_arm(motion, generator(), seconds=2.0).masks
     assert len(masks) == 3
     assert {(mask.start, mask.stop) for mask in masks} == {(45, 105)}
 
 
 def test_a_drifting_body_takes_its_feet_along(motion):
-    spoilt = sliding(motion, generator(), speed=0.2).motion
+    spoilt = add_drift(motion, generator(), speed=0.2).motion
     drift = (spoilt.joint_positions() - motion.joint_positions()).mean(dim=1)[:, 0]
     smooth = drift.unfold(0, 9, 1).mean(dim=-1)
     assert 0.1 < 30 * torch.diff(smooth).abs().max() < 0.35
@@ -85,7 +92,7 @@ def test_a_drifting_body_takes_its_feet_along(motion):
 
 
 def test_true_contacts_are_of_both_feet_in_turn(motion):
-    contacts = true_contacts(motion)
+    contacts = detect_true_contacts(motion)
     assert contacts.shape == (150, 2)
     assert (contacts.double().mean(dim=0) > 0.05).all()
     assert not contacts.all(dim=0).any()

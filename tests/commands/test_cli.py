@@ -293,9 +293,9 @@ def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
 
 def presses_ctrl_c(monkeypatch, *, after):
     """Every walk from here on is interrupted once so many frames are solved."""
-    from mapctl.problem.receding_horizon import WindowSolver
+    from mapctl.problem.receding_horizon import RecedingHorizonSolver
 
-    solve = WindowSolver.solve
+    solve = RecedingHorizonSolver.solve
 
     def pressed(*words, progress, **options):
         def press(done, total):
@@ -304,7 +304,7 @@ def presses_ctrl_c(monkeypatch, *, after):
 
         return solve(*words, progress=press, **options)
 
-    monkeypatch.setattr(WindowSolver, "solve", pressed)
+    monkeypatch.setattr(RecedingHorizonSolver, "solve", pressed)
 
 
 def test_an_interrupted_walk_is_written_as_far_as_it_was_solved(prior, tmp_path, monkeypatch, capsys):

@@ -15,7 +15,7 @@ ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", 
 
 def peaks_of(path):
     motion = mapctl.load(path)
-    return worst_frame.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
+    return worst_frame.measure_peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
 
 
 @pytest.mark.slow

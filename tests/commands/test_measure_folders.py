@@ -34,7 +34,7 @@ def made(tmp_path_factory):
 def mocap(tmp_path_factory):
     """Nine clips on another rig."""
     folder = tmp_path_factory.mktemp("mocap")
-    rigmap = retarget.map_rig(bandai_skeleton())
+    rigmap = retarget.identify_rig(bandai_skeleton())
     for k in range(9):
         clip = walk(92, cadence=0.7 + 0.05 * k, turn_rate=0.2, seed=20 + k)
         retarget.from_canonical(clip, rigmap).save(folder / f"{k}.bvh")
@@ -89,7 +89,7 @@ def test_the_seed_decides_alone(made, mocap, capsys):
 
 def test_rigs_do_not_matter(made, tmp_path, capsys):
     """The same walks on another rig have the same measures, jitter of every joint too."""
-    rigmap = retarget.map_rig(bandai_skeleton())
+    rigmap = retarget.identify_rig(bandai_skeleton())
     for k in range(8):
         clip = walk(95, cadence=0.8 + 0.05 * k, seed=k)
         retarget.from_canonical(clip, rigmap).save(tmp_path / f"{k}.bvh")

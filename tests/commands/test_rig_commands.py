@@ -10,23 +10,24 @@ from rig_maker import Make, make, names_of, person
 
 import controllers
 import mapctl
-from controllers.common.character import Stature
+from controllers.common.character import Character
 from controllers.following.follow import FollowSettings
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.steering import steer
 from mapctl import curves, retarget
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
-from mapctl.problem.receding_horizon import WindowSettings
-from mapctl.problem.window_solvers import LatentMethod
+from mapctl.problem.receding_horizon import HorizonSettings
+from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.retarget import figure, rigs
-from mapctl.retarget.reference_pose import vector
+from mapctl.retarget.reference_pose import axis_vector
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
-from mapctl.terms import Footing
+from mapctl.terms import FootContact
 
 QUICK = FollowSettings(
-    window=WindowSettings(frames=10, overlap=4, past=12), method=LatentMethod(rounds=1, budget=Budget(evaluations=5))
+    window=HorizonSettings(frames=10, overlap=4, past=12),
+    method=LatentNoiseSolver(rounds=1, budget=Budget(evaluations=5)),
 )
 SIZE = 1.3
 
@@ -110,7 +111,7 @@ def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_
     jobs["convert"] = (tmp_path / "in.bvh", tmp_path / "a.bvh")
     quiet = () if job == "convert" else ("--quiet",)
     assert run(job, *jobs[job], "--rig", told_rig, *quiet) == 0
-    rig = rigs.read(told_rig)
+    rig = rigs.load_rig(told_rig)
     made = mapctl.load(tmp_path / ("generated_000.bvh" if job == "generate" else "a.bvh"))
     assert set(made.skeleton.names) == set(rig.joints.values())
     canonical, rigmap = retarget.to_canonical(made, rig)
@@ -134,10 +135,10 @@ def test_a_rig_that_names_too_little_is_refused_for_a_body(prior, tmp_path, caps
     assert run("info", "--rig", "mixamo") == 2
 
 
-@pytest.mark.parametrize("preset", [rig.name for rig in rigs.known()])
+@pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs()])
 def test_who_stands_on_a_preset_is_the_canonical_body_in_its_t_pose(preset):
-    rig = rigs.read(preset)
-    standing = figure.stand(rig)
+    rig = rigs.load_rig(preset)
+    standing = figure.make_tpose_clip(rig)
     canonical, rigmap = retarget.to_canonical(standing)
     assert rigmap.rig.name == preset  # told by its names alone
     toes = [CANONICAL.index(side + "Toes") for side in ("left", "right")]
@@ -150,20 +151,20 @@ def test_who_stands_on_a_preset_is_the_canonical_body_in_its_t_pose(preset):
 
 @pytest.mark.parametrize(("up", "facing"), [("z", "-y"), ("z", "x"), ("-y", "x"), ("x", "auto"), ("y", "-z")])
 def test_a_rigs_axes_are_the_files(up, facing):
-    rig = replace(rigs.read("mixamo"), up=up, facing=facing)
-    standing = figure.stand(rig)
+    rig = replace(rigs.load_rig("mixamo"), up=up, facing=facing)
+    standing = figure.make_tpose_clip(rig)
     canonical, rigmap = retarget.to_canonical(standing, rig)
     assert (rigmap.up, rigmap.rest) == (up, "T")
-    height = standing.joint_positions()[0] @ vector(up)
+    height = standing.joint_positions()[0] @ axis_vector(up)
     assert float(height.max() - height.min()) > 1.2
     assert float(canonical.joint_positions()[0, CANONICAL.index("head"), 1]) > 1.2
     if facing != "auto":
         ahead = standing.skeleton.offsets[standing.skeleton.index("mixamorig:LeftToeBase")]  # with all rotations zero
-        assert float(ahead @ vector(facing)) == pytest.approx(0.0906, abs=1e-6)
+        assert float(ahead @ axis_vector(facing)) == pytest.approx(0.0906, abs=1e-6)
 
 
 def test_convert_to_a_z_up_rig_stands_in_its_world(clip, tmp_path):
-    walk = retarget.from_canonical(person(1.0), retarget.map_rig(bandai_skeleton()))
+    walk = retarget.from_canonical(person(1.0), retarget.identify_rig(bandai_skeleton()))
     walk.save(tmp_path / "in.bvh")
     assert run("convert", tmp_path / "in.bvh", tmp_path / "out.bvh", "--rig", clip) == 0
     canonical, rigmap = retarget.to_canonical(mapctl.load(tmp_path / "out.bvh"))
@@ -199,25 +200,25 @@ def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
 
 
 def test_the_canonical_body_is_not_scaled_at_all():
-    assert Stature().scale == 1.0
-    assert Stature().small is CANONICAL
+    assert Character().scale == 1.0
+    assert Character().small is CANONICAL
     curve, command = curves.circle(radius=2.0), Command(1.0, 0.0)
-    assert Stature().curve(curve) is curve
-    assert Stature().command(command) is command
+    assert Character().curve(curve) is curve
+    assert Character().command(command) is command
 
 
 def test_twice_the_legs_make_twice_the_way():
     """The same walk, of everything twice as long: a prior cannot tell it from its own."""
     density, double = tiny_density(), Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 2)
-    small = controllers.following.follow(
+    small = controllers.follow(
         density, curves.circle(radius=2.0), seconds=1.0, speed=1.0, settings=QUICK, generator=generator()
     )
-    footing = Footing(sigma_speed=0.06, sigma_height=0.02, sigma_below=0.01, rest_height=2 * TOE_REST_HEIGHT)
+    footing = FootContact(sigma_speed=0.06, sigma_height=0.02, sigma_below=0.01, rest_height=2 * TOE_REST_HEIGHT)
     twice = {
         name: 2 * getattr(QUICK, name)
         for name in ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")
     }
-    large = controllers.following.follow(
+    large = controllers.follow(
         density,
         curves.circle(radius=4.0),
         seconds=1.0,
@@ -234,7 +235,7 @@ def test_twice_the_legs_make_twice_the_way():
 
 
 def test_a_tall_character_is_steered_in_its_own_metres():
-    settings = steer.SteerSettings(horizon=10, evaluations=3, footing=Footing(rest_height=SIZE * TOE_REST_HEIGHT))
+    settings = steer.SteerSettings(horizon=10, evaluations=3, footing=FootContact(rest_height=SIZE * TOE_REST_HEIGHT))
     state, first = steer.begin(
         tiny_density(), Command(1.3, 0.0), generator=generator(), settings=settings, at=(1.0, 2.0), skeleton=taller()
     )
@@ -244,12 +245,12 @@ def test_a_tall_character_is_steered_in_its_own_metres():
     assert frames.motion.skeleton.offsets is state.person.skeleton.offsets
     step = (frames.motion.root_position[0] - first.motion.root_position[0]).norm()
     assert 0.005 < float(step) < 0.15
-    assert frames.wishes[0].speed == pytest.approx(first.wishes[0].speed, abs=0.2)
+    assert frames.steering_targets[0].speed == pytest.approx(first.steering_targets[0].speed, abs=0.2)
 
 
 def test_a_tall_character_goes_on_where_its_clip_ends():
     clip = person(SIZE, 40)
-    settings = GenerateSettings(finishing=None)
+    settings = GenerateSettings(foot_cleanup=None)
     drawn = generate(
         tiny_density(), seconds=0.5, generator=generator(), settings=settings, start_clip=clip, skeleton=clip.skeleton
     )
@@ -260,4 +261,4 @@ def test_a_tall_character_goes_on_where_its_clip_ends():
 def test_who_has_no_legs_is_refused():
     stump = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 0.0)
     with pytest.raises(RequestError, match="legs of a human's length"):
-        Stature(stump, 0.0)
+        Character(stump, 0.0)

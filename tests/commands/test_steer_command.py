@@ -11,7 +11,7 @@ from helpers import walk
 import mapctl
 from mapctl import cli
 from mapctl.intent.steering import Command, CommandTrack
-from mapctl.metrics.travel import by_command, travelled
+from mapctl.metrics.travel import compute_low_pass_velocity, measure_commands
 
 SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
 
@@ -101,7 +101,7 @@ def test_bad_scripts_are_named_and_nothing_is_written(steer, tmp_path, capsys, s
 
 def test_slow_velocity_is_that_of_the_walk():
     motion = walk(120)
-    way = travelled(motion)
+    way = compute_low_pass_velocity(motion)
     net = (motion.root_position[-1] - motion.root_position[0])[::2].norm() / (119 / 30)
     assert np.abs(way.speed[20:-20] - float(net)).max() < 0.05
     assert np.abs(way.direction[20:-20]).max() < 0.1
@@ -112,7 +112,7 @@ def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
     speed = float((motion.root_position[-1] - motion.root_position[0])[::2].norm()) / (149 / 30)
     way = float(torch.atan2(*(motion.root_position[-1] - motion.root_position[0])[[0, 2]]))
     obeyed, not_obeyed = (
-        by_command(motion, CommandTrack((0.0,), (Command(speed, way + off),)))[0] for off in (2 * math.pi, 1.0)
+        measure_commands(motion, CommandTrack((0.0,), (Command(speed, way + off),)))[0] for off in (2 * math.pi, 1.0)
     )
     assert obeyed["reached_s"] == 0
     assert obeyed["steady_speed_mps"] == pytest.approx(speed, rel=0.03)
@@ -123,13 +123,13 @@ def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
 
 def test_turning_on_is_measured_as_a_rate():
     motion = walk(180, turn_rate=0.5)
-    row = by_command(motion, CommandTrack((0.0,), (Command(1.2, 0.0, turning=0.5),)))[0]
+    row = measure_commands(motion, CommandTrack((0.0,), (Command(1.2, 0.0, turning=0.5),)))[0]
     assert row["steady_turn_deg_s"] == pytest.approx(math.degrees(0.5), rel=0.05)
     assert row["steady_heading_error_deg"] is None
 
 
 def test_a_short_command_has_no_steady_part():
-    rows = by_command(walk(100), CommandTrack((0.0, 2.0), (Command(1, 0), Command(0, 0))))
+    rows = measure_commands(walk(100), CommandTrack((0.0, 2.0), (Command(1, 0), Command(0, 0))))
     assert rows[0]["steady_speed_mps"] is None
     assert rows[1]["steady_heading_error_deg"] is None
 
@@ -144,5 +144,5 @@ def test_a_wanted_step_length_is_in_the_ledger_and_the_report(steer, tmp_path, c
 
 def test_steps_of_a_walk_are_measured():
     motion = walk(180)
-    row = by_command(motion, CommandTrack((0.0,), (Command(1.2, 0.0, step_length=0.6),)))[0]
+    row = measure_commands(motion, CommandTrack((0.0,), (Command(1.2, 0.0, step_length=0.6),)))[0]
     assert row["steady_step_m"] == pytest.approx(1.2 / (2 * 0.9), rel=0.15)  # two steps a stride

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mapctl.contacts import ContactSettings, floor_heights, planted
+from mapctl.contacts import ContactSettings, detect_contacts, estimate_floor_heights
 from mapctl.errors import RequestError
 
 
@@ -46,18 +46,18 @@ def test_contacts_are_those_of_the_definition(seed):
         expected = by_loop(toes, 30)
         assert expected.any()
         assert not expected.all()
-        np.testing.assert_array_equal(planted(toes, 30)[1:].numpy(), expected)
+        np.testing.assert_array_equal(detect_contacts(toes, 30)[1:].numpy(), expected)
 
 
 def test_contacts_mean_the_same_at_any_frame_rate():
-    slow, fast = planted(steps(180, 30), 30), planted(steps(720, 120), 120)
+    slow, fast = detect_contacts(steps(180, 30), 30), detect_contacts(steps(720, 120), 120)
     assert (slow == fast[::4]).double().mean() > 0.97
 
 
 def test_contacts_do_not_depend_on_place_direction_or_floor():
     toes = torch.tensor(steps(150, 30))
     turned = toes[..., [2, 1, 0]] * torch.tensor([1.0, 1.0, -1.0]) + torch.tensor([3.0, -7.0, 11.0])
-    assert torch.equal(planted(toes, 30), planted(turned, Fraction(30)))
+    assert torch.equal(detect_contacts(toes, 30), detect_contacts(turned, Fraction(30)))
 
 
 def test_contacts_shorter_than_a_tenth_of_a_second_are_dropped():
@@ -65,28 +65,28 @@ def test_contacts_shorter_than_a_tenth_of_a_second_are_dropped():
         toes = torch.zeros(30, 1, 3, dtype=torch.float64)
         toes[:, 0, 0] = torch.arange(30)
         toes[11 : 11 + frames, 0, 0] = 10.0  # stands for so many steps
-        assert bool(planted(toes, 30).any()) is kept
+        assert bool(detect_contacts(toes, 30).any()) is kept
 
 
 def test_the_first_frame_is_planted_with_the_second():
     still = torch.zeros(10, 2, 3)
-    assert planted(still, 30).all()
+    assert detect_contacts(still, 30).all()
     still[0, 0, 1] = 0.1  # the left toe starts in the air
-    assert planted(still, 30)[0].tolist() == [False, True]
+    assert detect_contacts(still, 30)[0].tolist() == [False, True]
 
 
 def test_thresholds_are_settings():
     toes = steps(150, 30)
-    assert not planted(toes, 30, ContactSettings(slow=0.0)).any()
-    assert planted(toes, 30, ContactSettings(slow=99.0, reach=99.0)).all()
+    assert not detect_contacts(toes, 30, ContactSettings(slow=0.0)).any()
+    assert detect_contacts(toes, 30, ContactSettings(slow=99.0, reach=99.0)).all()
     lifted = torch.tensor(toes) + torch.tensor([0.0, 1.5, 0.0])
-    torch.testing.assert_close(floor_heights(lifted), floor_heights(torch.tensor(toes)) + 1.5)
-    np.testing.assert_allclose(floor_heights(lifted).numpy(), np.percentile(lifted[..., 1].numpy(), 5, axis=0))
+    torch.testing.assert_close(estimate_floor_heights(lifted), estimate_floor_heights(torch.tensor(toes)) + 1.5)
+    np.testing.assert_allclose(estimate_floor_heights(lifted).numpy(), np.percentile(lifted[..., 1].numpy(), 5, axis=0))
 
 
 def test_a_clip_too_short_for_a_contact_has_none():
-    assert not planted(torch.zeros(1, 2, 3), 30).any()
-    assert not planted(torch.zeros(2, 2, 3), 30).any()
+    assert not detect_contacts(torch.zeros(1, 2, 3), 30).any()
+    assert not detect_contacts(torch.zeros(2, 2, 3), 30).any()
 
 
 @pytest.mark.parametrize(
@@ -94,4 +94,4 @@ def test_a_clip_too_short_for_a_contact_has_none():
 )
 def test_no_frames_and_no_frame_rate_are_refused(shape, fps):
     with pytest.raises(RequestError):
-        planted(torch.zeros(shape), fps)
+        detect_contacts(torch.zeros(shape), fps)

@@ -9,7 +9,7 @@ from helpers import finite_difference, generator, moved, random_motion, turn_bet
 
 from mapctl import features, rotations
 from mapctl.errors import MapctlError
-from mapctl.features import LAYOUT, Place, decode, encode, mirror_features, root_places
+from mapctl.features import LAYOUT, GroundPose, decode, encode, integrate_root, mirror_features
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -67,26 +67,28 @@ def test_a_straight_walk_reads_in_metres_and_radians_a_frame():
 
 def test_the_root_integration_is_eq_4_step_by_step():
     vectors, place = encode(walk(20, turn_rate=2.0))
-    ground, heading = root_places(vectors, place)
+    ground, heading = integrate_root(vectors, place)
     for t, frame in enumerate(vectors):
-        place = place.moved(LAYOUT.pick(frame, "root_displacement_heading"), LAYOUT.pick(frame, "heading_change")[0])
+        place = place.displace(LAYOUT.pick(frame, "root_displacement_heading"), LAYOUT.pick(frame, "heading_change")[0])
         torch.testing.assert_close((ground[t], heading[t]), (place.position_xz, place.heading), atol=1e-12, rtol=0)
 
 
 def test_a_step_back_undoes_a_step():
-    start = Place(torch.tensor([1.0, 2.0]), torch.tensor(0.4))
+    start = GroundPose(torch.tensor([1.0, 2.0]), torch.tensor(0.4))
     step, turn = torch.tensor([0.3, -0.2]), torch.tensor(1.1)
-    back = start.moved(step, turn).before(step, turn)
+    back = start.displace(step, turn).before(step, turn)
     torch.testing.assert_close((back.position_xz, back.heading), (start.position_xz, start.heading))
 
 
 def test_gradients_of_the_root_integration_are_those_of_finite_differences():
     vectors = torch.randn(2, 7, LAYOUT.size, generator=generator(), dtype=torch.float64)
-    place = Place(torch.randn(2, 2, generator=generator(1), dtype=torch.float64), torch.tensor([0.3, -2.0]).double())
+    place = GroundPose(
+        torch.randn(2, 2, generator=generator(1), dtype=torch.float64), torch.tensor([0.3, -2.0]).double()
+    )
     weight = torch.randn(2, 7, 2, generator=generator(2), dtype=torch.float64)
 
     def measure(values):
-        ground, heading = root_places(values, place)
+        ground, heading = integrate_root(values, place)
         return (ground * weight).sum() + heading.sin().sum()
 
     leaf = vectors.clone().requires_grad_(True)
@@ -99,21 +101,21 @@ def test_gradients_of_the_root_integration_are_those_of_finite_differences():
 
 def test_batches_are_integrated_each_on_its_own():
     vectors = torch.randn(3, 5, LAYOUT.size, generator=generator(), dtype=torch.float64)
-    place = Place(
+    place = GroundPose(
         torch.randn(3, 2, generator=generator(1), dtype=torch.float64),
         torch.randn(3, dtype=torch.float64, generator=generator(2)),
     )
-    ground, heading = root_places(vectors, place)
+    ground, heading = integrate_root(vectors, place)
     for row in range(3):
-        alone = root_places(vectors[row], Place(place.position_xz[row], place.heading[row]))
+        alone = integrate_root(vectors[row], GroundPose(place.position_xz[row], place.heading[row]))
         torch.testing.assert_close((ground[row], heading[row]), alone)
 
 
 def test_rotations_from_features_are_local():
     motion = MOTIONS["walk"]
     vectors, start = encode(motion)
-    _, heading = root_places(vectors, start)
-    assert turn_between(features.local_rotations(vectors, heading), motion.local_quat_xyzw) < 1e-6
+    _, heading = integrate_root(vectors, start)
+    assert turn_between(features.decode_local_rotations(vectors, heading), motion.local_quat_xyzw) < 1e-6
 
 
 def test_the_layout_tiles_the_vector_and_its_fingerprint_tells_it_from_others():

@@ -7,15 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rig_maker import Make, make, names_of, person, versions_of
 
-from controllers.inbetweening.keyframes import limb_end
+from controllers.inbetweening.keyframes import effector_joint
 from mapctl.errors import MapctlError, RequestError
 from mapctl.inbetweening.effector_targets import LIMBS
-from mapctl.joint_names import Side, find_joint, nearest, role, shorten, suggest
-from mapctl.recording.masks import ALL, ROOT, Mask, by_own_names, masked
-from mapctl.retarget import canonical_joints, map_rig, rigs
+from mapctl.joint_names import Side, abbreviate_names, classify_joint, describe_nearest, find_joint, suggest_joints
+from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, resolve_joint_names
+from mapctl.retarget import canonical_joints, identify_rig, rigs
 from mapctl.skeleton import CANONICAL
 
-VERSIONS = [(rig.name, version) for rig in rigs.known() for version in range(versions_of(rig.name))]
+VERSIONS = [(rig.name, version) for rig in rigs.known_rigs() for version in range(versions_of(rig.name))]
 ENDS = [side + part for side in ("left", "right") for part in ("Hand", "Foot")]
 
 
@@ -42,10 +42,10 @@ def test_every_rig_knows_its_own_and_the_canonical_names_in_any_case(preset, ver
 @pytest.mark.parametrize(("preset", "version"), VERSIONS)
 def test_hands_and_feet_are_found_on_every_rig(preset, version):
     names = names_of(preset, version)
-    rigmap = map_rig(make(Make(names)).skeleton)
+    rigmap = identify_rig(make(Make(names)).skeleton)
     for end in ENDS:
         for word in {*spellings(end), names[end], names[end].lower()}:
-            assert CANONICAL.names[limb_end(word, rigmap)] == end or word in rigmap.rig_skeleton.names
+            assert CANONICAL.names[effector_joint(word, rigmap)] == end or word in rigmap.rig_skeleton.names
 
 
 def test_own_names_as_written_come_first():
@@ -73,16 +73,16 @@ def test_masks_take_canonical_names(rig):
     motion = on_rig(rig, 40)
     own = motion.skeleton.names[canonical_joints(motion)["leftHand"]]
     asked = [Mask("leftHand", 3, 9), Mask("LEFTHAND", 9, 12), Mask(ALL, 20, 21), Mask(ROOT, 0, 2)]
-    told = by_own_names(motion, asked)
+    told = resolve_joint_names(motion, asked)
     assert [mask.joint for mask in told] == [own, own, ALL, ROOT]
     assert [(mask.start, mask.stop) for mask in told] == [(mask.start, mask.stop) for mask in asked]
-    assert (masked(motion, asked)[0] == masked(motion, told)[0]).all()
+    assert (expand_valid_masks(motion, asked)[0] == expand_valid_masks(motion, told)[0]).all()
 
 
 def test_names_of_a_rig_that_only_the_user_knows():
     motion = make(Make({c: f"b{n}" for n, c in enumerate(CANONICAL.names)}, extras=False)).motion(person(frames=3))
     given_rig = rigs.Rig("mine", {c: f"b{n}" for n, c in enumerate(CANONICAL.names)})
-    (mask,) = by_own_names(motion, [Mask("rightFoot", 0, 1)], given_rig)
+    (mask,) = resolve_joint_names(motion, [Mask("rightFoot", 0, 1)], given_rig)
     assert mask.joint == f"b{CANONICAL.names.index('rightFoot')}"
 
 
@@ -102,32 +102,32 @@ ASKED = {
 @pytest.mark.parametrize("preset", ["mixamo", "cmu-daz", "bandai-namco", "ue5", "iclone"])
 def test_hands_and_feet_are_suggested_on_the_side_and_limb_that_were_asked_for(preset, asked, meant):
     names = {c: own for c, own in names_of(preset).items() if not asked.startswith("RightToe") or "Toes" not in c}
-    rigmap = map_rig(make(Make(names)).skeleton)
+    rigmap = identify_rig(make(Make(names)).skeleton)
     with pytest.raises(RequestError) as refused:
-        limb_end(asked, rigmap)
+        effector_joint(asked, rigmap)
     assert f"the nearest is {names[meant]}" in str(refused.value)
 
 
 @given(st.sampled_from(CANONICAL.names), st.data())
 def test_suggestions_stay_on_the_side_whatever_is_mistyped(name, data):
-    side, part = role(name).side, name.removeprefix("left").removeprefix("right")
+    side, part = classify_joint(name).side, name.removeprefix("left").removeprefix("right")
     at = data.draw(st.integers(0, len(part) - 1))
     typo = name[: len(name) - len(part)] + part[:at] + part[at + 1 :]
     for preset in ("mixamo", "ue5", "cmu-daz"):
         names = list(names_of(preset).values())
-        found = suggest(typo, names)
+        found = suggest_joints(typo, names)
         assert 0 < len(found) <= 3
-        if role(typo).side is not Side.MIDDLE:
-            assert {role(one).side for one in found} == {side}
+        if classify_joint(typo).side is not Side.MIDDLE:
+            assert {classify_joint(one).side for one in found} == {side}
 
 
 def test_a_refusal_names_few_joints():
     many = [f"Bone{number:03d}" for number in range(200)]
-    assert nearest("Bone07", many).count("Bone") == 3
-    assert shorten(many).count("Bone") == 6
-    assert shorten(many).endswith(" and 194 more")
-    assert shorten(many[:2]) == "Bone000, Bone001"
-    assert nearest("x", ()) == "the nearest is none"
+    assert describe_nearest("Bone07", many).count("Bone") == 3
+    assert abbreviate_names(many).count("Bone") == 6
+    assert abbreviate_names(many).endswith(" and 194 more")
+    assert abbreviate_names(many[:2]) == "Bone000, Bone001"
+    assert describe_nearest("x", ()) == "the nearest is none"
 
 
 @pytest.mark.parametrize("words", [("info",), ("convert", "--rig", "canonical"), ("measure",)])

@@ -3,9 +3,9 @@
 import pytest
 from scenes_walks import walk
 
-from mapctl.joint_names import Part, Role, Side, role
-from mapctl.joint_roles import roles
-from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+from mapctl.joint_names import Part, Role, Side, classify_joint
+from mapctl.joint_roles import classify_joints
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 NAMES = {
     (Side.LEFT, Part.UPPER_LEG): "leftUpperLeg LeftUpLeg UpperLeg_L lThigh lfemur mixamorig:LeftUpLeg L_Thigh thigh.L",
@@ -29,23 +29,23 @@ NAMES = {
     ("name", "side", "part"), [(name, *key) for key, names in NAMES.items() for name in names.split()]
 )
 def test_role_of_every_way_to_name_it(name, side, part):
-    assert role(name) == Role(side, part)
+    assert classify_joint(name) == Role(side, part)
 
 
 def test_the_other_sides_joint_is_the_same_part_of_the_other_side():
     other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT, Side.MIDDLE: Side.MIDDLE}
     for name in CANONICAL.names:
-        assert role(mirrored_name(name)) == Role(other[role(name).side], role(name).part)
+        assert classify_joint(mirror_name(name)) == Role(other[classify_joint(name).side], classify_joint(name).part)
 
 
 def test_no_canonical_joint_is_unknown():
-    assert Part.OTHER not in {r.part for r in roles(CANONICAL)}
+    assert Part.OTHER not in {r.part for r in classify_joints(CANONICAL)}
 
 
 def test_a_shoulder_below_a_collar_is_the_upper_arm_and_a_hip_without_thigh_the_upper_leg():
     names = ("Hips", "LeftHip", "LeftKnee", "Chest", "LeftCollar", "LeftShoulder", "LeftElbow")
     skeleton = Skeleton(names, (-1, 0, 1, 0, 3, 4, 5), walk().skeleton.offsets[:7])
-    found = [r.part for r in roles(skeleton)]
+    found = [r.part for r in classify_joints(skeleton)]
     assert found == [
         Part.HIPS,
         Part.UPPER_LEG,

@@ -41,7 +41,7 @@ def solution() -> Solution:
 
 
 def test_everything_is_in_it(solution):
-    made = report.build(
+    made = report.build_report(
         solution,
         request={"curve": "line:4"},
         seed=3,
@@ -49,7 +49,7 @@ def test_everything_is_in_it(solution):
         seconds=1.0,
         prior={"name": "tiny", "licence": "none", "quality": {"mocap": {"sway_cm": {"mean": 1.9}}}},
     )
-    made = json.loads(report.as_json(made))
+    made = json.loads(report.to_json(made))
     assert made["request"] == {"curve": "line:4"}
     assert made["seed"] == 3
     assert made["prior"] == {"name": "tiny", "licence": "none"}
@@ -65,12 +65,12 @@ def test_everything_is_in_it(solution):
 
 
 def test_a_card_without_mocap_gives_none(solution):
-    made = report.build(solution, request={}, seed=0, measures={}, seconds=1.0, prior={"name": "tiny"})
+    made = report.build_report(solution, request={}, seed=0, measures={}, seconds=1.0, prior={"name": "tiny"})
     assert made["mocap"] == {}
 
 
 def test_timing_is_for_each_delivered_frame(solution):
-    timing = report.timing(solution.windows, seconds=2.0)
+    timing = report.summarise_timing(solution.windows, seconds=2.0)
     assert timing["frame_ms_p50"] == pytest.approx(15)  # between 10 ms in one window and 20 ms in the other
     assert timing["frame_ms_p99"] == pytest.approx(20)
     assert timing["frame_ms_mean"] == pytest.approx(15)
@@ -82,16 +82,16 @@ def test_timing_is_for_each_delivered_frame(solution):
 def test_long_windows_weigh_more():
     """Most frames cost 1 ms, whatever the two short windows took."""
     windows = (window(1, 0.1, 1), window(100, 0.1, 1), window(1, 0.1, 1))
-    assert report.timing(windows, seconds=1)["frame_ms_p50"] == pytest.approx(1)
+    assert report.summarise_timing(windows, seconds=1)["frame_ms_p50"] == pytest.approx(1)
 
 
 def test_no_windows_are_no_numbers():
-    assert json.loads(report.as_json(report.timing((), seconds=0.0)))["frame_ms_p50"] is None
+    assert json.loads(report.to_json(report.summarise_timing((), seconds=0.0)))["frame_ms_p50"] is None
 
 
 def test_progress_is_against_the_wanted_way():
     """89 steps of 1/30 m are 2.967 m; twice that was wanted."""
-    measures = report.path_measures(glide(), curves.line(length=10), wanted_m=2 * 89 / 30)
+    measures = report.measure_path(glide(), curves.line(length=10), wanted_m=2 * 89 / 30)
     assert measures["wanted_m"] == pytest.approx(2 * 89 / 30)
     assert measures["travelled_m"] == pytest.approx(89 / 30, abs=1e-6)
     assert measures["progress_ratio"] == pytest.approx(0.5, abs=1e-6)
@@ -110,16 +110,16 @@ def test_any_tree_becomes_plain_json(values):
     def refuse(word: str):
         raise AssertionError(f"{word} is no JSON")
 
-    json.loads(report.as_json(values), parse_constant=refuse)
+    json.loads(report.to_json(values), parse_constant=refuse)
 
 
 def test_numpy_and_torch_numbers_are_python_ones():
-    values = report.as_json({"a": np.float64("nan"), "b": float(torch.tensor(2.0))})
+    values = report.to_json({"a": np.float64("nan"), "b": float(torch.tensor(2.0))})
     assert json.loads(values) == {"a": None, "b": 2.0}
 
 
 def test_written_whole(solution, tmp_path):
     path = tmp_path / "report.json"
-    report.write(report.status(replace(solution, status=Status(Outcome.DONE))), path)
+    report.write_report(report.summarise_status(replace(solution, status=Status(Outcome.DONE))), path)
     assert json.loads(path.read_text())["text"] == "done"
     assert [file.name for file in tmp_path.iterdir()] == ["report.json"]

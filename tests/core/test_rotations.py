@@ -87,7 +87,7 @@ def test_sign_continuity_changes_no_rotation_and_leaves_no_jump():
         torch.linspace(0, 6, 50, dtype=torch.float64)[:, None, None] * torch.ones(1, 2, 3)
     )
     signs = torch.randint(0, 2, (50, 2, 1), generator=generator()) * 2.0 - 1
-    fixed = rotations.sign_continuous(smooth * signs)
+    fixed = rotations.make_sign_continuous(smooth * signs)
     assert float((fixed[1:] * fixed[:-1]).sum(-1).min()) > 0
     assert turn_between(fixed, smooth) < 1e-7
 

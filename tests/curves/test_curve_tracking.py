@@ -118,4 +118,4 @@ def test_long_walks_stay_exact():
 def test_path_error_is_to_the_branch_that_is_walked():
     curve = hairpin(apart=0.1)
     places, arcs = curve.point(1.0)[None], torch.tensor([curve.length - 1.0]).double()
-    assert float(path.path_error(places, curve, arcs)) == pytest.approx(0.1, abs=1e-3)
+    assert float(path.compute_path_error(places, curve, arcs)) == pytest.approx(0.1, abs=1e-3)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl.errors import RequestError
-from scenes.cameras import CameraSettings, View, fit, look_at, orientation, views
+from scenes.cameras import CameraSettings, View, camera_axes, compute_views, fit_eye, look_at
 
 KINDS = ("fixed", "follow", "top")
 
@@ -37,9 +37,9 @@ def test_look_at_straight_down_has_z_downwards():
 @given(st.integers(0, 1000), st.sampled_from(["fixed", "top"]), st.floats(-180, 180), st.floats(0.4, 3.0))
 def test_fit_sees_everything_and_touches_two_opposite_edges(seed, kind, azimuth, aspect):
     points, fov = cloud(seed), 0.6
-    axes = orientation(CameraSettings(kind=kind, azimuth_deg=azimuth))
+    axes = camera_axes(CameraSettings(kind=kind, azimuth_deg=azimuth))
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = axes, fit(points, axes, fov=fov, aspect=aspect)
+    pose[:3, :3], pose[:3, 3] = axes, fit_eye(points, axes, fov=fov, aspect=aspect)
     height = 1000
     seen = View(pose, fov, round(height * aspect), height).project(points)
     share = (seen[:, :2] / np.array([round(height * aspect), height])).T
@@ -55,7 +55,7 @@ def test_everybody_is_in_every_picture(kind):
     frames = 30
     path = np.stack([np.linspace(0, 9, frames), np.full(frames, 0.9), np.sin(np.linspace(0, 6, frames))], axis=1)
     points = path[:, None] + cloud(1, 8) * 0.2
-    for k, view in enumerate(views(CameraSettings(kind=kind), points, path, fps=30.0, size=(160, 90))):
+    for k, view in enumerate(compute_views(CameraSettings(kind=kind), points, path, fps=30.0, size=(160, 90))):
         seen = view.project(points[k])
         assert ((seen[:, :2] > 0) & (seen[:, :2] < [160, 90])).all()
 
@@ -64,7 +64,10 @@ def test_a_following_camera_moves_and_a_fixed_one_does_not():
     path = np.linspace([0, 1, 0], [10, 1, 0], 50)
     eyes = {
         kind: np.array(
-            [v.pose[:3, 3] for v in views(CameraSettings(kind=kind), path[:, None], path, fps=30.0, size=(64, 64))]
+            [
+                v.pose[:3, 3]
+                for v in compute_views(CameraSettings(kind=kind), path[:, None], path, fps=30.0, size=(64, 64))
+            ]
         )
         for kind in KINDS
     }
@@ -77,7 +80,7 @@ def test_zoom_shows_things_larger():
     points = cloud(3)[None]
     sizes = []
     for zoom in (1.0, 2.0):
-        view = views(CameraSettings(zoom=zoom), points, points[:, 0], fps=30.0, size=(160, 90))[0]
+        view = compute_views(CameraSettings(zoom=zoom), points, points[:, 0], fps=30.0, size=(160, 90))[0]
         sizes.append(np.linalg.norm(view.pose[:3, 3] - points[0].mean(axis=0)))
     assert sizes[1] < 0.75 * sizes[0]
 

@@ -16,7 +16,7 @@ from scenes.cameras import CameraSettings
 from scenes.content import Painter
 from scenes.film import film
 from scenes.renderers import offscreen, select
-from scenes.renderers.select import back_end, painter
+from scenes.renderers.select import back_end, select_painter
 from scenes.stage import Shot, Stage
 
 av = pytest.importorskip("av")
@@ -26,7 +26,7 @@ SMALL = (96, 64)
 
 def has_graphics() -> bool:
     try:
-        return isinstance(painter("egl"), Painter)
+        return isinstance(select_painter("egl"), Painter)
     except offscreen.NoGraphicsError:
         return False
 
@@ -72,7 +72,7 @@ def test_left_and_right_can_be_told_by_their_pixels(renderer):
     stage = Stage([Shot(walk(3, speed=0.0))])
     # From the front the actor's left hand is on the right of the picture.
     view = stage.views(CameraSettings(azimuth_deg=0.0, elevation_deg=5.0), (128, 128))[0]
-    picture = painter(renderer).paint(view, stage.content(0))
+    picture = select_painter(renderer).paint(view, stage.content(0))
     left, right = near(picture, colours.LEFT, 0.97), near(picture, colours.RIGHT, 0.97)
     assert len(left) > 100
     assert len(right) > 100
@@ -83,9 +83,9 @@ def test_left_and_right_can_be_told_by_their_pixels(renderer):
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_the_curve_and_the_growing_trail_are_seen(renderer):
     stage = Stage([Shot(walk(24, speed=2.0), curves.line(length=4.0))])
-    views, brush = stage.views(CameraSettings(kind="top", azimuth_deg=90.0), (400, 120)), painter(renderer)
+    views, brush = stage.views(CameraSettings(kind="top", azimuth_deg=90.0), (400, 120)), select_painter(renderer)
     seen = [
-        [len(near(brush.paint(views[k], stage.content(k)), c, 0.985)) for c in (colours.WISH, colours.TRAIL)]
+        [len(near(brush.paint(views[k], stage.content(k)), c, 0.985)) for c in (colours.TARGET, colours.TRAIL)]
         for k in (1, 12, 23)
     ]
     wish, trail = np.array(seen).T
@@ -100,7 +100,7 @@ def test_both_painters_put_the_actor_at_the_same_place():
     view = stage.views(CameraSettings(), (160, 120))[0]
     centres = []
     for name in ("egl", "stick"):
-        picture = painter(name).paint(view, stage.content(0))
+        picture = select_painter(name).paint(view, stage.content(0))
         assert picture.shape == (120, 160, 3)
         assert picture.dtype == np.uint8
         limbs = [near(picture, c, 0.97).mean() for c in (colours.LEFT, colours.RIGHT)]
@@ -154,7 +154,7 @@ def test_a_contact_sheet_has_ghosts_over_a_row_of_stills(actors, tmp_path):
 
 def test_ghosts_show_a_waiting_actor_once():
     stage = Stage([Shot(walk(4)), Shot(walk(4), start_seconds=1.0)])
-    ghosts = stage.ghosts([0, 1, 2, 3]).figures
+    ghosts = stage.compose_ghosts([0, 1, 2, 3]).figures
     assert [figure.frame for figure in ghosts] == [0, 1, 2, 3, 0]
     assert ghosts[0].fade > ghosts[3].fade == 0
 
@@ -209,28 +209,28 @@ def test_without_opengl_there_are_stick_figures_and_one_line_says_so(monkeypatch
     def missing():
         raise offscreen.NoGraphicsError("no OpenGL without a window (libEGL.so.1 not found)")
 
-    monkeypatch.setattr(offscreen, "_graphics", missing)
-    monkeypatch.delenv(select.VARIABLE, raising=False)
+    monkeypatch.setattr(offscreen, "_open_graphics", missing)
+    monkeypatch.delenv(select.RENDERER_VARIABLE, raising=False)
     with caplog.at_level(logging.WARNING, logger="mapctl.scenes"):
-        brush = painter()
+        brush = select_painter()
     assert brush.name.startswith("matplotlib")
     (record,) = caplog.records
     assert "libEGL.so.1" in record.getMessage()
     assert "\n" not in record.getMessage()
     assert "libEGL.so.1" in back_end()
     with pytest.raises(offscreen.NoGraphicsError):
-        painter("egl")
+        select_painter("egl")
 
 
 def test_a_missing_pyrender_counts_as_no_graphics(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrender", None)
     with pytest.raises(offscreen.NoGraphicsError, match="pyrender"):
-        offscreen._graphics.__wrapped__()
+        offscreen._open_graphics.__wrapped__()
 
 
 def test_the_renderer_can_be_chosen_by_the_environment(monkeypatch):
-    monkeypatch.setenv(select.VARIABLE, "stick")
-    assert painter().name.startswith("matplotlib")
-    monkeypatch.setenv(select.VARIABLE, "crayon")
+    monkeypatch.setenv(select.RENDERER_VARIABLE, "stick")
+    assert select_painter().name.startswith("matplotlib")
+    monkeypatch.setenv(select.RENDERER_VARIABLE, "crayon")
     with pytest.raises(RequestError, match="auto, egl or stick"):
-        painter()
+        select_painter()

@@ -19,23 +19,25 @@ def area(surface) -> float:
 @given(st.floats(0.5, 4.0), st.floats(0.02, 0.3))
 def test_a_ribbon_has_the_area_of_its_length_times_its_width(radius, width):
     turn = np.linspace(0, 2 * np.pi, 400)
-    ring = overlays.ribbon(radius * np.stack([np.sin(turn), np.cos(turn)], 1), width=width, rgb=np.ones(3), height=0.01)
+    ring = overlays.build_ribbon(
+        radius * np.stack([np.sin(turn), np.cos(turn)], 1), width=width, rgb=np.ones(3), height=0.01
+    )
     assert area(ring) == pytest.approx(2 * np.pi * radius * width, rel=0.01)
     assert (ring.vertices[:, 1] == 0.01).all()
 
 
 def test_a_ribbon_in_space_keeps_its_height():
     points = np.array([[0.0, 1.0, 0.0], [1.0, 2.0, 0.0], [2.0, 1.5, 0.0]])
-    ribbon = overlays.ribbon(points, width=0.1, rgb=np.ones(3), height=0.0)
+    ribbon = overlays.build_ribbon(points, width=0.1, rgb=np.ones(3), height=0.0)
     assert ribbon.vertices.reshape(3, 2, 3).mean(axis=1) == pytest.approx(points)
 
 
 def test_all_flat_surfaces_face_up():
     surfaces = [
-        overlays.ribbon(np.array([[0.0, 0.0], [0.3, 1.0]]), width=0.1, rgb=np.ones(3), height=0.0),
-        overlays.discs(np.zeros((1, 2)), np.ones((1, 3))),
-        overlays.grid(np.zeros((1, 2))),
-        overlays.shadow(np.array([[[0.0, 0.1, 0.0], [0.0, 1.0, 0.0]]]), np.array([0.1])),
+        overlays.build_ribbon(np.array([[0.0, 0.0], [0.3, 1.0]]), width=0.1, rgb=np.ones(3), height=0.0),
+        overlays.build_discs(np.zeros((1, 2)), np.ones((1, 3))),
+        overlays.build_grid(np.zeros((1, 2))),
+        overlays.build_shadow(np.array([[[0.0, 0.1, 0.0], [0.0, 1.0, 0.0]]]), np.array([0.1])),
     ]
     for surface in surfaces:
         a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
@@ -44,14 +46,14 @@ def test_all_flat_surfaces_face_up():
 
 def test_part_of_a_ribbon_is_its_beginning():
     points = np.stack([np.arange(10.0), np.zeros(10)], axis=1)
-    whole = overlays.ribbon(points, width=0.1, rgb=np.ones(3), height=0.0)
-    assert area(overlays.part_of_ribbon(whole, 4)) == pytest.approx(0.3)
-    assert len(overlays.part_of_ribbon(whole, 1).faces) == 0
-    assert area(overlays.part_of_ribbon(whole, 10)) == pytest.approx(0.9)
+    whole = overlays.build_ribbon(points, width=0.1, rgb=np.ones(3), height=0.0)
+    assert area(overlays.cut_ribbon(whole, 4)) == pytest.approx(0.3)
+    assert len(overlays.cut_ribbon(whole, 1).faces) == 0
+    assert area(overlays.cut_ribbon(whole, 10)) == pytest.approx(0.9)
 
 
 def test_the_grid_has_squares_of_a_metre_and_fades_into_the_background():
-    grid = overlays.grid(np.array([[0.3, -0.2]]))
+    grid = overlays.build_grid(np.array([[0.3, -0.2]]))
     tiles = grid.vertices[grid.vertices[:, 1] == overlays.TILE_HEIGHT]
     assert tiles[:, [0, 2]] == pytest.approx(np.round(tiles[:, [0, 2]]), abs=1e-9)
     assert np.ptp(tiles.reshape(-1, 4, 3), axis=1)[:, [0, 2]] == pytest.approx(1.0)
@@ -63,14 +65,14 @@ def test_the_grid_has_squares_of_a_metre_and_fades_into_the_background():
 
 @pytest.mark.parametrize("metres", [1.0, 40.0, 3000.0])
 def test_the_grid_stays_small_however_far_the_actors_go(metres):
-    grid = overlays.grid(np.linspace([0.0, 0.0], [metres, metres / 3], 50))
+    grid = overlays.build_grid(np.linspace([0.0, 0.0], [metres, metres / 3], 50))
     assert 0 < len(grid.faces) < 40_000
 
 
 def test_a_shadow_lies_where_the_light_throws_it_and_is_sharper_below():
     def darkest(height: float):
         ball = np.array([[[1.0, height, 2.0], [1.0, height, 2.0]]])
-        shade = overlays.shadow(ball, np.array([0.08]))
+        shade = overlays.build_shadow(ball, np.array([0.08]))
         peak = shade.rgba[:, 3].max()
         return shade.vertices[shade.rgba[:, 3] > 0.98 * peak][:, [0, 2]].mean(axis=0), peak
 
@@ -84,7 +86,7 @@ def test_a_shadow_lies_where_the_light_throws_it_and_is_sharper_below():
 
 def test_discs_lie_around_their_centres_in_their_colours():
     centres = np.array([[0.0, 0.0], [3.0, 1.0]])
-    discs = overlays.discs(centres, np.eye(3)[:2], radius=0.1)
+    discs = overlays.build_discs(centres, np.eye(3)[:2], radius=0.1)
     for k, centre in enumerate(centres):
         mine = discs.rgba[:, k] == 1
         distance = np.linalg.norm(discs.vertices[mine][:, [0, 2]] - centre, axis=1)
@@ -94,7 +96,7 @@ def test_discs_lie_around_their_centres_in_their_colours():
 
 def test_colours_are_names_or_hexadecimal():
     assert colours.rgb("#ff0080") == pytest.approx([1, 0, 128 / 255])
-    assert colours.rgb(colours.default(3)) == pytest.approx(colours.rgb(list(colours.ACTORS)[3]))
+    assert colours.rgb(colours.default_colour(3)) == pytest.approx(colours.rgb(list(colours.ACTORS)[3]))
     for wrong in ("#ff008", "reddish", "#gg0000", ""):
         with pytest.raises(RequestError, match="colour must be"):
             colours.rgb(wrong)

@@ -8,7 +8,7 @@ import pytest
 import scenes
 from mapctl import curves
 from mapctl.errors import FileFormatError, RequestError
-from scenes.scene_file import Actor, load, place
+from scenes.scene_file import Actor, load, transform_curve
 
 GOOD = """
 outputs = ["walk.mp4", "walk.bvh", "walk.json"]
@@ -92,7 +92,7 @@ def test_several_actors_write_a_motion_each(tmp_path):
 @pytest.mark.parametrize("turn", [0.0, 90.0, -135.0])
 def test_place_turns_about_the_origin_and_then_moves(turn, tmp_path):
     actor = Actor(curve="line:3", offset=(2.0, -1.0), turn_deg=turn)
-    curve = place(actor, tmp_path)
+    curve = transform_curve(actor, tmp_path)
     heading = np.radians(turn)
     assert curve.start.numpy() == pytest.approx([2.0, -1.0])
     end = np.array([2.0, -1.0]) + 3 * np.array([np.sin(heading), np.cos(heading)])
@@ -102,7 +102,10 @@ def test_place_turns_about_the_origin_and_then_moves(turn, tmp_path):
 
 def test_place_keeps_the_height_of_curves_in_space(tmp_path):
     (tmp_path / "stairs.csv").write_text("x,y,z\n0,0,0\n0,1,2\n1,2,3\n")
-    flat, space = (curves.read(tmp_path / "stairs.csv"), place(Actor(curve="stairs.csv", turn_deg=90.0), tmp_path))
+    flat, space = (
+        curves.read(tmp_path / "stairs.csv"),
+        transform_curve(Actor(curve="stairs.csv", turn_deg=90.0), tmp_path),
+    )
     assert space.points[:, 1].numpy() == pytest.approx(flat.points[:, 1].numpy())
     assert space.points[:, 0].numpy() == pytest.approx(flat.points[:, 2].numpy())
     assert space.length == pytest.approx(flat.length)
@@ -118,7 +121,7 @@ def test_curve_files_are_relative_to_the_scene(tmp_path):
 
 
 def test_at_least_three_ready_scenes_load_and_one_has_five_actors():
-    loaded = {name: load(scenes.find(name))[0] for name in scenes.ready()}
+    loaded = {name: load(scenes.find_scene(name))[0] for name in scenes.list_scenes()}
     assert len(loaded) >= 3
     assert max(len(scene.actors) for scene in loaded.values()) >= 5
     for scene in loaded.values():
@@ -127,7 +130,7 @@ def test_at_least_three_ready_scenes_load_and_one_has_five_actors():
 
 
 def test_crossing_actors_keep_out_of_each_others_way():
-    scene, ways = load(scenes.find("crossing"))
+    scene, ways = load(scenes.find_scene("crossing"))
     time = np.arange(0, 14, 0.05)
     places = []
     for actor, way in zip(scene.actors, ways, strict=True):
@@ -139,4 +142,4 @@ def test_crossing_actors_keep_out_of_each_others_way():
 
 def test_unknown_scenes_are_refused_with_the_ready_ones():
     with pytest.raises(RequestError, match="figure_eight"):
-        scenes.find("waltz")
+        scenes.find_scene("waltz")

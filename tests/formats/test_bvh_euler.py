@@ -29,7 +29,7 @@ def written_angles(quat, order, tmp_path):
 def euler_quat(degrees, order):
     """Quaternions of angles (frames, 3) by matrices."""
     turns = [turn(order[0], a) @ turn(order[1], b) @ turn(order[2], c) for a, b, c in degrees]
-    return rotations.sign_continuous(rotations.from_matrix(torch.from_numpy(np.array(turns))))
+    return rotations.make_sign_continuous(rotations.from_matrix(torch.from_numpy(np.array(turns))))
 
 
 @pytest.mark.parametrize("order", EULER_ORDERS)

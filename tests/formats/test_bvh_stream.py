@@ -9,7 +9,7 @@ import torch
 import mapctl
 from mapctl import rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.formats.bvh.stream import bvh_stream
+from mapctl.formats.bvh.stream import open_bvh_stream
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -21,13 +21,13 @@ def spinning(rate: float, frames: int = FRAMES) -> Motion:
     generator = torch.Generator().manual_seed(2)
     axes = torch.nn.functional.normalize(torch.randn(CANONICAL.num_joints, 3, generator=generator).double(), dim=-1)
     vectors = axes * (rate * torch.arange(frames)[:, None, None])
-    quat_xyzw = rotations.sign_continuous(rotations.from_rotation_vector(vectors))
+    quat_xyzw = rotations.make_sign_continuous(rotations.from_rotation_vector(vectors))
     root = torch.randn(frames, 3, generator=generator).double().cumsum(0)
     return Motion(CANONICAL, Fraction(30), root, quat_xyzw)
 
 
 def stream(motion: Motion, path, cuts: list[int]) -> None:
-    with bvh_stream(path, motion.num_frames) as file:
+    with open_bvh_stream(path, motion.num_frames) as file:
         for start, stop in zip([0, *cuts], [*cuts, motion.num_frames], strict=True):
             file.append(motion.slice(start, stop))
 
@@ -59,7 +59,7 @@ def test_angles_go_on_over_the_cuts(tmp_path, rate):
 
 @pytest.mark.parametrize("frames", [FRAMES - 1, FRAMES + 1])
 def test_a_wrong_count_leaves_no_file(tmp_path, frames):
-    with pytest.raises(MapctlError, match="announced"), bvh_stream(tmp_path / "a.bvh", frames) as file:
+    with pytest.raises(MapctlError, match="announced"), open_bvh_stream(tmp_path / "a.bvh", frames) as file:
         file.append(spinning(0.01))
     assert list(tmp_path.iterdir()) == []
 
@@ -67,15 +67,15 @@ def test_a_wrong_count_leaves_no_file(tmp_path, frames):
 def test_what_is_not_finite_leaves_the_old_file_alone(tmp_path):
     motion = spinning(0.01)
     broken = replace(motion, root_position=motion.root_position * float("nan"))
-    with bvh_stream(tmp_path / "a.bvh", FRAMES) as file:
+    with open_bvh_stream(tmp_path / "a.bvh", FRAMES) as file:
         file.append(motion)
     before = (tmp_path / "a.bvh").read_bytes()
-    with pytest.raises(RequestError, match="finite"), bvh_stream(tmp_path / "a.bvh", FRAMES) as file:
+    with pytest.raises(RequestError, match="finite"), open_bvh_stream(tmp_path / "a.bvh", FRAMES) as file:
         file.append(broken)
     assert (tmp_path / "a.bvh").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["a.bvh"]
 
 
 def test_places_that_cannot_be_written(tmp_path):
-    with pytest.raises(RequestError, match="does not exist"), bvh_stream(tmp_path / "gone" / "a.bvh", 1):
+    with pytest.raises(RequestError, match="does not exist"), open_bvh_stream(tmp_path / "gone" / "a.bvh", 1):
         pass

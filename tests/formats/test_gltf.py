@@ -11,7 +11,7 @@ from helpers import random_motion
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.formats import gltf
-from mapctl.mesh.skinning import at_rest, skin
+from mapctl.mesh.skinning import at_rest, build_skin
 from mapctl.skeleton import CANONICAL
 
 _TYPES = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}
@@ -88,7 +88,7 @@ def motion():
 
 def test_joints_and_skin_are_where_the_motion_says(motion):
     viewer = Viewer(gltf.to_bytes(motion))
-    body, turns = skin(motion), motion.joint_rotations()
+    body, turns = build_skin(motion), motion.joint_rotations()
     matrices, places = rotations.to_matrix(turns).numpy(), motion.joint_positions().numpy()
     for frame in (0, 7, 11):
         worlds = viewer.worlds(frame)
@@ -125,7 +125,7 @@ def test_nan_is_refused(motion, tmp_path):
 
 def test_skin_at_rest_stands_on_the_ground_as_large_as_a_person():
     rest = at_rest()
-    body, places = skin(rest), rest.joint_positions()[0].numpy()
+    body, places = build_skin(rest), rest.joint_positions()[0].numpy()
     world = body.vertices + places[body.joint]  # nothing is turned at rest
     assert -0.02 < world[:, 1].min() < 0.03
     assert 1.3 < world[:, 1].max() < 2.0

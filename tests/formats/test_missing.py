@@ -10,7 +10,7 @@ from lossy_files import archive_without, with_all_channels, without
 import mapctl
 from mapctl import formats
 from mapctl.errors import FileFormatError
-from mapctl.recording.masks import ROOT, Mask, of_missing
+from mapctl.recording.masks import ROOT, Mask, masks_from_missing
 
 RIGS = ("canonical", "bandai", "daz")
 HAND = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
@@ -19,7 +19,7 @@ HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 def masks_of(path):
     """As a set."""
-    return set(of_missing(*formats.load_lossy(path)))
+    return set(masks_from_missing(*formats.load_with_missing(path)))
 
 
 @pytest.fixture(params=RIGS)
@@ -43,24 +43,24 @@ def assert_known_where(motion, whole, frames):
 def test_every_form_of_nan_is_lost_and_nothing_else_is(clip, tmp_path, word):
     rig, whole, file = clip
     lossy = without(file, tmp_path / "lossy.bvh", [(HAND[rig], 4, 7), (f"{HIPS[rig]} Y", 8, 9)], word=word)
-    motion, missing = formats.load_lossy(lossy)
-    assert set(of_missing(motion, missing)) == {Mask(HAND[rig], 4, 7), Mask(HIPS[rig], 8, 9), Mask(ROOT, 8, 9)}
+    motion, missing = formats.load_with_missing(lossy)
+    assert set(masks_from_missing(motion, missing)) == {Mask(HAND[rig], 4, 7), Mask(HIPS[rig], 8, 9), Mask(ROOT, 8, 9)}
     assert_known_where(motion, whole, [*range(4), 7, 9, 10, 11])
 
 
 @pytest.mark.parametrize("gap", [(0, 3), (5, 6), (9, 12)])
 def test_whole_frames_are_lost_whole_also_joints_without_channels(clip, tmp_path, gap):
     _, whole, file = clip
-    motion, missing = formats.load_lossy(without(file, tmp_path / "lossy.bvh", [("", *gap)]))
+    motion, missing = formats.load_with_missing(without(file, tmp_path / "lossy.bvh", [("", *gap)]))
     assert missing.rotations[gap[0] : gap[1]].all()
-    assert set(of_missing(motion, missing)) == {Mask(name, *gap) for name in (*motion.skeleton.names, ROOT)}
+    assert set(masks_from_missing(motion, missing)) == {Mask(name, *gap) for name in (*motion.skeleton.names, ROOT)}
     assert_known_where(motion, whole, [frame for frame in range(12) if not gap[0] <= frame < gap[1]])
     assert motion.skeleton.matches(whole.skeleton)
 
 
 def test_a_whole_file_is_lost_nowhere_and_the_same(clip):
     _, whole, file = clip
-    motion, missing = formats.load_lossy(file)
+    motion, missing = formats.load_with_missing(file)
     assert not missing.rotations.any() | missing.places.any()
     assert torch.equal(motion.local_quat_xyzw, whole.local_quat_xyzw)
     assert torch.equal(motion.root_position, whole.root_position)
@@ -70,7 +70,7 @@ def test_a_joint_that_is_never_known_rests(clip, tmp_path):
     rig, _, file = clip
     lossy = without(file, tmp_path / "lossy.bvh", [(HAND[rig], 0, 12)])
     assert masks_of(lossy) == {Mask(HAND[rig], 0, 12)}
-    joint = formats.load_lossy(lossy)[0].local_quat_xyzw[:, mapctl.load(file).skeleton.index(HAND[rig])]
+    joint = formats.load_with_missing(lossy)[0].local_quat_xyzw[:, mapctl.load(file).skeleton.index(HAND[rig])]
     assert joint.abs().max() == joint[:, 3].abs().min() == 1
 
 
@@ -78,8 +78,8 @@ def test_the_place_of_a_still_joint_is_known_by_any_frame_and_by_its_offset(tmp_
     file = with_all_channels(on_rig("daz", 12), tmp_path / "in.bvh")
     whole = mapctl.load(file)
     for lost in (("lHand Xposition", 3, 6), ("lHand Xposition", 0, 12)):
-        motion, missing = formats.load_lossy(without(file, tmp_path / "lossy.bvh", [lost]))
-        assert of_missing(motion, missing) == ()
+        motion, missing = formats.load_with_missing(without(file, tmp_path / "lossy.bvh", [lost]))
+        assert masks_from_missing(motion, missing) == ()
         assert_known_where(motion, whole, range(12))
 
 
@@ -90,8 +90,8 @@ def test_a_joint_that_travels_besides_is_lost_with_its_place_and_goes_straight(t
     motion.moving_offsets[hand] = track
     file = with_all_channels(motion, tmp_path / "in.bvh")
     lossy = without(file, tmp_path / "lossy.bvh", [("lHand Zposition", 5, 7)])
-    read, missing = formats.load_lossy(lossy)
-    assert of_missing(read, missing) == (Mask("lHand", 5, 7),)
+    read, missing = formats.load_with_missing(lossy)
+    assert masks_from_missing(read, missing) == (Mask("lHand", 5, 7),)
     (number,) = read.moving_offsets
     steps = torch.diff(read.moving_offsets[number][4:8, 2])
     assert (steps - steps[0]).abs().max() < 1e-9
@@ -110,10 +110,10 @@ def test_nan_in_an_archive(tmp_path, key):
     lossy = archive_without(tmp_path / "in.npz", tmp_path / "lossy.npz", **{key: place})
     with pytest.raises(FileFormatError, match=rf"{key} at \[.*\]: .*; `mapctl infill` fills in what is lost"):
         mapctl.load(lossy)
-    read, missing = formats.load_lossy(lossy)
+    read, missing = formats.load_with_missing(lossy)
     # The root stands still: where it is in other frames, it is in these.
     wanted = {"local_quat_xyzw": (Mask("Hips", 3, 5),), "moving_offsets": (Mask(ROOT, 3, 5),)}.get(key, ())
-    assert of_missing(read, missing) == wanted
+    assert masks_from_missing(read, missing) == wanted
     assert_known_where(read, motion, [*range(3), *range(5, 12)])
 
 
@@ -124,7 +124,7 @@ def test_an_archive_of_other_nonsense_is_refused(tmp_path):
             arrays = {name: np.full((1, 3), np.nan) if name == key else values for name, values in read.items()}
         np.savez(tmp_path / "bad.npz", allow_pickle=False, **arrays)
         with pytest.raises(FileFormatError, match=key):
-            formats.load_lossy(tmp_path / "bad.npz")
+            formats.load_with_missing(tmp_path / "bad.npz")
 
 
 def test_nan_in_a_take_of_acclaim(tmp_path):
@@ -143,9 +143,9 @@ def test_nan_in_a_take_of_acclaim(tmp_path):
     (tmp_path / "a.amc").write_text("\n".join(rows) + "\n")
     with pytest.raises(FileFormatError, match=r"expected a finite number.*'nan'; `mapctl infill` fills"):
         mapctl.load(tmp_path / "a.amc")
-    motion, missing = formats.load_lossy(tmp_path / "a.amc")
+    motion, missing = formats.load_with_missing(tmp_path / "a.amc")
     first = int(next(row for row in rows if row.isdecimal()))
-    lost = {(mask.joint, mask.start + first, mask.stop + first) for mask in of_missing(motion, missing)}
+    lost = {(mask.joint, mask.start + first, mask.stop + first) for mask in masks_from_missing(motion, missing)}
     assert (bone, 2, 4) in lost
     assert len(lost) == 2
     known = [frame for frame in range(6) if frame + first not in (2, 3, 5)]
@@ -166,7 +166,7 @@ def test_what_is_no_number_and_no_nan_is_refused(tmp_path, lost, word, said):
     on_rig("bandai", 12).save(tmp_path / "in.bvh")
     lossy = without(tmp_path / "in.bvh", tmp_path / "lossy.bvh", lost, word=word)
     with pytest.raises(FileFormatError, match=said):
-        formats.load_lossy(lossy)
+        formats.load_with_missing(lossy)
 
 
 def test_others_refuse_nan_and_say_who_does_not(tmp_path):

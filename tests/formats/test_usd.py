@@ -10,7 +10,7 @@ from helpers import bandai_skeleton, random_motion, walk
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.formats import usd
-from mapctl.mesh.skinning import skin
+from mapctl.mesh.skinning import build_skin
 from mapctl.skeleton import CANONICAL, Skeleton
 
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
@@ -51,7 +51,7 @@ class Viewer:
 @pytest.mark.parametrize("ending", [".usda", ".usdc", ".usd"])
 def test_joints_and_skin_are_where_the_motion_says(motion, tmp_path, ending):
     motion.save(tmp_path / f"walk{ending}")
-    viewer, body = Viewer(tmp_path / f"walk{ending}"), skin(motion)
+    viewer, body = Viewer(tmp_path / f"walk{ending}"), build_skin(motion)
     assert viewer.skeleton.GetTopology().Validate()[0]
     assert viewer.skeleton.GetTopology().GetParentIndices() == list(CANONICAL.parents)
     assert viewer.names == list(CANONICAL.names)

@@ -17,7 +17,7 @@ from mapctl import formats, report
 from mapctl.errors import WriteError
 from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
-from mapctl.formats.bvh.stream import bvh_stream
+from mapctl.formats.bvh.stream import open_bvh_stream
 from priors import checkpoints
 from priors.tensor_files import write_tensors
 from priors.training import run_files
@@ -33,7 +33,7 @@ def _save(path):
 
 
 def _stream(path):
-    with bvh_stream(path, 2 * MOTION.num_frames) as file:
+    with open_bvh_stream(path, 2 * MOTION.num_frames) as file:
         file.append(MOTION)
         file.append(MOTION)
 
@@ -53,7 +53,7 @@ def _card(path):
 
 
 def _checkpoint(path):
-    run_files.write(path.parent, step=1, tensors=TENSORS, index={"curve": []})
+    run_files.write_checkpoint(path.parent, step=1, tensors=TENSORS, index={"curve": []})
 
 
 WRITERS = {
@@ -64,7 +64,7 @@ WRITERS = {
     "a.mp4": _film(mp4_writer),
     "a.gif": _film(gif_writer),
     "a.png": lambda path: save_png(path, PICTURE),
-    "a.json": lambda path: report.write({"values": list(range(9000))}, path),
+    "a.json": lambda path: report.write_report({"values": list(range(9000))}, path),
     "a.safetensors": lambda path: write_tensors(path, TENSORS),
     "model.safetensors": _card,
     "step-1-checkpoint.safetensors": _checkpoint,
@@ -154,7 +154,7 @@ def test_a_card_that_finds_no_room_takes_the_weights_with_it(tmp_path, monkeypat
     with pytest.raises(WriteError, match=r"model\.json: No space left on device"):
         checkpoints.save(density.reference.state_dict(), density.card, tmp_path / "model.safetensors")
     with pytest.raises(WriteError, match=r"checkpoint\.json: No space left on device"):
-        run_files.write(tmp_path, step=1, tensors=TENSORS, index={"curve": []})
+        run_files.write_checkpoint(tmp_path, step=1, tensors=TENSORS, index={"curve": []})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -175,11 +175,11 @@ def test_a_command_says_it_in_one_line(tmp_path, prior, monkeypatch, capsys, req
 def test_compiled_code_that_finds_no_room_works(tmp_path, monkeypatch):
     from numba.core.caching import FunctionCache
 
-    from mapctl.numerics.jit import compilers
+    from mapctl.numerics.jit import make_jit_decorators
 
     monkeypatch.setattr(FunctionCache, "save_overload", _no_space)
     monkeypatch.setattr(FunctionCache, "load_overload", lambda *words: None)
-    entry, _ = compilers()
+    entry, _ = make_jit_decorators()
     assert entry(_doubled)(21) == 42
 
 

@@ -9,7 +9,7 @@ from helpers import run, walk
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening import blend as blending
-from controllers.inbetweening.blend import Borrowed, blend
+from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import rotations
 from mapctl.errors import RequestError
@@ -57,7 +57,7 @@ def test_frames_are_the_other_clips_own(own, other, asked):
     start, stop = round(0.5 * other), round(1.0 * other)
     still = replace(waving(own), local_quat_xyzw=waving(own).local_quat_xyzw[:1].expand(4 * own, -1, -1))
     with pytest.raises(Asked):
-        blend(still, waving(other), Borrowed(("lefthand",), start, stop, 2 * own), None)
+        blend(still, waving(other), LimbTransfer(("lefthand",), start, stop, 2 * own), None)
     assert asked["frames"].tolist() == list(range(2 * own, 2 * own + round(0.5 * own)))
     wanted = 0.5 + torch.arange(len(asked["frames"]), dtype=torch.float64) / own
     torch.testing.assert_close(asked["seconds"], wanted, atol=1e-3, rtol=0)
@@ -96,7 +96,7 @@ ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", 
 
 
 def peaks_of(motion):
-    return worst_frame.peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
+    return worst_frame.measure_peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
 
 
 @pytest.mark.parametrize("fps", [30, 60])
@@ -107,7 +107,7 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
     done = blend(
         motion,
         source,
-        Borrowed(("leftHand",), 8, 28, 70 * fps // 30, margin=margin),
+        LimbTransfer(("leftHand",), 8, 28, 70 * fps // 30, margin=margin),
         tiny_infiller(),
         settings=InfillSettings(method="infiller"),
     )
@@ -122,7 +122,7 @@ def test_a_limb_that_is_hurried_is_named_with_numbers_and_bends_as_it_did():
     done = blend(
         motion,
         source,
-        Borrowed(("leftHand",), 8, 28, 70, margin=0.1),
+        LimbTransfer(("leftHand",), 8, 28, 70, margin=0.1),
         tiny_infiller(),
         settings=InfillSettings(method="infiller"),
     )

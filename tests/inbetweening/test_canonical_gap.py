@@ -9,7 +9,7 @@ from helpers import walk
 
 from controllers.inbetweening.canonical_gap import CanonicalGap
 from mapctl import retarget
-from mapctl.inbetweening.missing import Lost
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL
 
@@ -24,7 +24,7 @@ def keyed(motion, keys, *, hips=()):
     joints, root = free[:, None].expand(-1, motion.num_joints).clone(), free.clone()
     joints[list(hips), 0] = False
     root[list(hips)] = False
-    return Lost(joints, root)
+    return MissingMask(joints, root)
 
 
 def gap_of(motion, lost):
@@ -60,7 +60,7 @@ def test_a_key_at_any_frame_is_one_moment_with_its_own_pose_and_time(fps):
         assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
         assert apart_deg(gap.motion.local_quat_xyzw[moment], motion.local_quat_xyzw[key]).max() < 1e-5
         assert not gap.root[moment]
-        assert gap.places_known()[moment].all()
+        assert gap.compute_known_positions()[moment].all()
 
 
 @pytest.mark.parametrize("fps", [24, 30, 120])
@@ -109,14 +109,14 @@ def test_joints_that_are_lost_throughout_are_lost_in_every_moment(rig, fps):
     motion = on_rig(rig, fps, fps=fps)
     canonical, rigmap = retarget.to_canonical(motion)
     hand = {"canonical": "leftHand", "daz": "lHand"}[rig]
-    lost = Lost.of_masks(motion, [Mask(hand, 0, fps)], rigmap)
+    lost = MissingMask.of_masks(motion, [Mask(hand, 0, fps)], rigmap)
     gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
     assert known(gap) == []
     taken = {CANONICAL.names[joint] for joint in gap.turns.all(dim=0).nonzero()[:, 0].tolist()}
     assert taken == {"leftHand", "leftLowerArm"}
     assert gap.turns.any(dim=0).sum() == 2
     assert not gap.root.any()
-    places = gap.places_known()
+    places = gap.compute_known_positions()
     assert not places[:, CANONICAL.index("leftHand")].any()
     assert places[:, CANONICAL.index("rightHand")].all()
 
@@ -124,7 +124,7 @@ def test_joints_that_are_lost_throughout_are_lost_in_every_moment(rig, fps):
 def test_the_edges_of_a_gap_are_shown_while_a_joint_is_lost_throughout():
     motion = walk(120, fps=120)
     _, rigmap = retarget.to_canonical(motion)
-    lost = Lost.of_masks(motion, [Mask("leftHand", 0, 120), Mask(ALL, 50, 70)], rigmap)
+    lost = MissingMask.of_masks(motion, [Mask("leftHand", 0, 120), Mask(ALL, 50, 70)], rigmap)
     gap = gap_of(motion, lost)
     at = gap.seconds * 120
     inside = (at > 49.5) & (at < 69.5)
@@ -135,11 +135,11 @@ def test_the_edges_of_a_gap_are_shown_while_a_joint_is_lost_throughout():
 def test_a_place_is_known_only_with_all_that_carries_it():
     motion = walk(30)
     _, rigmap = retarget.to_canonical(motion)
-    gap = gap_of(motion, Lost.of_masks(motion, [Mask(ROOT, 5, 9)], rigmap))
-    assert not gap.places_known()[5:9].any()
-    assert gap.places_known()[9:].all()
-    gap = gap_of(motion, Lost.of_masks(motion, [Mask("chest", 5, 9)], rigmap))
-    unknown = {CANONICAL.names[joint] for joint in (~gap.places_known()[6]).nonzero()[:, 0].tolist()}
+    gap = gap_of(motion, MissingMask.of_masks(motion, [Mask(ROOT, 5, 9)], rigmap))
+    assert not gap.compute_known_positions()[5:9].any()
+    assert gap.compute_known_positions()[9:].all()
+    gap = gap_of(motion, MissingMask.of_masks(motion, [Mask("chest", 5, 9)], rigmap))
+    unknown = {CANONICAL.names[joint] for joint in (~gap.compute_known_positions()[6]).nonzero()[:, 0].tolist()}
     assert {"head", "leftHand", "neck"} <= unknown
     assert not unknown & {"hips", "leftFoot", "rightToes"}
 

@@ -7,7 +7,7 @@ from helpers import bandai_skeleton, generator
 from performers import FEET, TOES, Performer
 from rig_maker import Make, make, names_of
 
-from controllers.inbetweening.blend import Borrowed, blend
+from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.chain import ChainSettings, chain
 from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import retarget
@@ -20,7 +20,7 @@ OTHER = Performer(size=1.2, toe_height=-0.06)
 
 def own_walk() -> Motion:
     """On the Bandai Namco rig."""
-    return retarget.from_canonical(Performer().walks(), retarget.map_rig(bandai_skeleton()))
+    return retarget.from_canonical(Performer().walks(), retarget.identify_rig(bandai_skeleton()))
 
 
 def others_walk() -> Motion:
@@ -30,7 +30,7 @@ def others_walk() -> Motion:
 
 def foot_of(motion: Motion) -> str:
     """The rig's name of the left foot."""
-    joint = retarget.map_rig(motion.skeleton).joint_of[FEET[0]]
+    joint = retarget.identify_rig(motion.skeleton).joint_of[FEET[0]]
     assert joint is not None
     return motion.skeleton.names[joint]
 
@@ -47,7 +47,7 @@ def test_a_borrowed_foot_is_as_high_as_it_was():
     """The same step of somebody else comes at the same height of the foot over the floor, in scale."""
     motion, source = own_walk(), others_walk()
     name = foot_of(motion)
-    borrowed = Borrowed((name,), start=40, stop=60, at=40)
+    borrowed = LimbTransfer((name,), start=40, stop=60, at=40)
     done = blend(motion, source, borrowed, None, settings=LINEAR)
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
     torch.testing.assert_close(after, before, atol=0.015, rtol=0)
@@ -57,6 +57,6 @@ def test_a_clip_of_the_same_rig_is_blended_as_it_is():
     motion = own_walk()
     name = foot_of(motion)
     lifted = replace(motion, root_position=motion.root_position + 0.2)
-    done = blend(motion, lifted, Borrowed((name,), start=40, stop=60, at=40), None, settings=LINEAR)
+    done = blend(motion, lifted, LimbTransfer((name,), start=40, stop=60, at=40), None, settings=LINEAR)
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
     torch.testing.assert_close(after, before, atol=1e-4, rtol=0)

@@ -8,7 +8,7 @@ from captures import apart_deg
 from helpers import generator, quat_xyzw, walk
 
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import LIMBS, Targets, missed, reached
+from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets, compute_target_errors, reach_effector_targets
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -23,7 +23,7 @@ def at(motion, wanted):
     for (frame, limb), place in wanted.items():
         places[frame, CANONICAL.index(limb)] = place
         mask[frame, CANONICAL.index(limb)] = True
-    return Targets(places, mask)
+    return EffectorTargets(places, mask)
 
 
 def place_of(motion, frame, joint):
@@ -65,23 +65,28 @@ def test_places_in_reach_are_met_and_bones_stay_rigid(limb, fps):
     motion = walk(2 * fps, fps=fps, turn_rate=0.4)
     frames = (fps // 2, fps, fps + fps // 3)
     targets = at(motion, {(frame, limb): nearer(motion, frame, limb) for frame in frames})
-    assert missed(motion.joint_positions(), targets).max() > 0.03
-    made = reached(motion, targets, all_free(motion))
-    assert missed(made.joint_positions(), targets).max() < HAIR
+    assert compute_target_errors(motion.joint_positions(), targets).max() > 0.03
+    made = reach_effector_targets(motion, targets, all_free(motion))
+    assert compute_target_errors(made.joint_positions(), targets).max() < HAIR
     assert (lengths(made) - lengths(motion)).abs().max() < 1e-12
 
 
 def test_several_limbs_are_met_at_once():
     motion = walk(60)
     targets = at(motion, {(30, limb): nearer(motion, 30, limb) for limb in LIMBS})
-    assert missed(reached(motion, targets, all_free(motion)).joint_positions(), targets).max() < HAIR
+    assert (
+        compute_target_errors(
+            reach_effector_targets(motion, targets, all_free(motion)).joint_positions(), targets
+        ).max()
+        < HAIR
+    )
 
 
 @pytest.mark.parametrize("limb", LIMBS)
 def test_only_the_limb_turns_and_only_where_it_is_free(limb):
     motion, free = walk(60), torch.zeros(60, dtype=torch.bool)
     free[20:40] = True
-    made = reached(motion, at(motion, {(30, limb): nearer(motion, 30, limb)}), free)
+    made = reach_effector_targets(motion, at(motion, {(30, limb): nearer(motion, 30, limb)}), free)
     turned = (made.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1)
     assert set(turned.any(dim=0).nonzero()[:, 0].tolist()) == {LIMBS[limb].upper, LIMBS[limb].lower}
     assert torch.equal(made.local_quat_xyzw[~free], motion.local_quat_xyzw[~free])
@@ -91,7 +96,7 @@ def test_only_the_limb_turns_and_only_where_it_is_free(limb):
 def test_a_place_in_a_frame_that_is_not_free_is_let_be():
     motion, free = walk(40), torch.zeros(40, dtype=torch.bool)
     free[10:20] = True
-    made = reached(motion, at(motion, {(30, "leftHand"): nearer(motion, 30, "leftHand")}), free)
+    made = reach_effector_targets(motion, at(motion, {(30, "leftHand"): nearer(motion, 30, "leftHand")}), free)
     assert torch.equal(made.local_quat_xyzw, motion.local_quat_xyzw)
 
 
@@ -99,7 +104,9 @@ def test_a_place_in_a_frame_that_is_not_free_is_let_be():
 def test_a_limb_goes_there_and_back_smoothly(fps):
     """Far away nothing is left of the offset, and no step is a leap."""
     motion, frame = walk(4 * fps, fps=fps), 2 * fps
-    made = reached(motion, at(motion, {(frame, "leftHand"): nearer(motion, frame, "leftHand")}), all_free(motion))
+    made = reach_effector_targets(
+        motion, at(motion, {(frame, "leftHand"): nearer(motion, frame, "leftHand")}), all_free(motion)
+    )
     offset = (made.joint_positions() - motion.joint_positions())[:, CANONICAL.index("leftHand")]
     peak = offset[frame].norm()
     assert offset[: frame - fps].norm(dim=-1).max() < 0.02 * peak
@@ -120,8 +127,8 @@ def test_runs_of_places_are_met_in_every_frame(count):
             for frame in frames
         },
     )
-    made = reached(motion, targets, all_free(motion))
-    assert missed(made.joint_positions(), targets).max() < HAIR
+    made = reach_effector_targets(motion, targets, all_free(motion))
+    assert compute_target_errors(made.joint_positions(), targets).max() < HAIR
 
 
 @pytest.mark.parametrize("limb", LIMBS)
@@ -131,9 +138,9 @@ def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(
     length = float(lengths(motion)[15, [LIMBS[limb].lower - 1, LIMBS[limb].end - 1]].sum())
     way = torch.nn.functional.normalize(ends - begins + torch.tensor([0.1, 0.05, 0.1]).double(), dim=-1)
     targets = at(motion, {(15, limb): begins + (length + 0.3) * way})
-    made = reached(motion, targets, all_free(motion)).joint_positions()
+    made = reach_effector_targets(motion, targets, all_free(motion)).joint_positions()
     assert (made[15, CANONICAL.index(limb)] - (begins + length * way)).norm() < 2 * HAIR
-    wrong = missed(made, targets)
+    wrong = compute_target_errors(made, targets)
     assert wrong[15] == pytest.approx(0.3, abs=2 * HAIR)
     assert wrong[:15].max() == wrong[16:].max() == 0
 
@@ -141,7 +148,7 @@ def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(
 @pytest.mark.parametrize("limb", LIMBS)
 def test_a_place_where_the_limb_begins_breaks_nothing(limb):
     motion = walk(31)
-    made = reached(
+    made = reach_effector_targets(
         motion, at(motion, {(15, limb): place_of(motion, 15, CANONICAL.names[LIMBS[limb].upper])}), all_free(motion)
     )
     assert made.joint_positions().isfinite().all()
@@ -152,7 +159,7 @@ def test_straight_limbs_bend_knees_forward_and_elbows_back(limb, forward):
     motion = standing()
     upper, lower = (CANONICAL.names[joint] for joint in (LIMBS[limb].upper, LIMBS[limb].lower))
     begins, ends = place_of(motion, 15, upper), place_of(motion, 15, limb)
-    made = reached(motion, at(motion, {(15, limb): ends + 0.2 * (begins - ends)}), all_free(motion))
+    made = reach_effector_targets(motion, at(motion, {(15, limb): ends + 0.2 * (begins - ends)}), all_free(motion))
     bent = place_of(made, 15, lower) - begins
     axis = torch.nn.functional.normalize(ends - begins, dim=-1)
     across = bent - (bent @ axis) * axis
@@ -164,7 +171,9 @@ def test_a_bent_limb_stays_in_its_plane():
     """Knees that point outward do not swing to the front."""
     motion = standing(leftUpperLeg=(0.0, 1.2, 0.0), leftLowerLeg=(0.6, 0.0, 0.0))
     begins, ends = place_of(motion, 15, "leftUpperLeg"), place_of(motion, 15, "leftFoot")
-    made = reached(motion, at(motion, {(15, "leftFoot"): ends + 0.1 * (begins - ends)}), all_free(motion))
+    made = reach_effector_targets(
+        motion, at(motion, {(15, "leftFoot"): ends + 0.1 * (begins - ends)}), all_free(motion)
+    )
     axis = torch.nn.functional.normalize(ends - begins, dim=-1)
     knees = [place_of(each, 15, "leftLowerLeg") - begins for each in (motion, made)]
     before, after = (knee - (knee @ axis) * axis for knee in knees)
@@ -175,7 +184,9 @@ def test_a_bent_limb_stays_in_its_plane():
 
 def test_a_place_where_the_limb_is_turns_nothing():
     motion = walk(31)
-    made = reached(motion, at(motion, {(15, "leftFoot"): place_of(motion, 15, "leftFoot")}), all_free(motion))
+    made = reach_effector_targets(
+        motion, at(motion, {(15, "leftFoot"): place_of(motion, 15, "leftFoot")}), all_free(motion)
+    )
     assert apart_deg(made.local_quat_xyzw, motion.local_quat_xyzw).max() < 1e-6
 
 
@@ -183,13 +194,18 @@ def test_a_place_where_the_limb_is_turns_nothing():
 def test_motions_of_a_few_frames_are_met_too(frames):
     motion = walk(frames)
     targets = at(motion, {(frames - 1, "leftHand"): nearer(motion, frames - 1, "leftHand")})
-    assert missed(reached(motion, targets, all_free(motion)).joint_positions(), targets).max() < HAIR
+    assert (
+        compute_target_errors(
+            reach_effector_targets(motion, targets, all_free(motion)).joint_positions(), targets
+        ).max()
+        < HAIR
+    )
 
 
 @pytest.mark.parametrize("joint", ["hips", "head", "leftLowerArm", "rightToes"])
 def test_joints_that_are_no_hand_or_foot_are_refused(joint):
     with pytest.raises(RequestError, match=f"places are for leftHand, .*; {joint} has none"):
-        reached(walk(5), at(walk(5), {(2, joint): torch.zeros(3).double()}), all_free(walk(5)))
+        reach_effector_targets(walk(5), at(walk(5), {(2, joint): torch.zeros(3).double()}), all_free(walk(5)))
 
 
 @pytest.mark.parametrize("fps", [24, 30, 120])
@@ -218,6 +234,8 @@ def test_what_stands_where_no_place_is_wanted_does_not_matter():
     motion = walk(40)
     targets = at(motion, {(20, "leftHand"): nearer(motion, 20, "leftHand")})
     wild = replace(targets, places=torch.where(targets.wanted[..., None], targets.places, 50.0))
-    made, other = (reached(motion, each, all_free(motion)) for each in (targets, wild))
+    made, other = (reach_effector_targets(motion, each, all_free(motion)) for each in (targets, wild))
     assert torch.equal(made.local_quat_xyzw, other.local_quat_xyzw)
-    assert torch.equal(missed(motion.joint_positions(), targets), missed(motion.joint_positions(), wild))
+    assert torch.equal(
+        compute_target_errors(motion.joint_positions(), targets), compute_target_errors(motion.joint_positions(), wild)
+    )

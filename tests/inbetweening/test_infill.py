@@ -11,8 +11,8 @@ from tiny_infiller import tiny_infiller
 from controllers.inbetweening.infill import InfillSettings, infill
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.inbetweening import PositionImage, Proposed
-from mapctl.inbetweening.missing import Lost, put_back, straight
+from mapctl.inbetweening import PositionImage, ProposedPositions
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
 from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, leg_length
@@ -32,7 +32,7 @@ def seconds(motion, *edges):
 
 
 def lost_of(motion, masks):
-    return Lost.of_masks(motion, masks, retarget.to_canonical(motion)[1])
+    return MissingMask.of_masks(motion, masks, retarget.to_canonical(motion)[1])
 
 
 def assert_known_stays(motion, made, masks):
@@ -77,7 +77,7 @@ def test_what_stands_in_the_gap_does_not_matter(rig, method):
     masks = [Mask(ALL, 15, 25), Mask(motion.skeleton.names[8], 30, 40)]
     wild = random_motion(motion.skeleton, 45, seed=3)
     wild = replace(wild, moving_offsets={joint: wild.root_position for joint in motion.moving_offsets})
-    spoilt = put_back(wild, motion, lost_of(motion, masks))
+    spoilt = restore_observed(wild, motion, lost_of(motion, masks))
     assert not same(spoilt, motion)
     assert same(*(filled(given, *masks, method=method).motion for given in (motion, spoilt)))
 
@@ -86,7 +86,7 @@ def test_linear_is_straight_lines_and_needs_no_network():
     motion = on_rig("bandai", 45)
     mask = Mask(ALL, 15, 25)
     made = infill(motion, None, [mask], settings=InfillSettings(method="linear")).motion
-    assert same(made, straight(motion, lost_of(motion, [mask])))
+    assert same(made, interpolate_missing(motion, lost_of(motion, [mask])))
 
 
 @pytest.mark.parametrize("method", ["infiller", "map"])
@@ -101,7 +101,7 @@ class Oracle:
 
     truth: Motion
 
-    def propose(self, image: PositionImage) -> Proposed:
+    def propose(self, image: PositionImage) -> ProposedPositions:
         """The true places; where there is a moment more than at 30 a second it is that of the very end."""
         own = retarget.to_canonical(self.truth)[0]
         canonical = own.resample(30)
@@ -111,7 +111,7 @@ class Oracle:
         scale = leg_length(canonical.skeleton) / leg_length(CANONICAL)
         body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
         places = body.joint_positions().float()[None]
-        return Proposed(image.from_world(places), torch.zeros(1, places.shape[1], 2))
+        return ProposedPositions(image.from_world(places), torch.zeros(1, places.shape[1], 2))
 
 
 @pytest.mark.parametrize(("rig", "fps"), CASES)

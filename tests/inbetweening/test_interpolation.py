@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import kinematics
-from mapctl.inbetweening.interpolation import led, slerped
+from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.skeleton import CANONICAL
 
 FRAMES = 40
@@ -20,7 +20,7 @@ def with_hole(start, stop):
 
 
 def guess(motion, known):
-    return slerped(motion.joint_positions()[None], motion.local_quat_xyzw[None], known)
+    return interpolate_positions(motion.joint_positions()[None], motion.local_quat_xyzw[None], known)
 
 
 @settings(max_examples=10, deadline=None)
@@ -34,9 +34,9 @@ def test_what_is_not_known_has_no_part_in_it(seed, share):
     wild = torch.nn.functional.normalize(torch.randn(quats.shape, generator=draw).double(), dim=-1)
     other = torch.where(known[..., None], quats, wild)
     elsewhere = torch.where(known[..., None], places, 9 * torch.randn(places.shape, generator=draw).double())
-    assert torch.equal(slerped(places, quats, known), slerped(elsewhere, other, known))
+    assert torch.equal(interpolate_positions(places, quats, known), interpolate_positions(elsewhere, other, known))
     turned = torch.where(known[..., 0], facing, 9 * torch.randn(facing.shape, generator=draw).double())
-    assert torch.equal(led(facing, known), led(turned, known))
+    assert torch.equal(interpolate_heading(facing, known), interpolate_heading(turned, known))
 
 
 def test_known_places_stay():
@@ -57,5 +57,5 @@ def test_the_hips_go_straight_across_a_gap_and_hold_beyond_the_last_known_frame(
 def test_across_a_gap_the_heading_takes_the_short_way(facing):
     """Through a half turn too."""
     motion = moved(walk(FRAMES, turn_rate=0.5), turn=facing, shift=(0.0, 0.0))
-    found = led(kinematics.heading(motion.local_quat_xyzw[:, 0])[None], with_hole(10, 30))
+    found = interpolate_heading(kinematics.heading(motion.local_quat_xyzw[:, 0])[None], with_hole(10, 30))
     assert torch.diff(found[0]).abs().max() < 0.03

@@ -10,12 +10,12 @@ from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 import mapctl
-from controllers.inbetweening.keyframe_poses import keyed
+from controllers.inbetweening.keyframe_poses import build_keyframe_clip
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.tween import key_errors, tween
+from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey
+from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest
 from mapctl.kinematics import heading
 from mapctl.retarget.stance import Stance
 from mapctl.skeleton import Skeleton, leg_length
@@ -35,7 +35,7 @@ def poses(tmp_path_factory):
 
 
 def first_and_last(pose, *, frames=30):
-    return PlacedKey(frame=0, pose=pose), PlacedKey(frame=frames, pose=pose, pose_frame=30)
+    return KeyEntry(frame=0, pose=pose), KeyEntry(frame=frames, pose=pose, pose_frame=30)
 
 
 def canonical_of(found):
@@ -43,7 +43,7 @@ def canonical_of(found):
 
 
 def made_of(request):
-    found = keyed(request)
+    found = build_keyframe_clip(request)
     done = tween(
         found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig, settings=InfillSettings(method="infiller")
     )
@@ -53,7 +53,7 @@ def made_of(request):
 @pytest.mark.parametrize("rig", RIGS)
 def test_poses_of_the_body_that_are_not_moved_come_to_the_bit(poses, rig):
     clip = on_rig(rig, 45)
-    found = keyed(KeyRequest(first_and_last(poses[rig])))
+    found = build_keyframe_clip(KeyRequest(first_and_last(poses[rig])))
     assert (found.motion.num_frames, found.motion.fps) == (31, 30)
     for frame, pose in ((0, 0), (30, 30)):
         assert torch.equal(found.motion.local_quat_xyzw[frame].abs(), clip.local_quat_xyzw[pose].abs())
@@ -63,9 +63,12 @@ def test_poses_of_the_body_that_are_not_moved_come_to_the_bit(poses, rig):
 @pytest.mark.parametrize("rig", [*RIGS, "zup"])
 def test_hips_are_put_turned_and_lifted_and_the_pose_stays(poses, rig):
     """In metres with Y up, whatever the file's world is."""
-    key = PlacedKey(frame=30, pose=poses[rig], pose_frame=20, place=(2.0, -1.5), height=0.7, facing_deg=-120)
-    found = keyed(KeyRequest((first_and_last(poses[rig])[0], key)))
-    whole, plain = canonical_of(found), canonical_of(keyed(KeyRequest(first_and_last(poses[rig], frames=20))))
+    key = KeyEntry(frame=30, pose=poses[rig], pose_frame=20, place=(2.0, -1.5), height=0.7, facing_deg=-120)
+    found = build_keyframe_clip(KeyRequest((first_and_last(poses[rig])[0], key)))
+    whole, plain = (
+        canonical_of(found),
+        canonical_of(build_keyframe_clip(KeyRequest(first_and_last(poses[rig], frames=20)))),
+    )
     assert whole.root_position[30].tolist() == pytest.approx([2.0, 0.7, -1.5], abs=1e-9)
     assert math.degrees(float(heading(whole.local_quat_xyzw[30, 0]))) == pytest.approx(-120, abs=1e-6)
     source = retarget.to_canonical(mapctl.load(poses[rig]))[0]
@@ -78,10 +81,13 @@ def test_hips_are_put_turned_and_lifted_and_the_pose_stays(poses, rig):
 )
 def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
     """Rotations stay but of the legs, the hips' way is in the scale of these, and toes are as high over their rest."""
-    found = keyed(KeyRequest(first_and_last(poses[other]), body=poses[body]))
+    found = build_keyframe_clip(KeyRequest(first_and_last(poses[other]), body=poses[body]))
     whole = canonical_of(found)
     source = retarget.to_canonical(mapctl.load(poses[other]))[0]
-    assert found.motion.skeleton.names == keyed(KeyRequest(first_and_last(poses[body]))).motion.skeleton.names
+    assert (
+        found.motion.skeleton.names
+        == build_keyframe_clip(KeyRequest(first_and_last(poses[body]))).motion.skeleton.names
+    )
     legs = leg_length(whole.skeleton) / leg_length(source.skeleton)
     aside = whole.root_position[30] - legs * source.root_position[30]
     assert aside[::2].norm() < 0.02
@@ -98,24 +104,24 @@ def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
 
 @pytest.mark.parametrize("rig", [*RIGS, "zup"])
 def test_every_kind_of_key_is_met_in_one_motion(poses, rig):
-    rigmap = retarget.to_canonical(keyed(KeyRequest(first_and_last(poses[rig]))).motion)[1]
+    rigmap = retarget.to_canonical(build_keyframe_clip(KeyRequest(first_and_last(poses[rig]))).motion)[1]
     hand, foot = (
         rigmap.rig_skeleton.names[rigmap.joint_of[rigmap.skeleton.index(name)]] for name in ("leftHand", "rightFoot")
     )
     start, stop = first_and_last(poses[rig])
     between = (
-        PlacedKey(frame=7, reach={hand: (0.4, 1.2, 0.5)}),
-        PlacedKey(frame=13, pose=poses[rig], pose_frame=14, joints=(foot,)),
-        PlacedKey(frame=19, pose=poses[rig], pose_frame=18, root_only=True, place=(0.1, 0.6)),
-        PlacedKey(frame=24, pose=poses[rig], pose_frame=24),
+        KeyEntry(frame=7, reach={hand: (0.4, 1.2, 0.5)}),
+        KeyEntry(frame=13, pose=poses[rig], pose_frame=14, joints=(foot,)),
+        KeyEntry(frame=19, pose=poses[rig], pose_frame=18, root_only=True, place=(0.1, 0.6)),
+        KeyEntry(frame=24, pose=poses[rig], pose_frame=24),
     )
     found, done = made_of(KeyRequest((stop, *between, start)))
-    rows = key_errors(done.motion, found.motion, found.keys, found.rig)
+    rows = measure_keyframe_errors(done.motion, found.motion, found.keys, found.rig)
     assert [row["what"] for row in rows] == ["pose", "limbs", "limbs", "root", "pose", "pose"]
     assert max(row["missed_cm"] for row in rows) < 0.1
     assert done.notes == ()
     canonical, there = retarget.to_canonical(done.motion, found.rig)
-    places = retarget.places_on_rig(done.motion, there)
+    places = retarget.rig_joint_positions(done.motion, there)
     assert places[7, canonical.skeleton.index("leftHand")].tolist() == pytest.approx([0.4, 1.2, 0.5], abs=1e-3)
     assert canonical.root_position[19, ::2].tolist() == pytest.approx([0.1, 0.6], abs=1e-6)
 
@@ -124,23 +130,23 @@ def test_every_kind_of_key_is_met_in_one_motion(poses, rig):
 def test_of_a_key_that_only_reaches_a_pose_would_not_count_and_is_refused(poses, more):
     start, stop = first_and_last(poses["bandai"])
     with pytest.raises(RequestError, match=rf"key\[1\].{next(iter(more))}: of a key that only reaches, no pose counts"):
-        KeyRequest((start, PlacedKey(frame=15, reach={"Hand_L": (0.3, 1.3, 0.9)}, **more), stop))
+        KeyRequest((start, KeyEntry(frame=15, reach={"Hand_L": (0.3, 1.3, 0.9)}, **more), stop))
 
 
 @pytest.mark.parametrize(
     ("key", "said"),
     [
-        (PlacedKey(frame=9, pose="gone.npz"), r"key\[2\]\.pose: gone\.npz"),
-        (PlacedKey(frame=9, pose="clip.mp3"), r"key\[2\]\.pose: clip\.mp3"),
-        (PlacedKey(frame=9, pose_frame=45), r"key\[2\]\.pose_frame: the frame 45 is not one of the pose's 0:45"),
-        (PlacedKey(frame=9, pose_seconds=1.6), r"key\[2\]\.pose_seconds: the frame 48 is not one of the pose's 0:45"),
-        (PlacedKey(frame=9, joints=("Hnad_L",)), r"key\[2\]\.joints: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-        (PlacedKey(frame=9, reach={"fot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'fot_r'; .* Foot_R"),
+        (KeyEntry(frame=9, pose="gone.npz"), r"key\[2\]\.pose: gone\.npz"),
+        (KeyEntry(frame=9, pose="clip.mp3"), r"key\[2\]\.pose: clip\.mp3"),
+        (KeyEntry(frame=9, pose_frame=45), r"key\[2\]\.pose_frame: the frame 45 is not one of the pose's 0:45"),
+        (KeyEntry(frame=9, pose_seconds=1.6), r"key\[2\]\.pose_seconds: the frame 48 is not one of the pose's 0:45"),
+        (KeyEntry(frame=9, joints=("Hnad_L",)), r"key\[2\]\.joints: no hand or foot 'Hnad_L'; the nearest is Hand_L"),
+        (KeyEntry(frame=9, reach={"fot_r": (0, 0, 0)}), r"key\[2\]\.reach: no hand or foot 'fot_r'; .* Foot_R"),
     ],
 )
 def test_what_is_not_there_is_named_with_its_key(poses, key, said):
     with pytest.raises(RequestError, match=said):
-        keyed(KeyRequest((*first_and_last(poses["bandai"]), key), body=poses["bandai"]))
+        build_keyframe_clip(KeyRequest((*first_and_last(poses["bandai"]), key), body=poses["bandai"]))
 
 
 def test_a_pose_on_a_skeleton_that_is_no_body_is_refused(poses, tmp_path):
@@ -148,18 +154,18 @@ def test_a_pose_on_a_skeleton_that_is_no_body_is_refused(poses, tmp_path):
     names = tuple(f"part{number}" for number in range(clip.num_joints))
     star = Skeleton(names, (-1, *([0] * (len(names) - 1))), clip.skeleton.offsets)
     replace(clip, skeleton=star).save(tmp_path / "star.npz")
-    request = KeyRequest((*first_and_last(poses["bandai"]), PlacedKey(frame=9, pose=str(tmp_path / "star.npz"))))
+    request = KeyRequest((*first_and_last(poses["bandai"]), KeyEntry(frame=9, pose=str(tmp_path / "star.npz"))))
     with pytest.raises(RequestError, match=r"key\[2\]\.pose: "):
-        keyed(request)
+        build_keyframe_clip(request)
 
 
 def test_limbs_that_no_one_could_bring_there_in_time_are_named_with_numbers(poses):
     start, stop = first_and_last(poses["bandai"])
     reaches = (
-        PlacedKey(frame=14, reach={"Hand_L": (0.6, 1.3, 0.5)}),
-        PlacedKey(frame=15, reach={"Hand_L": (-0.4, 1.3, 0.5)}),
+        KeyEntry(frame=14, reach={"Hand_L": (0.6, 1.3, 0.5)}),
+        KeyEntry(frame=15, reach={"Hand_L": (-0.4, 1.3, 0.5)}),
     )
     _, done = made_of(KeyRequest((start, *reaches, stop)))
     assert done.notes[0] == "Hand_L needs 30 m/s between frames 14 and 15, which nobody reaches"
-    slower = (reaches[0], PlacedKey(frame=17, reach=reaches[1].reach))
+    slower = (reaches[0], KeyEntry(frame=17, reach=reaches[1].reach))
     assert not any("Hand_L needs" in note for note in made_of(KeyRequest((start, *slower, stop)))[1].notes)

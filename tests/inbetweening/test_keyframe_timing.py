@@ -10,10 +10,15 @@ from helpers import generator, moved, random_motion, run, walk, walks
 from tiny_infiller import card, network
 
 from controllers.benchmarks import keyframe_timing
-from controllers.benchmarks.keyframe_timing import Pairs, fitted, pairs_of, timing
-from controllers.inbetweening.keyframe_timing import FEATURES, WEIGHTS, pair_features, suggest
+from controllers.benchmarks.keyframe_timing import (
+    PosePairs,
+    benchmark_keyframe_timing,
+    fit_timing_weights,
+    sample_pose_pairs,
+)
+from controllers.inbetweening.keyframe_timing import FEATURES, WEIGHTS, compute_pair_features, suggest_intervals
 from mapctl import retarget
-from mapctl.inbetweening.missing import Lost, put_back
+from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.intent.keyframes import Key, Keys
 from priors import checkpoints
 
@@ -33,19 +38,19 @@ def shifted_from(motion, frame, metres):
 
 @pytest.mark.parametrize("rig", ["canonical", "bandai", "daz"])
 def test_a_walk_takes_about_as_long_as_it_took(rig):
-    for interval in suggest(on_rig(rig, 90), KEYS):
+    for interval in suggest_intervals(on_rig(rig, 90), KEYS):
         assert 0.4 < interval.suggested / interval.given < 2.5
         assert interval.usual[0] <= interval.suggested <= interval.usual[1]
 
 
 def test_where_in_the_world_and_what_lies_between_the_keys_tells_nothing():
     motion = walk(90, turn_rate=0.3)
-    found = frames(suggest(motion, KEYS))
-    assert frames(suggest(moved(motion, turn=2.0, shift=(5.0, -3.0)), KEYS)) == found
+    found = frames(suggest_intervals(motion, KEYS))
+    assert frames(suggest_intervals(moved(motion, turn=2.0, shift=(5.0, -3.0)), KEYS)) == found
     free = torch.ones(90, dtype=torch.bool)
     free[list(KEYS.frames)] = False
-    lost = Lost(free[:, None].expand(-1, motion.num_joints).clone(), free)
-    assert frames(suggest(put_back(random_motion(motion.skeleton, 90), motion, lost), KEYS)) == found
+    lost = MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
+    assert frames(suggest_intervals(restore_observed(random_motion(motion.skeleton, 90), motion, lost), KEYS)) == found
 
 
 def test_a_child_takes_as_long_as_a_giant():
@@ -56,22 +61,24 @@ def test_a_child_takes_as_long_as_a_giant():
         root_position=1.4 * motion.root_position,
         skeleton=replace(motion.skeleton, offsets=1.4 * motion.skeleton.offsets),
     )
-    small, big = suggest(motion, KEYS), suggest(large, KEYS)
+    small, big = suggest_intervals(motion, KEYS), suggest_intervals(large, KEYS)
     assert frames(small) == frames(big)
     for one, other in zip(small, big, strict=True):
         assert other.metres == pytest.approx(1.4 * one.metres)
-        assert other.apart_cm == pytest.approx(1.4 * one.apart_cm)
+        assert other.pose_distance_cm == pytest.approx(1.4 * one.pose_distance_cm)
 
 
 def test_frames_are_those_of_the_motions_rate():
-    slow, fast = suggest(walk(31), Keys((0, 30))), suggest(walk(121, fps=120), Keys((0, 120)))
+    slow, fast = suggest_intervals(walk(31), Keys((0, 30))), suggest_intervals(walk(121, fps=120), Keys((0, 120)))
     assert fast[0].suggested == pytest.approx(4 * slow[0].suggested, abs=4)
     assert fast[0].given_speed == pytest.approx(slow[0].given_speed, rel=0.02)
 
 
 def test_farther_takes_longer_and_very_far_goes_on_at_one_speed():
     motion = walk(60)
-    found = [suggest(shifted_from(motion, 30, metres), Keys((0, 30)))[0] for metres in (0.0, 1.0, 2.0, 8.0, 20.0)]
+    found = [
+        suggest_intervals(shifted_from(motion, 30, metres), Keys((0, 30)))[0] for metres in (0.0, 1.0, 2.0, 8.0, 20.0)
+    ]
     taken = [interval.suggested for interval in found]
     assert taken == sorted(set(taken))
     assert found[-1].suggested_speed == pytest.approx(found[-2].suggested_speed, rel=0.05)
@@ -79,7 +86,7 @@ def test_farther_takes_longer_and_very_far_goes_on_at_one_speed():
 
 @pytest.mark.parametrize(("metres", "verdict"), [(6.0, "short: 7."), (0.0, "usual: 1."), (-0.9, "long: 0.3")])
 def test_a_timing_that_nobody_would_take_is_named_with_numbers(metres, verdict):
-    (interval,) = suggest(shifted_from(walk(40), 31, metres), Keys((0, 31)))
+    (interval,) = suggest_intervals(shifted_from(walk(40), 31, metres), Keys((0, 31)))
     assert interval.reason.startswith(verdict)
     assert f"mocap mostly takes {interval.usual[0]} to {interval.usual[1]} frames" in interval.reason
     assert interval.summary()["reason"] == interval.reason
@@ -87,18 +94,18 @@ def test_a_timing_that_nobody_would_take_is_named_with_numbers(metres, verdict):
 
 
 def test_about_in_place_no_speed_is_told():
-    (interval,) = suggest(walk(40), Keys((0, 3)))
+    (interval,) = suggest_intervals(walk(40), Keys((0, 3)))
     assert "about in place (0." in interval.reason
     assert "m/s" not in interval.reason
 
 
 def test_keys_that_tell_less_than_a_pose_lie_within():
     keys = Keys((0, Key(20, limbs=("leftHand",)), 50, Key(70, root_only=True), 89))
-    assert frames(suggest(walk(90), keys)) == frames(suggest(walk(90), Keys((0, 50, 89))))
+    assert frames(suggest_intervals(walk(90), keys)) == frames(suggest_intervals(walk(90), Keys((0, 50, 89))))
 
 
 def test_features_have_names_and_weights():
-    features = pair_features(walk(20), torch.tensor([0, 3]), torch.tensor([9, 19]))
+    features = compute_pair_features(walk(20), torch.tensor([0, 3]), torch.tensor([9, 19]))
     assert features.shape == (2, len(FEATURES))
     assert len(WEIGHTS) == len(FEATURES)
     assert features.isfinite().all()
@@ -111,12 +118,12 @@ def test_the_fit_finds_the_weights_that_pairs_were_made_by_but_for_a_few_wild_on
     wanted = torch.tensor([0.3, -0.2, 0.5, 0.1]).double()
     seconds = torch.exp(features @ wanted)
     seconds[::50] *= 20
-    found = fitted(Pairs(features, torch.ones(2000), seconds))
+    found = fit_timing_weights(PosePairs(features, torch.ones(2000), seconds))
     assert torch.allclose(features @ found, features @ wanted, atol=0.02)
 
 
 def test_pairs_are_as_long_as_asked_for_and_clips_that_are_too_short_give_none():
-    pairs = pairs_of([walk(80), walk(10), walk(40)], generator(), shortest=0.5, longest=1.0)
+    pairs = sample_pose_pairs([walk(80), walk(10), walk(40)], generator(), shortest=0.5, longest=1.0)
     assert len(pairs.seconds) == 2 * 5
     assert pairs.seconds.min() >= 0.5
     assert pairs.seconds.max() <= 1.0
@@ -125,12 +132,12 @@ def test_pairs_are_as_long_as_asked_for_and_clips_that_are_too_short_give_none()
 
 def test_the_bench_compares_with_what_poses_do_not_tell(monkeypatch):
     """Who knows the truth is right everywhere."""
-    rows = timing(walks(3, 90))
+    rows = benchmark_keyframe_timing(walks(3, 90))
     methods = ["suggested", "one speed for all", "one duration for all"]
     assert [(row["pairs"], row["method"]) for row in rows] == [(p, m) for p in ("on the way", "all") for m in methods]
-    pairs = pairs_of(walks(3, 90), torch.Generator().manual_seed(0))
-    monkeypatch.setattr(keyframe_timing, "seconds_of", lambda features, metres: pairs.seconds)
-    for row in timing(walks(3, 90)):
+    pairs = sample_pose_pairs(walks(3, 90), torch.Generator().manual_seed(0))
+    monkeypatch.setattr(keyframe_timing, "predict_seconds", lambda features, metres: pairs.seconds)
+    for row in benchmark_keyframe_timing(walks(3, 90)):
         assert row["count"] == 15
         if row["method"] == "suggested":
             assert (row["lower_quartile"], row["median"], row["upper_quartile"], row["half_off_by"]) == (1, 1, 1, 1)
@@ -141,7 +148,7 @@ def test_the_bench_takes_clips_that_were_kept_from_training(tmp_path, capsys):
     path = tmp_path / "data" / "bandai" / "a_walk_0.bvh"
     path.parent.mkdir(parents=True)
     walk_made = walk(60)
-    retarget.from_canonical(walk_made, retarget.map_rig(walk_made.skeleton)).save(path)
+    retarget.from_canonical(walk_made, retarget.identify_rig(walk_made.skeleton)).save(path)
     told = replace(card(), data={"held_out": {"validation": [], "test": ["bandai/a_walk_0.bvh"]}})
     checkpoints.save(network().state_dict(), told, tmp_path / "ours.safetensors")
     words = ["--infiller", tmp_path / "ours.safetensors", "--data", tmp_path / "data", "--json"]

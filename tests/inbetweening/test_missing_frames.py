@@ -7,14 +7,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.inbetweening.missing import Lost, put_back, straight
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
 from mapctl.recording.masks import ALL, ROOT, Mask
 
 RIGS = ("canonical", "bandai", "daz")
 
 
 def lost_of(motion, *masks):
-    return Lost.of_masks(motion, masks, retarget.to_canonical(motion)[1])
+    return MissingMask.of_masks(motion, masks, retarget.to_canonical(motion)[1])
 
 
 def interpolated(quats, start, stop):
@@ -32,7 +32,7 @@ def interpolated(quats, start, stop):
 @pytest.mark.parametrize(("start", "stop"), [(20, 40), (20, 21), (1, 49)])
 def test_a_gap_is_crossed_by_slerp_and_straight_lines(rig, start, stop):
     motion = on_rig(rig, 50)
-    made = straight(motion, lost_of(motion, Mask(ALL, start, stop)))
+    made = interpolate_missing(motion, lost_of(motion, Mask(ALL, start, stop)))
     wanted = interpolated(motion.local_quat_xyzw, start, stop)
     assert apart_deg(made.local_quat_xyzw[start:stop], wanted).max() < 1e-5
     pairs = [(made.root_position, motion.root_position)]
@@ -46,7 +46,7 @@ def test_a_gap_is_crossed_by_slerp_and_straight_lines(rig, start, stop):
 @pytest.mark.parametrize("rig", RIGS)
 def test_beyond_the_first_and_last_known_frame_it_holds(rig):
     motion = on_rig(rig, 50)
-    made = straight(motion, lost_of(motion, Mask(ALL, 0, 10), Mask(ALL, 40, 50)))
+    made = interpolate_missing(motion, lost_of(motion, Mask(ALL, 0, 10), Mask(ALL, 40, 50)))
     for part, edge in ((slice(0, 10), 10), (slice(40, 50), 39)):
         assert apart_deg(made.local_quat_xyzw[part], motion.local_quat_xyzw[edge].expand(10, -1, 4)).max() < 1e-5
         assert torch.allclose(made.joint_positions()[part], motion.joint_positions()[edge].expand(10, -1, 3))
@@ -56,7 +56,7 @@ def test_beyond_the_first_and_last_known_frame_it_holds(rig):
 def test_what_is_known_stays_to_the_bit(rig):
     motion = on_rig(rig, 50)
     lost = lost_of(motion, Mask(ALL, 12, 20), Mask(motion.skeleton.names[5], 30, 40))
-    for made in (straight(motion, lost), put_back(on_rig(rig, 50, seed=3), motion, lost)):
+    for made in (interpolate_missing(motion, lost), restore_observed(on_rig(rig, 50, seed=3), motion, lost)):
         assert torch.equal(made.local_quat_xyzw[~lost.joints], motion.local_quat_xyzw[~lost.joints])
         assert torch.equal(made.root_position[~lost.root], motion.root_position[~lost.root])
         for joint, values in motion.moving_offsets.items():
@@ -67,7 +67,7 @@ def test_what_is_known_stays_to_the_bit(rig):
 def test_put_back_takes_what_is_lost_from_the_other_motion(rig):
     motion, other = on_rig(rig, 50), on_rig(rig, 50, seed=3)
     lost = lost_of(motion, Mask(ALL, 12, 20))
-    whole = put_back(other, motion, lost)
+    whole = restore_observed(other, motion, lost)
     assert torch.equal(whole.local_quat_xyzw[12:20], other.local_quat_xyzw[12:20])
     assert torch.equal(whole.joint_positions()[12:20], other.joint_positions()[12:20])
     assert whole.source is motion.source
@@ -76,7 +76,7 @@ def test_put_back_takes_what_is_lost_from_the_other_motion(rig):
 def test_what_stands_in_the_gap_does_not_matter():
     motion, other = on_rig("bandai", 50), on_rig("bandai", 50, seed=3)
     lost = lost_of(motion, Mask(ALL, 12, 20), Mask("Hand_L", 0, 50))
-    first, second = straight(motion, lost), straight(put_back(other, motion, lost), lost)
+    first, second = interpolate_missing(motion, lost), interpolate_missing(restore_observed(other, motion, lost), lost)
     assert torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
     assert torch.equal(first.joint_positions(), second.joint_positions())
 
@@ -134,7 +134,7 @@ def test_the_place_of_the_root_can_be_lost_alone():
 def test_joints_that_are_never_known_rest():
     motion = on_rig("canonical", 30)
     lost = lost_of(motion, Mask("leftHand", 0, 30))
-    made = straight(motion, lost)
+    made = interpolate_missing(motion, lost)
     rest = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     for name in ("leftHand", "leftLowerArm"):
         assert torch.equal(made.local_quat_xyzw[:, motion.skeleton.index(name)], rest.expand(30, 4))

@@ -24,7 +24,7 @@ HANDS = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
 
 def peaks_of(motion):
     canonical = to_canonical(motion)[0]
-    return worst_frame.peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
+    return worst_frame.measure_peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
 
 
 def asked(motion, keys, *, method="infiller", drawn=0.0):

@@ -5,7 +5,7 @@ import torch
 from captures import apart_deg, swaying, vectors
 from helpers import generator, quat_xyzw
 
-from controllers.inbetweening.geometry.seam_blending import closed_places, closed_rotations
+from controllers.inbetweening.geometry.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl import rotations
 
 FRAMES = 120
@@ -37,20 +37,20 @@ def turning_bends(quats):
 def test_known_frames_stay_to_the_bit(start, stop):
     put = gap(start, stop)
     wild = way() + put[:, None] * torch.randn(FRAMES, 3, generator=generator(), dtype=torch.float64)
-    assert torch.equal(closed_places(wild, put, fps=30.0)[~put], wild[~put])
+    assert torch.equal(blend_seams_in_positions(wild, put, fps=30.0)[~put], wild[~put])
     quats, turned = swaying(FRAMES, 2), swaying(FRAMES, 2, seed=5)
     quats[start:stop, 1] = turned[start:stop, 1]
     masks = torch.stack([torch.zeros_like(put), put], dim=1)
-    closed = closed_rotations(quats, masks, fps=30.0)
+    closed = blend_seams_in_rotations(quats, masks, fps=30.0)
     assert torch.equal(closed[~masks], quats[~masks])
 
 
 @pytest.mark.parametrize(("start", "stop"), GAPS)
 def test_the_truth_is_left_nearly_alone(start, stop):
     put, truth = gap(start, stop), way()
-    assert (closed_places(truth, put, fps=30.0) - truth).norm(dim=-1).max() < 0.005
+    assert (blend_seams_in_positions(truth, put, fps=30.0) - truth).norm(dim=-1).max() < 0.005
     quats = swaying(FRAMES, 3)
-    closed = closed_rotations(quats, put[:, None].expand(-1, 3), fps=30.0)
+    closed = blend_seams_in_rotations(quats, put[:, None].expand(-1, 3), fps=30.0)
     assert apart_deg(closed, quats).max() < 0.5
 
 
@@ -61,7 +61,7 @@ def test_a_leap_of_a_place_at_the_edges_is_closed(start, stop, fps):
     put = gap(int(start * fps / 30), int(stop * fps / 30), frames)
     truth = way(fps, frames)
     leapt = truth + 0.3 * put[:, None]
-    closed = closed_places(leapt, put, fps=fps)
+    closed = blend_seams_in_positions(leapt, put, fps=fps)
     assert bends(leapt).max() > 0.25
     assert bends(closed).max() < 0.2 * bends(leapt).max()
 
@@ -74,14 +74,14 @@ def test_a_leap_of_a_rotation_at_the_edges_is_closed(start, stop, fps):
     truth = swaying(frames, 1, fps=fps)
     turn = quat_xyzw(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)).expand(frames, 1, 4)
     leapt = torch.where(put[..., None], rotations.multiply(truth, turn), truth)
-    closed = closed_rotations(leapt, put, fps=fps)
+    closed = blend_seams_in_rotations(leapt, put, fps=fps)
     assert turning_bends(leapt).max() > 0.3
     assert turning_bends(closed).max() < 0.2 * turning_bends(leapt).max()
 
 
 def test_what_is_far_from_an_edge_keeps_its_shape():
     put, truth = gap(200, 400, 600), way(30.0, 600)
-    closed = closed_places(truth + 0.1 * put[:, None], put, fps=30.0)
+    closed = blend_seams_in_positions(truth + 0.1 * put[:, None], put, fps=30.0)
     offset = (closed - truth)[260:340]
     assert (offset - offset.mean(dim=0)).norm(dim=-1).max() < 0.03
 
@@ -89,7 +89,7 @@ def test_what_is_far_from_an_edge_keeps_its_shape():
 def test_several_gaps_are_closed_each_for_itself():
     put = gap(20, 40) | gap(70, 80)
     leapt = way() + put[:, None] * torch.tensor([0.2, 0.0, -0.1])
-    both = closed_places(leapt, put, fps=30.0)
+    both = blend_seams_in_positions(leapt, put, fps=30.0)
     assert bends(both).max() < 0.2 * bends(leapt).max()
 
 
@@ -97,16 +97,16 @@ def test_joints_are_closed_each_for_itself():
     quats, other = swaying(FRAMES, 3), swaying(FRAMES, 3, seed=9)
     put = torch.stack([gap(40, 70), gap(40, 70), gap(10, 12)], dim=1)
     mixed = torch.where(put[..., None], other, quats)
-    together = closed_rotations(mixed, put, fps=30.0)
+    together = blend_seams_in_rotations(mixed, put, fps=30.0)
     for joint in range(3):
-        alone = closed_rotations(mixed[:, [joint]], put[:, [joint]], fps=30.0)
+        alone = blend_seams_in_rotations(mixed[:, [joint]], put[:, [joint]], fps=30.0)
         assert torch.allclose(together[:, [joint]], alone, atol=1e-12)
 
 
 def test_signs_of_quaternions_do_not_matter():
     quats, put = swaying(FRAMES, 1), gap(40, 70)[:, None]
     signs = torch.where(torch.rand(FRAMES, 1, 1, generator=generator()) < 0.5, -1.0, 1.0)
-    plain, flipped = (closed_rotations(values, put, fps=30.0) for values in (quats, quats * signs))
+    plain, flipped = (blend_seams_in_rotations(values, put, fps=30.0) for values in (quats, quats * signs))
     assert apart_deg(plain, flipped).max() < 1e-5
 
 
@@ -115,19 +115,19 @@ def test_signs_of_quaternions_do_not_matter():
 def test_motions_of_a_few_frames_break_nothing(frames, whole):
     put = gap(0, frames if whole else 1, frames)
     values = torch.randn(frames, 3, generator=generator(), dtype=torch.float64)
-    assert closed_places(values, put, fps=30.0).isfinite().all()
-    assert closed_rotations(swaying(frames, 1), put[:, None], fps=30.0).isfinite().all()
+    assert blend_seams_in_positions(values, put, fps=30.0).isfinite().all()
+    assert blend_seams_in_rotations(swaying(frames, 1), put[:, None], fps=30.0).isfinite().all()
 
 
 def test_a_gap_without_edges_is_left_as_it_is():
     everything = gap(0, FRAMES)
-    assert torch.equal(closed_places(way(), everything, fps=30.0), way())
+    assert torch.equal(blend_seams_in_positions(way(), everything, fps=30.0), way())
 
 
 def test_nothing_put_in_changes_nothing():
     nothing = gap(0, 0)
-    assert torch.equal(closed_places(way(), nothing, fps=30.0), way())
+    assert torch.equal(blend_seams_in_positions(way(), nothing, fps=30.0), way())
     assert torch.equal(
-        closed_rotations(swaying(FRAMES, 2), nothing[:, None].expand(-1, 2), fps=30.0),
-        rotations.sign_continuous(swaying(FRAMES, 2)),
+        blend_seams_in_rotations(swaying(FRAMES, 2), nothing[:, None].expand(-1, 2), fps=30.0),
+        rotations.make_sign_continuous(swaying(FRAMES, 2)),
     )

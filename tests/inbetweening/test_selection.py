@@ -8,15 +8,20 @@ from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.error_estimates import sureness_of
+from controllers.inbetweening.error_estimates import estimate_error
 from controllers.inbetweening.geometry.footholds import hold_planted
 from controllers.inbetweening.proposers.rollout import RolloutSettings
-from controllers.inbetweening.proposers.selection import STANDING, ChoiceSettings, choose_proposals, viewers_cost
+from controllers.inbetweening.proposers.selection import (
+    STANDING_STILL,
+    ChoiceSettings,
+    choose_proposals,
+    compute_artefact_cost,
+)
 from controllers.inbetweening.tween import tween
 from mapctl import contacts
-from mapctl.inbetweening.missing import Lost, straight
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Keys
-from mapctl.problem.window_solvers import LatentMethod
+from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -29,7 +34,7 @@ QUICK = ChoiceSettings(
         trajectory=0.2,
         stage=30,
         ahead=4,
-        method=LatentMethod(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=6)),
+        method=LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=6)),
     ),
 )
 
@@ -37,8 +42,8 @@ QUICK = ChoiceSettings(
 def gap_of(motion, start, stop):
     free = torch.zeros(motion.num_frames, dtype=torch.bool)
     free[start:stop] = True
-    lost = Lost(free[:, None].expand(-1, motion.num_joints).clone(), free)
-    shown = straight(motion, lost)
+    lost = MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
+    shown = interpolate_missing(motion, lost)
     return CanonicalGap.of(shown, lost, range(CANONICAL.num_joints)), shown
 
 
@@ -68,7 +73,7 @@ def test_somebody_who_stands_stays_where_he_is(seconds):
     motion = still(30 * seconds + 1)
     wandering = tiny_infiller(drawn=0.05)
     done = tween(motion, Keys((0, 30 * seconds)), wandering, rollable=[tiny_density()])
-    assert [source.by for source in done.sources] == [STANDING]
+    assert [source.by for source in done.sources] == [STANDING_STILL]
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)
     assert away.max() < 0.02
     assert any("standing still" in note for note in done.gap_notes)
@@ -88,11 +93,11 @@ def test_a_slide_costs_what_a_viewer_sees_and_a_walk_does_not():
     motion = walk(90)
     odds = torch.full((90, 2), -1.0)
     sliding = replace(still(90), root_position=motion.root_position)
-    walks, slides = (viewers_cost(each, odds, (1, 89), QUICK) for each in (motion, sliding))
+    walks, slides = (compute_artefact_cost(each, odds, (1, 89), QUICK) for each in (motion, sliding))
     assert slides > walks + 0.3
     round_about = motion.root_position.clone()
     round_about[:, 0] += torch.sin(torch.arange(90) / 89 * torch.pi) * 1.5
-    assert viewers_cost(replace(motion, root_position=round_about), odds, (1, 89), QUICK) > walks
+    assert compute_artefact_cost(replace(motion, root_position=round_about), odds, (1, 89), QUICK) > walks
 
 
 def test_of_several_answers_the_one_that_costs_least_is_taken():
@@ -100,9 +105,9 @@ def test_of_several_answers_the_one_that_costs_least_is_taken():
     gap, shown = gap_of(motion, 1, 74)
     odds = torch.zeros(len(gap.root), 2)
     costs = {}
-    for name, settings in (("rolled", QUICK), ("alone", replace(QUICK, good=1e9))):
+    for name, settings in (("rolled", QUICK), ("alone", replace(QUICK, acceptable_cost=1e9))):
         answer = choose_proposals(gap, shown, odds, densities=[tiny_density()], settings=settings)
-        costs[name] = viewers_cost(answer.motion, answer.odds, (1, 74), QUICK)
+        costs[name] = compute_artefact_cost(answer.motion, answer.odds, (1, 74), QUICK)
     assert costs["rolled"] <= costs["alone"] + 1e-9
 
 
@@ -117,7 +122,7 @@ def test_known_frames_stay_and_the_same_comes_twice():
 def test_planted_toes_are_held_and_what_is_known_stays():
     """A walk that slides aside: toes stand where they first stood, or in the middle of where they slid."""
     motion = walk(60)
-    stands = contacts.planted(motion.joint_positions()[:, TOES], 30)
+    stands = contacts.detect_contacts(motion.joint_positions()[:, TOES], 30)
     sliding = torch.arange(60).double()[:, None] * torch.tensor([0.006, 0.0, 0.0]).double()
     motion = replace(motion, root_position=motion.root_position + sliding)
     free = torch.ones(60, dtype=torch.bool)
@@ -139,12 +144,12 @@ def test_a_long_morph_of_somebody_who_moves_is_called_one():
     assert "longer than the" in note
 
 
-@pytest.mark.parametrize("by", ["infiller", "rollout of locomotion", "density general", STANDING])
+@pytest.mark.parametrize("by", ["infiller", "rollout of locomotion", "density general", STANDING_STILL])
 @pytest.mark.parametrize(("going", "beside"), [(True, True), (True, False), (False, True), (False, False)])
 def test_longer_gaps_are_no_surer_and_what_few_clips_told_is_said(by, going, beside):
-    sures = [sureness_of(by, frames, going=going, beside=beside) for frames in (5, 15, 60, 200, 1000)]
-    assert sures[0].nine_in_ten_cm <= sures[-1].nine_in_ten_cm
+    sures = [estimate_error(by, frames, going=going, beside=beside) for frames in (5, 15, 60, 200, 1000)]
+    assert sures[0].percentile_90_cm <= sures[-1].percentile_90_cm
     assert sures[-2] == sures[-1]
     for sure in sures:
-        assert sure.half_cm <= sure.nine_in_ten_cm
+        assert sure.median_cm <= sure.percentile_90_cm
         assert ("only" in sure.text) == (sure.clips < 5)

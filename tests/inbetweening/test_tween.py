@@ -10,10 +10,10 @@ from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.tween import key_errors, tween
+from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.inbetweening.missing import Lost, put_back, straight
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
 from mapctl.intent.keyframes import Key, Keys
 
 RIGS = ("canonical", "bandai", "daz")
@@ -36,14 +36,14 @@ def frames_of(fps):
 def keyed(motion, frames):
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[list(frames)] = False
-    return Lost(free[:, None].expand(-1, motion.num_joints).clone(), free)
+    return MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
 
 
 def spoilt(motion, frames):
     """Nonsense between the keys."""
     wild = random_motion(motion.skeleton, motion.num_frames, seed=3)
     wild = replace(wild, moving_offsets={joint: wild.root_position for joint in motion.moving_offsets})
-    return put_back(wild, motion, keyed(motion, frames))
+    return restore_observed(wild, motion, keyed(motion, frames))
 
 
 def assert_met(made, motion, frames):
@@ -121,7 +121,7 @@ def test_slerp_meets_hands_too():
     motion = on_rig("bandai", 45)
     done = made_of(motion, frames_of(30), method="linear", limbs=("Hand_L",))
     assert max(missed_cm(done.motion, motion, frame, ("Hand_L",)) for frame in frames_of(30)) < 0.1
-    plain = straight(motion, keyed(motion, (0, 44)))
+    plain = interpolate_missing(motion, keyed(motion, (0, 44)))
     arm = [motion.skeleton.index(name) for name in ("UpperArm_L", "LowerArm_L")]
     others = [joint for joint in range(motion.num_joints) if joint not in arm]
     assert apart_deg(done.motion.local_quat_xyzw, plain.local_quat_xyzw)[:, others].max() < 1e-4
@@ -157,7 +157,7 @@ def test_hips_that_are_keys_between_two_moments_do_not_leap(fps, aside):
     motion = walk(2 * fps, fps=fps, turn_rate=1.5)
     frames = (0, fps // 2 + aside, fps + fps // 3 + aside, 2 * fps - 1)
     made = made_of(motion, frames, drawn=0.0, root_only=True).motion
-    lines = straight(motion, keyed(motion, frames))
+    lines = interpolate_missing(motion, keyed(motion, frames))
     off, straight_off = ((each.root_position - motion.root_position).norm(dim=-1).max() for each in (made, lines))
     assert off < straight_off + 0.02
     step, own = (torch.diff(each.root_position, dim=0).norm(dim=-1).max() for each in (made, motion))
@@ -246,7 +246,7 @@ def test_a_network_is_needed_but_for_slerp():
     with pytest.raises(RequestError, match="method map needs an infiller"):
         tween(motion, Keys((0, 29)), None)
     made = tween(motion, Keys((0, 29)), None, settings=InfillSettings(method="linear")).motion
-    assert same(made, straight(motion, keyed(motion, (0, 29))))
+    assert same(made, interpolate_missing(motion, keyed(motion, (0, 29))))
 
 
 @pytest.mark.parametrize("told", [{}, {"root_only": True}])
@@ -290,13 +290,13 @@ def test_errors_at_keys_are_told_for_what_they_tell(rig):
     told = {"pose": {}, "limbs": {"limbs": LIMBS[rig]}, "root": {"root_only": True}}
     for what, kind in told.items():
         keys = Keys.of(frames, **kind)
-        rows = key_errors(motion, motion, keys)
+        rows = measure_keyframe_errors(motion, motion, keys)
         assert [row["frame"] for row in rows] == list(frames)
         assert [row["what"] for row in rows] == ["pose", what, what, "pose"]
         assert max(row["missed_cm"] for row in rows) == 0
         assert [("missed_deg" in row) for row in rows] == [True, what != "limbs", what != "limbs", True]
         wrong = spoilt(motion, (0, 44))
-        rows = key_errors(wrong, motion, keys)
+        rows = measure_keyframe_errors(wrong, motion, keys)
         picked = {"pose": motion.skeleton.names, "limbs": LIMBS[rig], "root": (HIPS[rig],)}[what]
         assert rows[1]["missed_cm"] == pytest.approx(missed_cm(wrong, motion, frames[1], picked))
         assert rows[1]["missed_cm"] > 1
@@ -309,7 +309,7 @@ def test_errors_at_keys_are_told_for_what_they_tell(rig):
 def test_places_on_the_rig_are_those_of_its_own_joints():
     motion = on_rig("daz", 20)
     canonical, rigmap = retarget.to_canonical(motion)
-    places = retarget.places_on_rig(motion, rigmap)
+    places = retarget.rig_joint_positions(motion, rigmap)
     for name, own in (("leftHand", "lHand"), ("hips", "hip")):
         joint = canonical.skeleton.index(name)
         assert torch.equal(places[:, joint], motion.joint_positions()[:, motion.skeleton.index(own)])

@@ -15,14 +15,14 @@ import mapctl
 import priors
 from controllers.inbetweening import infill
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.proposers.rollout import RolloutSettings, rolled
+from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps
 from controllers.inbetweening.tween import tween
-from controllers.inbetweening.variations import best_of, variations
+from controllers.inbetweening.variations import lowest_energy, sample_variations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.missing import Lost
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
-from mapctl.problem.warm_start import Swarm
-from mapctl.problem.window_solvers import LatentMethod
+from mapctl.problem.warm_start import SwarmProposal
+from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.recording.masks import Mask
 from mapctl.retarget import to_canonical
 from mapctl.solver.budget import Budget
@@ -32,11 +32,11 @@ from mapctl.solver.swarm import SwarmSettings
 FRAMES, KEYS = 45, (0, 20, 23, 44)
 QUICK = RolloutSettings(
     ahead=4,
-    method=LatentMethod(
+    method=LatentNoiseSolver(
         rounds=1,
         lbfgs=LbfgsSettings(max_iterations=6),
         budget=Budget(evaluations=20),
-        proposal=Swarm(SwarmSettings(particles=4, iterations=2)),
+        proposal=SwarmProposal(SwarmSettings(particles=4, iterations=2)),
     ),
 )
 
@@ -65,7 +65,7 @@ def command(tmp_path_factory, prior_file):
 
 
 def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
-    return variations(
+    return sample_variations(
         motion,
         Keys.of(keys, **told),
         tiny_infiller(drawn=0.02),
@@ -81,9 +81,9 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
     motion = on_rig(rig, FRAMES * fps // 30, fps=fps)
     keys = [key * fps // 30 for key in KEYS]
     found = asked(motion, prior, keys=tuple(keys))
-    places = [one.infilled.motion.joint_positions() for one in found.each]
+    places = [one.infill_result.motion.joint_positions() for one in found.each]
     for one in found.each:
-        made = one.infilled.motion
+        made = one.infill_result.motion
         assert torch.equal(made.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
         assert torch.equal(made.root_position[keys], motion.root_position[keys])
     apart = [float((places[i] - places[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
@@ -96,19 +96,21 @@ def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prio
     motion = on_rig("canonical", FRAMES)
     alone = tween(motion, Keys(KEYS), tiny_infiller(drawn=0.02)).motion
     two, three = (asked(motion, prior, count=count).each for count in (2, 3))
-    assert torch.equal(two[0].infilled.motion.local_quat_xyzw, alone.local_quat_xyzw)
+    assert torch.equal(two[0].infill_result.motion.local_quat_xyzw, alone.local_quat_xyzw)
     for one, other in zip(two, three[:2], strict=True):
-        assert torch.equal(one.infilled.motion.local_quat_xyzw, other.infilled.motion.local_quat_xyzw)
+        assert torch.equal(one.infill_result.motion.local_quat_xyzw, other.infill_result.motion.local_quat_xyzw)
         assert one.energy == other.energy
     reseeded = asked(motion, prior, count=2, seed=1).each
-    assert not torch.equal(two[1].infilled.motion.local_quat_xyzw, reseeded[1].infilled.motion.local_quat_xyzw)
+    assert not torch.equal(
+        two[1].infill_result.motion.local_quat_xyzw, reseeded[1].infill_result.motion.local_quat_xyzw
+    )
 
 
 def test_limbs_are_still_where_they_are_wanted(prior):
     motion = on_rig("bandai", FRAMES)
     hand = motion.skeleton.index("Hand_L")
     for one in asked(motion, prior, limbs=("Hand_L",)).each:
-        away = (one.infilled.motion.joint_positions() - motion.joint_positions())[list(KEYS), hand].norm(dim=-1)
+        away = (one.infill_result.motion.joint_positions() - motion.joint_positions())[list(KEYS), hand].norm(dim=-1)
         assert float(away.max()) < 1e-3
 
 
@@ -117,9 +119,13 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     free = torch.zeros(FRAMES, dtype=torch.bool)
     free[:5] = free[20:30] = free[40:] = True
     canonical, rigmap = to_canonical(motion)
-    gap = CanonicalGap.of(canonical, Lost(free[:, None].expand(-1, motion.num_joints).clone(), free), rigmap.joint_of)
+    gap = CanonicalGap.of(
+        canonical, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free), rigmap.joint_of
+    )
     odds = torch.full((FRAMES, 2), -1.0)
-    answer = rolled(gap, gap.motion, odds, densities=[tiny_density()], generator=generator(0), settings=QUICK)
+    answer = roll_through_gaps(
+        gap, gap.motion, odds, densities=[tiny_density()], generator=generator(0), settings=QUICK
+    )
     made, bits = answer.motion, answer.odds
     assert [(source.start, source.stop) for source in answer.sources] == [(20, 30)]
     same = torch.ones(FRAMES, dtype=torch.bool)
@@ -160,7 +166,7 @@ def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(
         def __getattr__(self, name):
             return getattr(prior, name)
 
-        def blurred(self, spread):
+        def with_observation_noise(self, spread):
             return self
 
     done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], extending=[Stern()])
@@ -181,7 +187,7 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
 @pytest.mark.parametrize("keys", [KEYS, (0, 44)])
 def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     motion = on_rig("canonical", FRAMES)
-    made = best_of(
+    made = lowest_energy(
         motion, Keys(keys), tiny_infiller(drawn=0.02), 4, rollable=[prior], generator=generator(0), rolling=QUICK
     )
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
@@ -194,11 +200,11 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     for name, one in zip(("infiller", "rollout 1", "rollout 2"), others, strict=True):
         assert float(told[name]) == pytest.approx(one.energy, abs=0.06)
         if name == winner:
-            assert torch.equal(made.motion.local_quat_xyzw, one.infilled.motion.local_quat_xyzw)
+            assert torch.equal(made.motion.local_quat_xyzw, one.infill_result.motion.local_quat_xyzw)
 
 
 def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
-    motion, take = on_rig("canonical", FRAMES), partial(best_of, rollable=[prior], generator=generator(0))
+    motion, take = on_rig("canonical", FRAMES), partial(lowest_energy, rollable=[prior], generator=generator(0))
     with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):
         take(motion, Keys(KEYS), tiny_infiller(), 1)
     with pytest.raises(RequestError, match="leaves nothing to vary"):

@@ -3,7 +3,7 @@
 import pytest
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.keyframe_toml import KeyRequest, PlacedKey, read_keys
+from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest, read_keys
 
 TWO = '[[key]]\nframe = 0\npose = "a.bvh"\n[[key]]\nframe = 30\npose = "b.bvh"\n'
 
@@ -27,7 +27,7 @@ def test_all_keys_of_a_table_are_read(tmp_path):
         "facing_deg = -90\njoints = ['LeftFoot']\nreach = { LeftHand = [0.5, 1.5, 2] }\n"
     )
     key = read_keys(written(tmp_path, TWO + more)).key[2]
-    assert key == PlacedKey(
+    assert key == KeyEntry(
         frame=9,
         pose=str(tmp_path / "a.bvh"),
         pose_seconds=1.5,
@@ -102,7 +102,7 @@ def test_files_that_are_no_text_or_not_there_are_refused(tmp_path):
 
 
 def test_a_request_is_checked_however_it_is_made():
-    keys = (PlacedKey(frame=0, pose="a.bvh"), PlacedKey(frame=3, pose="a.bvh", root_only=True))
+    keys = (KeyEntry(frame=0, pose="a.bvh"), KeyEntry(frame=3, pose="a.bvh", root_only=True))
     with pytest.raises(RequestError, match=r"key\[1\]: the first and the last key"):
         KeyRequest(keys)
     with pytest.raises(RequestError, match="at least two keys"):

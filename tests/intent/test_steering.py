@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.steering import STEP_LENGTHS, Command, CommandTrack, Limits, Wish
+from mapctl.intent.steering import STEP_LENGTHS, Command, CommandTrack, SteeringLimits, SteeringTarget
 from mapctl.intent.steering_csv import read_commands
 
 ANGLES = st.floats(-20, 20)
@@ -17,8 +17,8 @@ SPEEDS = st.floats(0, 5)
 
 @given(ANGLES, ANGLES, SPEEDS, SPEEDS)
 def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(heading, wanted, speed, asked):
-    limits, command = Limits(acceleration=2, braking=3, turn_rate=2.5), Command(asked, wanted)
-    wish = Wish(speed, heading, heading)
+    limits, command = SteeringLimits(acceleration=2, braking=3, turn_rate=2.5), Command(asked, wanted)
+    wish = SteeringTarget(speed, heading, heading)
     wishes = [wish, *wish.ahead(command, limits, frames=90, fps=30)]
     for before, after in pairwise(wishes):
         assert -3 / 30 - 1e-9 <= after.speed - before.speed <= 2 / 30 + 1e-9
@@ -30,16 +30,18 @@ def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(head
 
 
 def test_facing_goes_with_travel_unless_it_is_held():
-    wish = Wish(1.0, 0.0, 0.0)
-    walked, strafed = (wish.ahead(Command(1.0, 1.0, facing), Limits(), frames=60, fps=30)[-1] for facing in (None, 0.0))
+    wish = SteeringTarget(1.0, 0.0, 0.0)
+    walked, strafed = (
+        wish.ahead(Command(1.0, 1.0, facing), SteeringLimits(), frames=60, fps=30)[-1] for facing in (None, 0.0)
+    )
     assert (walked.facing, strafed.facing) == pytest.approx((1.0, 0.0))
     assert strafed.heading == pytest.approx(1.0)
 
 
 def test_turning_on_and_on_stays_within_the_limits_and_never_arrives():
-    limits = Limits(turn_rate=2.0)
+    limits = SteeringLimits(turn_rate=2.0)
     for asked, got in ((0.7, 0.7), (-1.5, -1.5), (9.0, 2.0)):
-        wishes = Wish(1.0, 0.3, 0.3).ahead(Command(1.0, 5.0, turning=asked), limits, frames=90, fps=30)
+        wishes = SteeringTarget(1.0, 0.3, 0.3).ahead(Command(1.0, 5.0, turning=asked), limits, frames=90, fps=30)
         assert wishes[-1].heading - 0.3 == pytest.approx(3 * got)
         assert wishes[-1].facing == pytest.approx(wishes[-1].heading, abs=2 * math.pi / 30)
 
@@ -52,7 +54,7 @@ def test_a_track_holds_each_command_until_the_next():
 
 
 def test_speeds_beyond_the_priors_are_lowered_and_said():
-    track, said = CommandTrack((0.0, 1.0), (Command(50, 0), Command(1, 0))).clamped(3.0)
+    track, said = CommandTrack((0.0, 1.0), (Command(50, 0), Command(1, 0))).limit_speed(3.0)
     assert [command.speed for command in track.commands] == [3.0, 1.0]
     assert said == ["the speed of 50 m/s at 0 s was lowered to 3.00 m/s, the prior's fastest"]
 
@@ -87,7 +89,7 @@ def test_angles_of_many_turns_are_the_same_direction_and_others_stay_to_the_bit(
         (lambda: Command(1, 0, turning=math.inf), "turning must be"),
         (lambda: CommandTrack((), ()), "at least one"),
         (lambda: CommandTrack((1.0, 1.0), (Command(1, 0),) * 2), "must rise, got 1 s after 1 s"),
-        (lambda: Limits(turn_rate=0), "turn_rate must be positive"),
+        (lambda: SteeringLimits(turn_rate=0), "turn_rate must be positive"),
     ],
 )
 def test_what_cannot_be_is_refused(wrong, message):
@@ -117,7 +119,7 @@ def test_turning_gait_and_style_may_be_left_empty(read):
     track = read("time_s,speed_mps,heading_deg,turn_deg_s,gait,style\n0,1,0,,run,\n1,1,0,-90,, elderly\n2,1,0,,,\n")
     assert [command.turning for command in track.commands] == [None, pytest.approx(-math.pi / 2), None]
     assert [command.told for command in track.commands] == [("run",), ("elderly",), ()]
-    lowered, _ = track.clamped(0.5)
+    lowered, _ = track.limit_speed(0.5)
     assert [(c.turning, c.told, c.speed) for c in lowered.commands] == [
         (c.turning, c.told, 0.5) for c in track.commands
     ]

@@ -11,9 +11,9 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from tiny_denoiser import tiny_denoiser
 
 import mapctl
-from controllers.common.map_refinement import StandingSettings
+from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.denoise import DenoiseSettings, begins_with_tpose, denoise
-from controllers.denoising.result import faded, joined
+from controllers.denoising.result import crossfade, join_segments
 from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
@@ -23,7 +23,9 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 
 RIGS = ("canonical", "bandai", "daz")
-QUICK = DenoiseSettings(standing=StandingSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4)))
+QUICK = DenoiseSettings(
+    refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4))
+)
 
 
 def cleaned(motion, **changes):
@@ -46,7 +48,7 @@ def test_noise_shrinks_and_rig_frames_and_rate_stay(rig, fps):
     assert torch.allclose(done.motion.local_quat_xyzw.norm(dim=-1), torch.ones(1, dtype=torch.float64))
     assert torch.equal(done.motion.root_position, given.root_position) == (rig == "bandai")
     assert abs(len(done.contacts) - 90) <= 4
-    assert len(done.believed) == len(done.contacts)
+    assert len(done.proposal_share) == len(done.contacts)
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -54,7 +56,7 @@ def test_joints_that_the_canonical_skeleton_lacks_are_smoothed_too(rig):
     truth = on_rig(rig)
     given = noisy(truth)
     done = cleaned(given)
-    used = set(retarget.map_rig(truth.skeleton).joint_of)
+    used = set(retarget.identify_rig(truth.skeleton).joint_of)
     for joint in set(range(truth.num_joints)) - used:
         before, after = (
             apart_deg(truth.local_quat_xyzw[:, joint], m.local_quat_xyzw[:, joint]).mean() for m in (given, done.motion)
@@ -76,7 +78,7 @@ def test_a_network_that_is_wrong_does_little_harm():
     given = noisy(truth, 6.0)
     done = denoise(given, tiny_denoiser(drawn=0.5), settings=QUICK)
     assert error_cm(truth, done.motion) < 1.1 * error_cm(truth, given)
-    assert done.believed.mean() < 0.9
+    assert done.proposal_share.mean() < 0.9
 
 
 def test_the_same_capture_gives_the_same():
@@ -112,7 +114,7 @@ def test_what_densities_made_of_windows_is_told_in_frames_of_the_capture():
     assert (done.stretches[0].start, done.stretches[-1].stop) == (0, 361)
     first, second = done.slice(0, 100), done.slice(100, 361)
     assert (first.stretches[-1].stop, second.stretches[0].start, second.stretches[-1].stop) == (100, 0, 261)
-    parts = joined([(first, 0), (second, 100)]).stretches
+    parts = join_segments([(first, 0), (second, 100)]).stretches
     assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
     assert (parts[0].start, parts[-1].stop) == (0, 361)
     json.dumps(done.summary(), allow_nan=False)
@@ -121,7 +123,7 @@ def test_what_densities_made_of_windows_is_told_in_frames_of_the_capture():
 @pytest.mark.parametrize("rig", RIGS)
 def test_what_masked_frames_show_does_not_leak(rig):
     truth = on_rig(rig, 120)
-    given, rigmap = noisy(truth, 2.0, 0.5), retarget.map_rig(truth.skeleton)
+    given, rigmap = noisy(truth, 2.0, 0.5), retarget.identify_rig(truth.skeleton)
     joint = rigmap.joint_of[CANONICAL.index("leftLowerArm")]
     masks, out = [Mask(truth.skeleton.names[joint], 50, 58)], []
     for seed in (1, 2):
@@ -211,7 +213,7 @@ def test_a_tpose_in_frame_0_stays(rig):
                 retarget.to_canonical(truth)[0].slice(0, 1),
                 local_quat_xyzw=torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4),
             ),
-            retarget.map_rig(truth.skeleton),
+            retarget.identify_rig(truth.skeleton),
         )
         if rig != "canonical"
         else replace(
@@ -234,15 +236,15 @@ def test_a_tpose_in_frame_0_stays(rig):
 @pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])
 def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, fps):
     module = import_module("controllers.denoising.denoise")  # the package has a function of this name
-    monkeypatch.setattr(module, "_PIECE", 2.0)
-    monkeypatch.setattr(module, "_SHARED", 0.5)
+    monkeypatch.setattr(module, "_SEGMENT_SECONDS", 2.0)
+    monkeypatch.setattr(module, "_OVERLAP_SECONDS", 0.5)
     truth, calls = on_rig(rig, 7 * fps, fps=fps), []
     given = noisy(truth)
     done = cleaned(given, progress=lambda now, of: calls.append((now, of)), masks=[Mask(ALL, 3 * fps, 3 * fps + 2)])
     assert done.motion.num_frames == 7 * fps
     assert len(calls) >= 4
     assert calls[-1] == (7 * fps, 7 * fps)
-    assert len(done.contacts) == len(done.believed) == 210
+    assert len(done.contacts) == len(done.proposal_share) == 210
     assert all(len(entry.energy) == 210 for entry in done.ledger.entries)
     assert error_cm(truth, done.motion) < 0.8 * error_cm(truth, given)
     leap = torch.diff(done.motion.joint_positions(), n=2, dim=0).norm(dim=-1).amax(dim=-1)
@@ -302,12 +304,12 @@ def test_unknown_rigs_are_refused():
 def test_pieces_fade_into_each_other(rig):
     truth = on_rig(rig, 60)
     before, after = noisy(truth, seed=1).slice(0, 40), noisy(truth, seed=2).slice(30, 60)
-    mixed = faded(before, after, 10)
+    mixed = crossfade(before, after, 10)
     assert mixed.num_frames == 60
     assert apart_deg(mixed.local_quat_xyzw[:31], before.local_quat_xyzw[:31]).max() < 1e-4
     assert apart_deg(mixed.local_quat_xyzw[39:], after.local_quat_xyzw[9:]).max() < 1e-4
-    assert faded(truth.slice(0, 20), truth.slice(20, 60), 0).num_frames == 60
-    assert error_cm(faded(truth.slice(0, 40), truth.slice(25, 60), 15), truth) < 1e-4
+    assert crossfade(truth.slice(0, 20), truth.slice(20, 60), 0).num_frames == 60
+    assert error_cm(crossfade(truth.slice(0, 40), truth.slice(25, 60), 15), truth) < 1e-4
 
 
 def test_a_part_of_a_result_is_of_those_frames():
@@ -315,8 +317,8 @@ def test_a_part_of_a_result_is_of_those_frames():
     first, second = done.slice(0, 50), done.slice(50, 120)
     assert (first.motion.num_frames, len(first.contacts)) == (50, 25)
     assert all(0 <= fault.start < fault.stop <= 70 for fault in second.faults)
-    whole = joined([(first, 0), (second, 50)])
+    whole = join_segments([(first, 0), (second, 50)])
     assert torch.equal(whole.motion.local_quat_xyzw, done.motion.local_quat_xyzw)
     assert set(whole.faults) == set(done.faults)
     assert torch.equal(whole.contacts, done.contacts)
-    assert torch.equal(whole.believed, done.believed)
+    assert torch.equal(whole.proposal_share, done.proposal_share)

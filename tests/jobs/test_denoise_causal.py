@@ -9,7 +9,7 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from test_denoise import QUICK
 from tiny_denoiser import tiny_denoiser
 
-from controllers.common.map_refinement import StandingSettings
+from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.causal import CausalDenoiser, CausalSettings, denoise_causal
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
@@ -17,7 +17,9 @@ from mapctl.recording.masks import Mask
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 
-FAST = replace(QUICK, standing=StandingSettings(lbfgs=LbfgsSettings(max_iterations=1), budget=Budget(evaluations=1)))
+FAST = replace(
+    QUICK, refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=1), budget=Budget(evaluations=1))
+)
 
 
 def stream(causal=None):
@@ -139,7 +141,7 @@ def test_delays_that_make_no_sense_are_refused(delay):
 @pytest.mark.parametrize("delay", [1 / 30, 0.1, 0.2, 0.5])
 def test_what_is_said_of_the_delay_holds_at_any_rate(fps, delay):
     causal = CausalSettings(delay=delay)
-    most, step = causal.waiting(fps)
+    most, step = causal.compute_delay_frames(fps)
     assert stream(causal).delay == delay
     assert most / fps <= delay + 1e-9 < (most + 1) / fps + 1e-9
     assert step >= 1

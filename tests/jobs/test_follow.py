@@ -11,34 +11,35 @@ import torch
 from helpers import generator, tiny_density
 
 import controllers
-from controllers.common.feasibility import after_the_fact, in_advance
-from controllers.common.initial_state import choose_start
-from controllers.following.follow import FollowSettings, follow_terms
+from controllers.common.feasibility import check_path, check_tracking
+from controllers.common.initial_state import select_initial_state
+from controllers.following.follow import FollowSettings, build_follow_terms
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import encode
-from mapctl.intent.path import Follow, SpeedProfile
+from mapctl.intent.path import PathRequest, SpeedProfile
 from mapctl.kinematics import heading
-from mapctl.problem.receding_horizon import WindowSettings
+from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.solution import Outcome
-from mapctl.problem.window_solvers import LatentMethod
-from mapctl.protocols import Abilities
+from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.protocols import DataLimits
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.terms import Likelihood
 
 DENSITY = tiny_density()
 QUICK = FollowSettings(
-    window=WindowSettings(frames=10, overlap=4, past=12), method=LatentMethod(rounds=1, budget=Budget(evaluations=5))
+    window=HorizonSettings(frames=10, overlap=4, past=12),
+    method=LatentNoiseSolver(rounds=1, budget=Budget(evaluations=5)),
 )
-ABLE = Abilities(slowest=0.5, fastest=2.0, turn_rate=1.5)
+ABLE = DataLimits(slowest=0.5, fastest=2.0, turn_rate=1.5)
 HILL = torch.stack(
     [torch.zeros(50), 0.9 + 0.02 * torch.linspace(0, 6, 50).sin(), torch.linspace(0, 3, 50)], -1
 ).double()
 
 
 def follow(curve, *, seed=0, **wishes):
-    return controllers.following.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **wishes})
+    return controllers.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **wishes})
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_an_interrupted_walk_keeps_what_was_solved():
 def test_the_deadlines_clock_starts_with_the_call(monkeypatch):
     module = sys.modules["controllers.following.follow"]
     slow = partial(after_a_while, module.choose_start)
-    monkeypatch.setattr(module, "choose_start", slow)
+    monkeypatch.setattr(module, "select_initial_state", slow)
     assert follow(curves.circle(radius=2), seconds=5, deadline_seconds=0.05).motion.num_frames == 1
 
 
@@ -164,8 +165,8 @@ def test_a_speed_beyond_the_data_is_named_with_both_numbers():
 
 
 def notes(curve, speed, seconds, profile=None):
-    request = Follow(curve, profile or SpeedProfile.constant(speed), seconds)
-    return in_advance(request, request.arcs(request.frames(30), 30), ABLE)
+    request = PathRequest(curve, profile or SpeedProfile.constant(speed), seconds)
+    return check_path(request, request.arcs(request.frames(30), 30), ABLE)
 
 
 def test_possible_wishes_draw_no_notes():
@@ -204,14 +205,14 @@ def test_speeds_that_the_walk_never_reaches_draw_no_notes():
 
 
 def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
-    request, note = Follow(curves.line(length=3), SpeedProfile.constant(1.0), 4.0).fitted(30)
+    request, note = PathRequest(curves.line(length=3), SpeedProfile.constant(1.0), 4.0).fitted(30)
     assert float(request.arcs(120, 30)[-1]) == pytest.approx(3.0, abs=0.05)
     assert "the curve is 3.0 m long" in note
     assert "76 %" in note
-    far, _ = Follow(curves.line(length=1), SpeedProfile.constant(1.0), 4.0).fitted(30)
+    far, _ = PathRequest(curves.line(length=1), SpeedProfile.constant(1.0), 4.0).fitted(30)
     assert far.profile.speeds == (0.6,)
     assert "go straight on beyond the end of the curve of 1.0 m" in notes(curves.line(length=1), 1.0, 4.0)[-1]
-    closed = Follow(curves.circle(radius=0.1), SpeedProfile.constant(1.0), 4.0)
+    closed = PathRequest(curves.circle(radius=0.1), SpeedProfile.constant(1.0), 4.0)
     assert closed.fitted(30) == (closed, None)
 
 
@@ -220,21 +221,21 @@ def test_leaving_the_curve_is_told_with_the_distance_and_the_time():
     beside = motion.root_position.clone()
     beside[:, 0] = 0.14
     line = curves.line(length=3)
-    assert after_the_fact(replace(motion, root_position=beside), line, "hips") == []
+    assert check_tracking(replace(motion, root_position=beside), line, "hips") == []
     beside[12:19, 0] = 0.4
-    told = after_the_fact(replace(motion, root_position=beside), line, "hips")
+    told = check_tracking(replace(motion, root_position=beside), line, "hips")
     assert told == ["the curve is left by up to 40 cm between 0.4 and 0.6 s"]
     beside[25:, 0] = 0.3  # another stretch, not so bad
-    assert after_the_fact(replace(motion, root_position=beside), line, "hips") == told
+    assert check_tracking(replace(motion, root_position=beside), line, "hips") == told
 
 
 def test_the_start_is_one_of_the_best_by_the_wishes_speed():
     arcs = 0.04 * torch.arange(60, dtype=torch.float64)
     curve = curves.circle(radius=2)
-    terms_of = follow_terms(curve, arcs, QUICK)
-    found = choose_start(DENSITY, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator())
+    terms_of = build_follow_terms(curve, arcs, QUICK)
+    found = select_initial_state(DENSITY, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator())
     assert any(torch.equal(found.committed.state.previous[0], row) for row in DENSITY.starts.state.previous)
-    stood = found.before_first.moved(found.committed.features[0, :2], found.committed.features[0, 2])
+    stood = found.before_first.displace(found.committed.features[0, :2], found.committed.features[0, 2])
     torch.testing.assert_close(stood.position_xz, found.committed.place.position_xz, atol=1e-6, rtol=0)
     torch.testing.assert_close(stood.heading, found.committed.place.heading)
 
@@ -257,7 +258,7 @@ def test_profiles_that_are_none_are_refused(text):
 
 def test_arcs_are_the_integral_of_speed():
     profile = SpeedProfile((0.0, 10.0), (1.0, 2.0))  # ds/dt = 1 + s / 10
-    arcs = Follow(curves.line(length=20), profile, 5.0).arcs(151, 30)
+    arcs = PathRequest(curves.line(length=20), profile, 5.0).arcs(151, 30)
     assert float(arcs[-1]) == pytest.approx(10 * (math.exp(0.5) - 1), rel=2e-3)
-    frames = Follow(curves.line(length=5), profile).frames(30)
-    assert float(Follow(curves.line(length=5), profile).arcs(frames, 30)[-1]) == pytest.approx(5.0, abs=0.06)
+    frames = PathRequest(curves.line(length=5), profile).frames(30)
+    assert float(PathRequest(curves.line(length=5), profile).arcs(frames, 30)[-1]) == pytest.approx(5.0, abs=0.06)

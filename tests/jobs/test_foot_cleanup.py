@@ -4,17 +4,17 @@ import pytest
 import torch
 from helpers import corpus, generator, tiny_density, tiny_model
 
-from controllers.generation.foot_cleanup import FinishSettings, finish
-from mapctl.contacts import without_short_runs
+from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
+from mapctl.contacts import remove_short_runs
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, Place
-from mapctl.problem.context import Context
-from mapctl.problem.receding_horizon import WindowSettings
-from mapctl.problem.window_solvers import GuidedMethod
-from mapctl.terms import Closeness, Footing
+from mapctl.features import LAYOUT, GroundPose
+from mapctl.problem.context import WindowContext
+from mapctl.problem.receding_horizon import HorizonSettings
+from mapctl.problem.window_solvers import GuidedNoiseSolver
+from mapctl.terms import FootContact, MotionTracking
 from mapctl.terms.trial import Trial
 
-SETTINGS = FinishSettings(window=WindowSettings(frames=12, overlap=6))
+SETTINGS = FootCleanupSettings(window=HorizonSettings(frames=12, overlap=6))
 DENSITY = tiny_density()
 
 
@@ -29,14 +29,14 @@ def clip(frames: int = 60, *, noise: float = 0.01) -> torch.Tensor:
 def finished(pieces, frames, *, settings=SETTINGS):
     state = DENSITY.initial_state(corpus().clips()[1][:1])
     return torch.cat(
-        list(finish(DENSITY, pieces, frames=frames, state=state, generator=generator(), settings=settings))
+        list(clean_up_feet(DENSITY, pieces, frames=frames, state=state, generator=generator(), settings=settings))
     )
 
 
 def toe_speed(features: torch.Tensor) -> float:
     """Mean ground speed of planted toes, m/s, by the labels of the walk itself."""
     batch, bits = features[None], corpus().clips()[1][1 : len(features) + 1, -2:] > 0.5
-    origin = Place(torch.zeros(1, 2), torch.zeros(1))
+    origin = GroundPose(torch.zeros(1, 2), torch.zeros(1))
     trial = Trial(batch, origin, batch, batch[..., 0], bits[None], torch.zeros(0, 21, 3))
     toes = torch.stack([trial.joint_world("leftToes"), trial.joint_world("rightToes")], 2)
     held = (bits[1:] & bits[:-1])[None]
@@ -69,8 +69,8 @@ def test_contacts_and_gaps_of_one_or_two_frames_go():
     flickering[15:17, -1] = 1 - flickering[15:17, -1]
     bits = LAYOUT.pick(finished([flickering[1:]], 24), "contacts") > 0.5
     inner = bits[:-4]
-    assert torch.equal(without_short_runs(inner, 3)[3:-3], inner[3:-3])
-    assert torch.equal(~without_short_runs(~inner, 3)[3:-3], inner[3:-3])
+    assert torch.equal(remove_short_runs(inner, 3)[3:-3], inner[3:-3])
+    assert torch.equal(~remove_short_runs(~inner, 3)[3:-3], inner[3:-3])
 
 
 def test_too_few_frames_to_look_ahead_are_refused():
@@ -90,11 +90,11 @@ def test_latents_are_what_rolls_out_to_the_motion(seed):
 def test_a_guide_that_is_all_that_is_wished_comes_back():
     guide = clip(13)[1:]
     state = DENSITY.initial_state(clip(13)[:1])
-    context = Context(DENSITY, state, Place.origin(), torch.zeros(0, 21, 3), 12)
-    exact = GuidedMethod(guide, share=1.0)
+    context = WindowContext(DENSITY, state, GroundPose.origin(), torch.zeros(0, 21, 3), 12)
+    exact = GuidedNoiseSolver(guide, share=1.0)
     tail = torch.zeros(0, LAYOUT.continuous)
-    solved = exact(context, [Closeness(guide)], tail, generator())
+    solved = exact(context, [MotionTracking(guide)], tail, generator())
     assert float((solved.trial.features[0] - guide).abs().max()) < 1e-3
     assert torch.equal(solved.trial.contacts[0], guide[:, -2:] > 0.5)
-    pulled = GuidedMethod(guide, share=0.5)(context, [Closeness(guide), Footing()], tail, generator())
+    pulled = GuidedNoiseSolver(guide, share=0.5)(context, [MotionTracking(guide), FootContact()], tail, generator())
     assert pulled.energy < pulled.start_energy

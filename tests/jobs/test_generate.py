@@ -8,15 +8,22 @@ import pytest
 import torch
 from helpers import bandai_skeleton, generator, tiny_density, turn_between, walk
 
-from controllers.generation.generate import GenerateSettings, begin, generate, spread_starts, stream, stream_features
+from controllers.generation.generate import (
+    GenerateSettings,
+    generate,
+    initialise_generation,
+    sample_stratified_starts,
+    stream,
+    stream_features,
+)
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, Place, decode, encode
+from mapctl.features import LAYOUT, GroundPose, decode, encode
 from mapctl.kinematics import heading
 from mapctl.skeleton import CANONICAL
 
 DENSITY = tiny_density()
-RAW = GenerateSettings(finishing=None)
+RAW = GenerateSettings(foot_cleanup=None)
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +92,7 @@ def test_temperature_spreads_the_draws():
 def test_it_continues_where_a_clip_ends(rig):
     clip = walk(40, turn_rate=0.8, fps=60 if rig == "60 fps" else 30)
     if rig == "bandai":
-        clip = retarget.from_canonical(clip, retarget.map_rig(bandai_skeleton()))
+        clip = retarget.from_canonical(clip, retarget.identify_rig(bandai_skeleton()))
     end = retarget.to_canonical(clip)[0]
     motion = made(start_clip=clip)
     step = motion.root_position[0] - end.root_position[-1]
@@ -146,7 +153,7 @@ def test_a_refiner_comes_before_the_motion_is_decoded():
 def test_features_are_the_motion_and_its_contact_labels():
     motion = made(seed=2)
     features = torch.cat(list(stream_features(DENSITY, seconds=1.0, generator=generator(2), settings=RAW)))
-    rebuilt = decode(features, Place.origin(torch.float64))
+    rebuilt = decode(features, GroundPose.origin(torch.float64))
     torch.testing.assert_close(rebuilt.joint_positions(), motion.joint_positions(), atol=1e-6, rtol=0)
     assert set(LAYOUT.pick(features, "contacts").unique().tolist()) <= {0.0, 1.0}
 
@@ -154,15 +161,15 @@ def test_features_are_the_motion_and_its_contact_labels():
 def test_starts_are_drawn_by_their_weight():
     only = replace(DENSITY, starts=replace(DENSITY.starts, weight=torch.tensor([0.0, 0.0, 1.0, 0.0])))
     for seed in range(5):
-        _, state, _ = begin(only, RAW, None, generator(seed))
+        _, state, _ = initialise_generation(only, RAW, None, generator(seed))
         assert torch.equal(state.previous, DENSITY.starts.state.previous[2:3])
 
 
 def test_starts_of_several_motions_are_spread_by_weight_and_the_first_do_not_depend_on_how_many():
     weight = torch.tensor([0.1, 0.2, 0.3, 0.4])
     prior = replace(DENSITY, starts=replace(DENSITY.starts, weight=weight))
-    drawn = spread_starts(prior, 200, generator(1))
+    drawn = sample_stratified_starts(prior, 200, generator(1))
     counts = torch.bincount(torch.tensor(drawn), minlength=4) / 200
     torch.testing.assert_close(counts, weight, atol=0.015, rtol=0)
-    assert spread_starts(prior, 7, generator(1)) == drawn[:7]
-    assert spread_starts(prior, 7, generator(2)) != drawn[:7]
+    assert sample_stratified_starts(prior, 7, generator(1)) == drawn[:7]
+    assert sample_stratified_starts(prior, 7, generator(2)) != drawn[:7]

@@ -10,7 +10,7 @@ from test_denoise import QUICK
 from tiny_denoiser import tiny_denoiser
 
 from controllers.denoising.denoise import begins_with_tpose, denoise
-from controllers.denoising.lead_transition import passage
+from controllers.denoising.lead_transition import find_lead_transition
 from mapctl import retarget, rotations
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask
@@ -37,7 +37,7 @@ def led(motion: Motion, shares=SHARES) -> Motion:
     for frame, share in enumerate(shares):
         weight = torch.full((motion.num_joints,), share, dtype=torch.float64)
         quats[frame] = rotations.slerp(pose.local_quat_xyzw[0], quats[frame], weight)
-    body = retarget.map_rig(motion.skeleton).joint_of[0]
+    body = retarget.identify_rig(motion.skeleton).joint_of[0]
     quats[:, : body + 1] = motion.local_quat_xyzw[:, : body + 1]
     moving = {joint: values[:1] for joint, values in motion.moving_offsets.items()}
     pose = replace(pose, moving_offsets=moving, root_position=motion.root_position[:1])
@@ -83,7 +83,7 @@ def test_no_frame_after_a_mixed_in_tpose_errs_by_far_more_than_the_others(rig, f
 def test_without_a_mixture_the_first_frames_are_motion(rig):
     truth = led(arms_down(on_rig(rig, 90)), shares=())
     given = noisy(truth, 5.0, 1.0, seed=4)
-    assert passage(given, retarget.map_rig(given.skeleton)).stop <= 2  # noise may look like a trace
+    assert find_lead_transition(given, retarget.identify_rig(given.skeleton)).stop <= 2  # noise may look like a trace
     done = cleaned(given)
     away = errors_cm(truth, done.motion)
     assert away[1:8].max() < 9
@@ -125,7 +125,7 @@ def test_where_the_body_is_may_be_mixed_too():
         place[frame] = torch.lerp(pose.root_position[0], place[frame], share)
     truth = pose.join(replace(truth, local_quat_xyzw=quats, root_position=place))
     given = noisy(truth, 3.0, 1.0, seed=1)
-    found = passage(given, retarget.map_rig(given.skeleton))
+    found = find_lead_transition(given, retarget.identify_rig(given.skeleton))
     assert found.place
     assert bool(found.joints[0])
     away = errors_cm(truth, cleaned(given).motion)
@@ -145,7 +145,7 @@ def test_a_tpose_is_told_under_noise_whatever_rest_the_rig_has(rest, seed):
     """Also where the rig's own T-pose is found from the motion, noise and all."""
     truth = led(arms_down(on_rig("daz", 90)), shares=())
     given = noisy(truth, 6.0, 1.0, seed=seed)
-    rig = Rig("own", retarget.map_rig(truth.skeleton).rig.joints) if rest == "auto" else None
+    rig = Rig("own", retarget.identify_rig(truth.skeleton).rig.joints) if rest == "auto" else None
     assert begins_with_tpose(given, rig)
     assert not begins_with_tpose(given.slice(1, 91), rig)
     moved = errors_cm(given.slice(0, 1), cleaned(given, rig=rig).motion.slice(0, 1))

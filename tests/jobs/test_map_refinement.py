@@ -9,24 +9,24 @@ from captures import apart_deg
 from helpers import finite_difference, generator, tiny_density, walk
 
 from controllers.common import map_refinement
-from controllers.common.map_refinement import StandingSettings, guide_of, rest_height, stand
+from controllers.common.map_refinement import RefinementSettings, estimate_rest_height, guide_of, refine
 from mapctl import rotations
-from mapctl.contacts import steadied
-from mapctl.features import PRIOR_FPS, Place
+from mapctl.contacts import debounced
+from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import runs
+from mapctl.numerics.intervals import true_intervals
 from mapctl.problem import density_selection
 from mapctl.problem.objective import Objective
-from mapctl.problem.pose_offsets import Guide, Poses
+from mapctl.problem.pose_offsets import Guide, PoseOffsets
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms import Clearance, Footing, Noise
+from mapctl.terms import Clearance, FootContact, LatentPrior
 from mapctl.terms.foot_contact import TOES
 
 TOE = [CANONICAL.index(name) for name in TOES]
-QUICK = StandingSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
+QUICK = RefinementSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
 
 
 def standing_still(frames=60, *, drift=0.0):
@@ -58,10 +58,10 @@ def poses_of(motion, contacts, dtype=torch.float32, sigma=0.05):
     guide = guide_of(motion, contacts)
     guide = Guide(guide.root.to(dtype), guide.heading.to(dtype), guide.angles.to(dtype), guide.contacts)
     width = guide.packed().shape[1]
-    return Poses(
+    return PoseOffsets(
         guide,
         torch.full((len(guide.root), width), sigma, dtype=dtype),
-        Place(guide.root[0, ::2], guide.heading[0]),
+        GroundPose(guide.root[0, ::2], guide.heading[0]),
         torch.zeros(0, CANONICAL.num_joints, 3, dtype=dtype),
         torch.zeros(2, dtype=torch.bool),
         CANONICAL,
@@ -91,7 +91,7 @@ def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
 def test_the_gradient_is_that_of_finite_differences():
     motion = walk(12, turn_rate=0.5)
     poses = poses_of(motion, torch.tensor([True, False]).expand(12, 2).contiguous(), torch.float64)
-    objective = Objective(poses.build, [Noise(1.0), Footing(sigma_speed=0.1, sigma_height=0.03)])
+    objective = Objective(poses.build, [LatentPrior(1.0), FootContact(sigma_speed=0.1, sigma_height=0.03)])
     at = 0.3 * torch.randn(1, poses.sigma.numel(), generator=generator(1), dtype=torch.float64)
     _, gradient = objective.energy_and_gradient(at)
     for seed in range(3):
@@ -102,7 +102,7 @@ def test_the_gradient_is_that_of_finite_differences():
 
 def test_planted_toes_that_slide_slow_down_and_joints_stay_near():
     motion = standing_still(60, drift=0.2)
-    stood = stand(motion, odds(motion), told(motion), QUICK)
+    stood = refine(motion, odds(motion), told(motion), QUICK)
     before, after = speeds(motion), speeds(stood.motion)
     assert after[2:].mean() < 0.6 * before[2:].mean()
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).mean() < 0.15
@@ -111,14 +111,14 @@ def test_planted_toes_that_slide_slow_down_and_joints_stay_near():
 
 def test_feet_in_the_air_may_move():
     motion = standing_still(60, drift=0.2)
-    stood = stand(motion, odds(motion, -5.0, -5.0), told(motion), QUICK)
+    stood = refine(motion, odds(motion, -5.0, -5.0), told(motion), QUICK)
     assert not stood.contacts.any()
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.01
 
 
 def test_a_capture_without_noise_stays_but_for_half_millimetres():
     motion = walk(60)
-    stood = stand(motion, odds(motion), told(motion, degrees=0.0, centimetres=0.0), QUICK)
+    stood = refine(motion, odds(motion), told(motion, degrees=0.0, centimetres=0.0), QUICK)
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.005
 
 
@@ -126,7 +126,7 @@ def test_what_was_not_seen_moves_before_what_was():
     motion = standing_still(40, drift=0.2)
     capture = told(motion, degrees=0.5, centimetres=0.1)
     lost = replace(capture, seen_root=torch.zeros(1, 40, dtype=torch.bool))
-    held, free = (speeds(stand(motion, odds(motion), given, QUICK).motion)[2:].mean() for given in (capture, lost))
+    held, free = (speeds(refine(motion, odds(motion), given, QUICK).motion)[2:].mean() for given in (capture, lost))
     assert free < 0.5 * held
 
 
@@ -137,7 +137,7 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
     shallow = replace(deep, card=replace(deep.card, quality={"windows": {"p2": 1e5}}))
     found = {}
     for density in (deep, shallow):
-        stood = stand(motion, odds(motion), told(motion), settings, densities=[density])
+        stood = refine(motion, odds(motion), told(motion), settings, densities=[density])
         assert [(part.start, part.stop) for part in stood.stretches] == [(0, 20), (20, 50)]
         (entry,) = (entry for entry in stood.ledger.entries if entry.name == "likelihood")
         scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in stood.stretches])
@@ -150,8 +150,10 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
 def test_of_several_densities_the_likelier_counts_in_each_window():
     motion = walk(50)
     near = tiny_density()
-    far = replace(near, name="far", reference=near.reference.blurred(100 * density_selection.spread()))
-    stood = stand(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10), densities=[far, near])
+    far = replace(
+        near, name="far", reference=near.reference.with_observation_noise(100 * density_selection.proposal_sigma())
+    )
+    stood = refine(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10), densities=[far, near])
     for part in stood.stretches:
         assert part.prior == max(part.nats, key=lambda name: part.nats[name])
         assert set(part.nats) == {"tiny", "far"}
@@ -160,7 +162,7 @@ def test_of_several_densities_the_likelier_counts_in_each_window():
 def test_a_walk_that_is_moving_begins_so():
     """The density is not shown a first frame that stands: its step is the second's."""
     motion = walk(30)
-    place = map_refinement._before(guide_of(motion, torch.zeros(30, 2, dtype=torch.bool)))
+    place = map_refinement._extrapolate_backward(guide_of(motion, torch.zeros(30, 2, dtype=torch.bool)))
     step = motion.root_position[1, [0, 2]] - motion.root_position[0, [0, 2]]
     assert torch.allclose((motion.root_position[0, [0, 2]] - place.position_xz), step, atol=1e-4)
 
@@ -169,7 +171,7 @@ def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):
     motion = walk(70, turn_rate=0.6)
     for frames, ahead in ((96, 24), (70, 8), (20, 8), (33, 1)):
         settings = replace(QUICK, frames=frames, ahead=ahead, budget=Budget(evaluations=2))
-        stood = stand(motion, odds(motion, -5.0, -5.0), told(motion), settings)
+        stood = refine(motion, odds(motion, -5.0, -5.0), told(motion), settings)
         assert stood.motion.num_frames == len(stood.contacts) == 70
         assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.03
         assert all(len(entry.energy) == 70 for entry in stood.ledger.entries)
@@ -179,7 +181,7 @@ def test_windows_meet_without_a_jump():
     """A slide that many windows work on: the hips' accelerations where two meet are as elsewhere."""
     motion = standing_still(120, drift=0.2)
     settings = replace(QUICK, frames=40, ahead=16)
-    out = stand(motion, odds(motion), told(motion), settings).motion
+    out = refine(motion, odds(motion), told(motion), settings).motion
     jump = torch.diff(out.joint_positions(), n=2, dim=0).norm(dim=-1).amax(dim=-1)
     seams = torch.zeros(len(jump), dtype=torch.bool)
     for seam in (24, 48, 72):
@@ -197,7 +199,7 @@ def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
         return replace(result, x=torch.full_like(result.x, math.nan), energy=torch.full_like(result.energy, math.nan))
 
     monkeypatch.setattr(map_refinement, "minimise", lost)
-    stood = stand(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10))
+    stood = refine(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10))
     assert stood.motion.num_frames == 50
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-4
 
@@ -205,7 +207,7 @@ def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_short_proposals_break_nothing(frames):
     motion = walk(frames)
-    stood = stand(motion, odds(motion), told(motion), QUICK)
+    stood = refine(motion, odds(motion), told(motion), QUICK)
     assert stood.motion.num_frames == frames
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.1
 
@@ -224,24 +226,24 @@ def test_a_guide_is_its_motion():
 def test_no_contact_and_no_gap_in_one_is_short():
     bits = torch.rand(200, 40, generator=generator()) < torch.linspace(0.1, 0.9, 40)
     for pair in bits.split(2, dim=1):
-        found = steadied(pair)
+        found = debounced(pair)
         for mask in (found, ~found):
-            assert all(stop - start >= 3 for _, start, stop in runs(mask))
-        assert torch.equal(steadied(found), found)
+            assert all(stop - start >= 3 for _, start, stop in true_intervals(mask))
+        assert torch.equal(debounced(found), found)
 
 
 def test_long_contacts_stay():
     bits = torch.zeros(30, 2, dtype=torch.bool)
     bits[3:9, 0] = True
     bits[20:, 1] = True
-    assert torch.equal(steadied(bits), bits)
+    assert torch.equal(debounced(bits), bits)
 
 
 def test_the_rest_height_is_that_of_planted_toes():
     motion = walk(90)
     planted = motion.joint_positions()[:, TOE, 1] < TOE_REST_HEIGHT + 0.01
-    assert rest_height(motion, planted) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
-    assert rest_height(motion, torch.zeros_like(planted)) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
+    assert estimate_rest_height(motion, planted) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
+    assert estimate_rest_height(motion, torch.zeros_like(planted)) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
 
 
 def test_toes_that_slide_unseen_are_lifted_and_those_that_were_seen_are_not():
@@ -251,8 +253,8 @@ def test_toes_that_slide_unseen_are_lifted_and_those_that_were_seen_are_not():
     seen[15:45] = False
     capture = replace(capture, seen=seen[None, :, None].expand_as(capture.seen), seen_root=seen[None])
     heights = [
-        stand(
-            motion, odds(motion, -5.0, -5.0), capture, replace(QUICK, clearance=clearance, ease=5.0)
+        refine(
+            motion, odds(motion, -5.0, -5.0), capture, replace(QUICK, clearance=clearance, uncertainty_ramp=5.0)
         ).motion.joint_positions()[:, TOE, 1]
         for clearance in (None, Clearance())
     ]

@@ -14,8 +14,8 @@ from helpers import generator, walk
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.curves.local_frame import axes_near
-from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.curves.local_frame import find_local_frames
+from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.kinematics import fast
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.trial import Trial
@@ -41,7 +41,7 @@ def reference(monkeypatch):
     """A switch that leaves only the torch code."""
 
     def switch():
-        monkeypatch.setattr(fast, "serves", lambda features, start, skeleton: False)
+        monkeypatch.setattr(fast, "is_supported", lambda features, start, skeleton: False)
 
     return switch
 
@@ -50,16 +50,16 @@ def trial(batch=3, *, features=None, place=None, skeleton=CANONICAL, dtype=torch
     """Disturbed windows of a walk, with the walk before them; features are a leaf that gradients reach."""
     motion = walk(PAST + FRAMES, turn_rate=0.2)
     vectors, start = encode(motion)
-    ground, heading = root_places(vectors[:PAST], start)
+    ground, heading = integrate_root(vectors[:PAST], start)
     if features is None:
         noise = torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(0)).double()
         features = vectors[PAST:] + 0.05 * vectors.std(0) * noise
-    place = place or Place(ground[-1], heading[-1])
+    place = place or GroundPose(ground[-1], heading[-1])
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(1))
     bits = torch.rand(batch, FRAMES, 2, generator=generator(2)) < 0.6
     return Trial(
         features.to(dtype).requires_grad_(),
-        Place(place.position_xz.to(dtype), place.heading.to(dtype)),
+        GroundPose(place.position_xz.to(dtype), place.heading.to(dtype)),
         draw[..., 1:].to(dtype),
         draw[..., 0].to(dtype),
         bits,
@@ -100,8 +100,8 @@ def value_and_gradient(whole, part):
 def agree(part, **wishes):
     """The compiled float32 answers lie close to the torch code's in float64."""
     quick, exact = trial(**wishes), trial(**wishes, dtype=torch.float64)
-    assert quick._fast
-    assert not exact._fast
+    assert quick._use_kernels
+    assert not exact._use_kernels
     for found, expected in zip(value_and_gradient(quick, part), value_and_gradient(exact, part), strict=True):
         assert found.dtype == torch.float32
         close(found, expected, 1e-5)
@@ -135,7 +135,7 @@ def test_rotation_vectors_of_any_size_have_exact_gradients(size):
 @pytest.mark.parametrize("shape", [(), (1,), (3,)])
 def test_starts_may_be_shared_or_one_for_each_candidate(shape):
     xz = 50 * torch.randn(*shape, 2, generator=generator(5)).double()
-    agree(everything_of, place=Place(xz, torch.randn(shape, generator=generator(6)).double()))
+    agree(everything_of, place=GroundPose(xz, torch.randn(shape, generator=generator(6)).double()))
 
 
 def test_any_tree_and_bones():
@@ -162,7 +162,7 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_the_body_is_left_alone_while_only_the_root_is_asked_for(monkeypatch):
-    monkeypatch.setattr(fast, "joints_world", None)
+    monkeypatch.setattr(fast, "compute_joints_world", None)
     whole = trial()
     assert TERMS["path of the hips"](whole).shape == (3, FRAMES)
     with pytest.raises(TypeError):
@@ -171,11 +171,11 @@ def test_the_body_is_left_alone_while_only_the_root_is_asked_for(monkeypatch):
 
 def test_the_torch_code_serves_what_the_kernels_do_not():
     whole = trial()
-    wanting = Place(whole.start.position_xz.requires_grad_(), whole.start.heading)
-    assert not replace(whole, start=wanting)._fast
+    wanting = GroundPose(whole.start.position_xz.requires_grad_(), whole.start.heading)
+    assert not replace(whole, start=wanting)._use_kernels
     (gradient,) = torch.autograd.grad(replace(whole, start=wanting).joints_world.sum(), wanting.position_xz)
     torch.testing.assert_close(gradient, torch.full((2,), 3.0 * FRAMES * CANONICAL.num_joints))
-    assert not trial(dtype=torch.float64)._fast
+    assert not trial(dtype=torch.float64)._use_kernels
 
 
 def test_the_same_candidates_give_the_same_bytes_alone_and_in_a_batch():
@@ -196,7 +196,7 @@ def beside(curve, *, count=400, dtype=torch.float64):
 def test_the_place_found_is_the_nearest(name):
     curve = CURVES[name]
     points, arcs = beside(curve)
-    found = axes_near(curve, points, arcs, reach=0.6)
+    found = find_local_frames(curve, points, arcs, reach=0.6)
     reach = min(0.6, curve.length / 2) if curve.closed else 0.6
     tried = curve.point(arcs.unsqueeze(-1) + torch.linspace(-reach, reach, 2401, dtype=torch.float64))
     best = (tried - points.unsqueeze(-2)).norm(dim=-1).amin(-1)
@@ -209,7 +209,7 @@ def test_the_place_found_is_the_nearest(name):
 def test_places_and_axes_are_the_curves_own(name):
     curve = CURVES[name]
     points, arcs = beside(curve)
-    found = axes_near(curve, points, arcs, reach=0.6)
+    found = find_local_frames(curve, points, arcs, reach=0.6)
     nearest = curve.nearest(points, around=arcs.expand(2, -1), reach=0.6)
     same = (curve.point(nearest) - found.place).norm(dim=-1) < 1e-8
     assert float(same.double().mean()) > 0.9  # the rest are about as far from two places
@@ -222,8 +222,8 @@ def test_places_and_axes_are_the_curves_own(name):
 def test_the_wanted_place_lies_straight_on_from_the_nearest(name):
     curve = CURVES[name]
     points, arcs = beside(curve)
-    found = axes_near(curve, points, arcs, reach=0.6)
-    apart = (found.axes @ (found.straightened - found.place).unsqueeze(-1)).squeeze(-1)
+    found = find_local_frames(curve, points, arcs, reach=0.6)
+    apart = (found.axes @ (found.tangent_extension - found.place).unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(apart[..., 0], torch.zeros_like(apart[..., 0]), atol=1e-9, rtol=0)
     torch.testing.assert_close(curve.point(arcs - apart[..., 1]), found.place, atol=1e-9, rtol=0)
 
@@ -232,7 +232,7 @@ def test_the_wanted_place_lies_straight_on_from_the_nearest(name):
 def test_single_precision_finds_the_same(name):
     curve = CURVES[name]
     points, arcs = beside(curve, dtype=torch.float32)
-    narrow, wide = (axes_near(curve, part, arcs, reach=0.6) for part in (points, points.double()))
+    narrow, wide = (find_local_frames(curve, part, arcs, reach=0.6) for part in (points, points.double()))
     torch.testing.assert_close(narrow.place, wide.place.float())
     torch.testing.assert_close(narrow.axes, wide.axes.float())
 
@@ -241,9 +241,9 @@ def test_single_precision_finds_the_same(name):
 def test_what_is_not_a_number_stays_so_and_harms_nobody_else(name):
     curve = CURVES[name]
     points, arcs = beside(curve, count=20)
-    clean = axes_near(curve, points, arcs, reach=0.6)
+    clean = find_local_frames(curve, points, arcs, reach=0.6)
     points[0, 3], arcs[7], arcs[9] = torch.nan, torch.inf, torch.nan
-    found = axes_near(curve, points, arcs, reach=0.6)
+    found = find_local_frames(curve, points, arcs, reach=0.6)
     assert bool(torch.isnan(found.place[:, [7, 9]]).all())
     rest = [t for t in range(20) if t not in (3, 7, 9)]
     torch.testing.assert_close(found.axes[:, rest], clean.axes[:, rest], atol=0, rtol=0)
@@ -259,10 +259,9 @@ def test_the_paths_memory_of_a_window_does_not_outlive_it():
 
 COMPILED = """
 import torch
-from mapctl import fast_kinematics
-from mapctl.features import Place
-from mapctl.skeleton import CANONICAL
-ground, heading = fast_kinematics.root_places(torch.ones(1, 2, 68), Place.origin())
+from mapctl.features import GroundPose
+from mapctl.kinematics import fast
+ground, heading = fast.integrate_root_fast(torch.ones(1, 2, 68), GroundPose.origin())
 print(float(heading[0, 1]))
 """
 
@@ -270,7 +269,7 @@ print(float(heading[0, 1]))
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
 def test_kernels_work_where_nothing_can_be_written(tmp_path):
     shutil.copytree(ROOT / "mapctl", tmp_path / "mapctl", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "mapctl" / "__pycache__").write_text("a file where the cache's folder would be")
+    (tmp_path / "mapctl" / "kinematics" / "__pycache__").write_text("a file where the cache's folder would be")
     # HOME is a file too, so neither the package's folder nor the user's cache can be made.
     home = tmp_path / "home"
     home.write_text("")

@@ -21,7 +21,7 @@ SKELETONS = {"canonical": CANONICAL, "bandai": bandai_skeleton(), "daz": cmu_ske
 
 def solved(places, start, skeleton=CANONICAL, **options):
     """The solution as a motion."""
-    quats = inverse.solve(places, start, skeleton, **options)
+    quats = inverse.solve_inverse_kinematics(places, start, skeleton, **options)
     root = options.get("root_position", places[:, 0])
     return Motion(skeleton, walk(2).fps, root, quats)
 
@@ -213,7 +213,7 @@ def test_straight_limbs_and_opposite_directions_give_something_finite(direction)
 
 def test_all_joints_in_one_point_give_something_finite():
     start = walk(3).local_quat_xyzw
-    made = inverse.solve(torch.zeros(3, CANONICAL.num_joints, 3).double(), start, CANONICAL)
+    made = inverse.solve_inverse_kinematics(torch.zeros(3, CANONICAL.num_joints, 3).double(), start, CANONICAL)
     assert made.isfinite().all()
 
 
@@ -233,4 +233,4 @@ def test_signs_of_the_solution_do_not_jump():
 def test_other_shapes_are_refused():
     motion = walk(4)
     with pytest.raises(RequestError, match=r"must be of the same frames and of 21 joints"):
-        inverse.solve(motion.joint_positions()[:, :20], motion.local_quat_xyzw[:, :20], CANONICAL)
+        inverse.solve_inverse_kinematics(motion.joint_positions()[:, :20], motion.local_quat_xyzw[:, :20], CANONICAL)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError
-from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 BRANCHED = Skeleton(
     ("a", "b", "c", "d", "e"), (-1, 0, 0, 1, 3), torch.randn(5, 3, generator=generator(1), dtype=torch.float64)
@@ -109,7 +109,7 @@ def test_the_canonical_skeleton_stands_as_the_conventions_say():
     assert at["leftToes"][2] > at["leftFoot"][2]
     assert at["head"][1] > at["hips"][1] > at["leftLowerLeg"][1] > at["leftFoot"][1]
     for name in CANONICAL.names:
-        torch.testing.assert_close(at[mirrored_name(name)] * torch.tensor([-1.0, 1, 1]), at[name], check_dtype=False)
+        torch.testing.assert_close(at[mirror_name(name)] * torch.tensor([-1.0, 1, 1]), at[name], check_dtype=False)
 
 
 @pytest.mark.parametrize(

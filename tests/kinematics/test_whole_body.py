@@ -6,8 +6,8 @@ from captures import on_rig
 from helpers import generator, walk
 
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import Targets
-from mapctl.kinematics.whole_body import reach_with_body
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.kinematics.whole_body import reach_targets
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 
@@ -20,16 +20,14 @@ def asked(motion, frame, joint, place):
     places = motion.joint_positions().clone()
     wanted = torch.zeros(motion.num_frames, JOINTS, dtype=torch.bool)
     places[frame, joint], wanted[frame, joint] = place, True
-    return Targets(places, wanted)
+    return EffectorTargets(places, wanted)
 
 
 def reach(motion, targets, *, stray=0.0, turning=None, moving=None):
     all_of_it = torch.ones(motion.num_frames, JOINTS, dtype=torch.bool)
     turning = all_of_it if turning is None else turning
     moving = all_of_it[:, 0] if moving is None else moving
-    return reach_with_body(
-        motion, targets, turning=turning, moving=moving, stray=torch.full((motion.num_frames,), stray)
-    )
+    return reach_targets(motion, targets, turning=turning, moving=moving, stray=torch.full((motion.num_frames,), stray))
 
 
 def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
@@ -118,7 +116,7 @@ def test_neighbouring_frames_reach_alike():
     wanted = torch.zeros(30, JOINTS, dtype=torch.bool)
     wanted[10:20, HAND] = True
     places[10:20, HAND] += torch.tensor([0.1, 0.5, 0.3]).double()
-    made, _ = reach(motion, Targets(places, wanted), stray=0.02)
+    made, _ = reach(motion, EffectorTargets(places, wanted), stray=0.02)
     steps = torch.diff((made.joint_positions() - motion.joint_positions())[10:20], dim=0).norm(dim=-1)
     assert steps.max() < 0.03
 
@@ -132,7 +130,7 @@ def test_joints_that_end_no_limb_are_refused(joint):
 
 def test_nothing_wanted_changes_nothing():
     motion = walk(4)
-    nothing = Targets(
+    nothing = EffectorTargets(
         torch.randn(4, JOINTS, 3, generator=generator(0)).double(), torch.zeros(4, JOINTS, dtype=torch.bool)
     )
     assert reach(motion, nothing)[0] is motion

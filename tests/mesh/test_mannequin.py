@@ -13,8 +13,8 @@ from scenes_walks import renamed, scaled, walk
 from mapctl.joint_names import Part, Side
 from mapctl.mesh import colours
 from mapctl.mesh.anatomy import Anatomy
-from mapctl.mesh.mannequin import Body
-from mapctl.mesh.primitives import RoundedBoxes, Surface, ball, frame_along, merge
+from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.primitives import RoundedBoxes, Surface, frame_along, merge_surfaces, unit_sphere
 from mapctl.skeleton import CANONICAL, Skeleton
 from scenes.renderers.lighting import shade
 
@@ -62,7 +62,7 @@ def test_a_capsules_skin_lies_a_radius_from_its_axis_and_its_normals_point_away_
 
 
 def test_every_vertex_of_the_ball_has_an_octant():
-    points, faces = ball()
+    points, faces = unit_sphere()
     assert np.abs(points).min() > 1e-3
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
@@ -70,7 +70,7 @@ def test_every_vertex_of_the_ball_has_an_octant():
 
 def test_merged_faces_still_point_at_their_own_vertices():
     parts = [one((0, 0.4, 0), (0.1, 0.1)), one((0.1, 0.4, 0.2), (0.1, 0.2))]
-    whole = merge(parts)
+    whole = merge_surfaces(parts)
     corners = np.concatenate([p.vertices[p.faces] for p in parts])
     assert np.array_equal(whole.vertices[whole.faces], corners)
 
@@ -78,7 +78,7 @@ def test_merged_faces_still_point_at_their_own_vertices():
 def test_a_body_moves_and_turns_with_its_motion():
     motion, frame = walk(), 5
     there = moved(motion, turn=0.7, shift=(2.0, -1.0))
-    skin, skin_there = (Body(m, GREY).surface(frame).vertices for m in (motion, there))
+    skin, skin_there = (Mannequin(m, GREY).surface(frame).vertices for m in (motion, there))
     cosine, sine = np.cos(0.7), np.sin(0.7)
     turned = skin @ np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
     assert skin_there == pytest.approx(turned + np.array([2.0, 0, -1.0]), abs=1e-9)
@@ -87,20 +87,20 @@ def test_a_body_moves_and_turns_with_its_motion():
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_body_is_as_large_as_its_bones(factor):
     motion = walk()
-    skin, larger = (Body(m, GREY).surface(3).vertices for m in (motion, scaled(motion, factor)))
+    skin, larger = (Mannequin(m, GREY).surface(3).vertices for m in (motion, scaled(motion, factor)))
     assert larger == pytest.approx(skin * factor, abs=1e-9)
 
 
 def test_the_mirrored_motions_body_is_the_mirror_image():
     motion = walk()
-    box, other = (Body(m, GREY).surface(4).vertices for m in (motion, motion.mirror()))
+    box, other = (Mannequin(m, GREY).surface(4).vertices for m in (motion, motion.mirror()))
     for corner in (np.min, np.max):
         assert corner(box[:, 1:], axis=0) == pytest.approx(corner(other[:, 1:], axis=0), abs=2e-3)
     assert box[:, 0].max() == pytest.approx(-other[:, 0].min(), abs=2e-3)
 
 
 def test_left_is_blue_and_right_is_orange_and_the_torso_is_the_actors():
-    skin = Body(walk(), colours.rgb("green")).surface(0)
+    skin = Mannequin(walk(), colours.rgb("green")).surface(0)
     hands = {side: skin.rgba[np.argmax(sign * skin.vertices[:, 0]), :3] for side, sign in (("left", 1), ("right", -1))}
     assert hands["left"] == pytest.approx(colours.rgb(colours.LEFT))
     assert hands["right"] == pytest.approx(colours.rgb(colours.RIGHT))
@@ -109,7 +109,7 @@ def test_left_is_blue_and_right_is_orange_and_the_torso_is_the_actors():
 
 
 def test_soles_stand_on_the_ground_in_the_upright_pose():
-    assert Body(walk(), GREY).surface(0).vertices[:, 1].min() == pytest.approx(0.0, abs=0.01)
+    assert Mannequin(walk(), GREY).surface(0).vertices[:, 1].min() == pytest.approx(0.0, abs=0.01)
 
 
 def test_head_faces_as_the_body_does():
@@ -121,19 +121,19 @@ def test_another_rigs_names_give_the_same_body():
     motion = walk()
     # The canonical order: limbs of one side after each other, legs after arms.
     same = renamed(motion, MIXAMO)
-    assert Body(same, GREY).surface(2).vertices == pytest.approx(Body(motion, GREY).surface(2).vertices)
+    assert Mannequin(same, GREY).surface(2).vertices == pytest.approx(Mannequin(motion, GREY).surface(2).vertices)
 
 
 def test_unknown_names_get_thin_capsules():
     strange = renamed(walk(), tuple(f"j{k}x" for k in range(CANONICAL.num_joints)))
-    body = Body(strange, GREY)
+    body = Mannequin(strange, GREY)
     assert body.bones.radius.max() < 0.03
     assert np.isfinite(body.surface(0).vertices).all()
 
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_the_shortest_motions_have_bodies(frames):
-    assert np.isfinite(Body(walk(frames), GREY).surface(frames - 1).vertices).all()
+    assert np.isfinite(Mannequin(walk(frames), GREY).surface(frames - 1).vertices).all()
 
 
 def test_feet_are_found_with_their_heights_over_the_sole():

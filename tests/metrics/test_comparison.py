@@ -15,7 +15,7 @@ from rig_maker import Make, make, names_of, person
 from mapctl import metrics
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
-from mapctl.retarget.upright import UNKNOWN, put_upright
+from mapctl.retarget.upright import UNKNOWN_RIG_NOTE, put_upright
 from mapctl.skeleton import Skeleton
 
 TREMOR = math.radians(0.3)
@@ -83,11 +83,11 @@ def unknown() -> Motion:
 def test_what_is_not_known_of_a_rig_is_said_in_one_line(tmp_path, capsys):
     unknown().save(tmp_path / "a.bvh")
     values = told(capsys, tmp_path / "a.bvh")
-    assert values["notes"] == [f"{tmp_path / 'a.bvh'}: {UNKNOWN}"]
+    assert values["notes"] == [f"{tmp_path / 'a.bvh'}: {UNKNOWN_RIG_NOTE}"]
     assert values["measures"]["jitter_m_s3"] == pytest.approx(metrics.measure(unknown())["jitter_m_s3"], rel=1e-3)
     assert run("measure", tmp_path / "a.bvh") == 0
-    assert UNKNOWN in capsys.readouterr().out
-    assert put_upright(unknown())[1] == (UNKNOWN,)
+    assert UNKNOWN_RIG_NOTE in capsys.readouterr().out
+    assert put_upright(unknown())[1] == (UNKNOWN_RIG_NOTE,)
 
 
 @pytest.mark.parametrize("root", [None, "Reference"])

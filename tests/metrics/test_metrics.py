@@ -9,9 +9,9 @@ import torch
 
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
-from mapctl.metrics import body, feet, measure, path, reference
+from mapctl.metrics import body, compute_reference, feet, measure, path
 from mapctl.motion import Motion
-from mapctl.numerics.gaussian import gaussian_kernel, slow_part
+from mapctl.numerics.gaussian import gaussian_kernel, low_pass
 from mapctl.rotations import about_y, from_rotation_vector
 from mapctl.skeleton import CANONICAL
 
@@ -183,18 +183,18 @@ def test_pose_variation_sees_poses_only():
 def test_penetration_and_float_of_planted_toes():
     toes = torch.zeros(100, 1, 3, dtype=torch.float64)
     toes[:10, 0, 1], toes[10:, 0, 1] = 0.0, 0.01  # a tenth of the frames is the floor
-    found = feet.Toes.of(toes, 30)
-    assert feet.floating(found) == pytest.approx(0.009)
+    found = feet.ToeMeasurements.of(toes, 30)
+    assert feet.float_height(found) == pytest.approx(0.009)
     assert feet.penetration(found) == 0.0
     toes[:3, 0, 1] = -0.02  # too few to be the floor
-    found = feet.Toes.of(toes, 30)
+    found = feet.ToeMeasurements.of(toes, 30)
     assert feet.penetration(found) == pytest.approx(3 * 0.02 / 100, rel=1e-9)
 
 
 def test_what_a_clip_cannot_tell_is_nan():
     flying = torch.zeros(20, 1, 3, dtype=torch.float64)
     flying[:, 0, 0] = torch.arange(20)
-    assert math.isnan(feet.contact_speed(feet.Toes.of(flying, 30)))
+    assert math.isnan(feet.contact_speed(feet.ToeMeasurements.of(flying, 30)))
     got = measure(straight(3))
     assert math.isnan(got["jitter_m_s3"])
     assert math.isnan(got["sway_cm"])
@@ -202,19 +202,19 @@ def test_what_a_clip_cannot_tell_is_nan():
 
 def test_smoothing_keeps_constants_and_lines_inside():
     line = torch.linspace(0, 1, 200, dtype=torch.float64)
-    torch.testing.assert_close(slow_part(torch.full_like(line, 3.0), seconds=0.5, fps=30), torch.full_like(line, 3.0))
-    torch.testing.assert_close(slow_part(line, seconds=0.5, fps=30)[50:150], line[50:150])
+    torch.testing.assert_close(low_pass(torch.full_like(line, 3.0), seconds=0.5, fps=30), torch.full_like(line, 3.0))
+    torch.testing.assert_close(low_pass(line, seconds=0.5, fps=30)[50:150], line[50:150])
     assert float(gaussian_kernel(0.5, 30).sum()) == pytest.approx(1)
 
 
 def test_a_reference_is_mean_and_percentiles_over_clips():
     speeds = np.array([0.5, 1.0, 1.5, 2.0, 1.0])
     clips = [straight(frames, speed=speed) for frames, speed in zip((90, 90, 90, 90, 3), speeds, strict=True)]
-    table = reference(iter(clips))
+    table = compute_reference(iter(clips))
     assert table["speed_m_s"] == pytest.approx((speeds.mean(), *np.percentile(speeds, [2, 98])))
     assert not math.isnan(table["sway_cm"].mean)  # the clip of 3 frames has none and is left out
     with pytest.raises(RequestError):
-        reference([])
+        compute_reference([])
 
 
 def test_what_cannot_be_measured_is_refused():

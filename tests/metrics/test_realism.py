@@ -17,7 +17,7 @@ from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.metrics import body, realism
 from mapctl.metrics.realism import classifier, frechet, gait, windows
-from mapctl.metrics.realism.diversity import average_pairwise_distance, from_own_start, sample_diversity
+from mapctl.metrics.realism.diversity import align_to_start, average_pairwise_distance, measure_diversity
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -35,14 +35,14 @@ def clip_set(count: int, frames: int = 61, *, seed: int = 0) -> list[Motion]:
 
 
 def windows_of(motions):
-    return [realism.clip_windows(realism.canonical_positions(motion)) for motion in motions]
+    return [realism.cut_windows(realism.canonical_positions(motion)) for motion in motions]
 
 
 def test_windows_are_positions_from_the_first_frame_and_velocities():
     clip = walk(75, turn_rate=0.4)
     positions = clip.joint_positions().numpy()
     left, right = (positions[:, CANONICAL.index(f"{side}UpperLeg")] for side in ("left", "right"))
-    got = realism.clip_windows(realism.canonical_positions(clip)).numpy()
+    got = realism.cut_windows(realism.canonical_positions(clip)).numpy()
     assert got.shape == (5, 30, 2 * 3 * 21)
     for number, start in enumerate(range(0, 45, 10)):
         across = left[start] - right[start]
@@ -73,7 +73,7 @@ def test_windows_know_the_height():
 def test_windows_of_any_known_rig_and_rate_are_the_same():
     """A constant walk, for whose straight pieces resampling loses nothing that the tolerance would miss."""
     clip = walk(61)
-    other_rig = retarget.from_canonical(clip, retarget.map_rig(bandai_skeleton()))
+    other_rig = retarget.from_canonical(clip, retarget.identify_rig(bandai_skeleton()))
     same, on_rig, slower = windows_of([clip, other_rig, clip.resample(60)])
     torch.testing.assert_close(on_rig, same, atol=1e-4, rtol=0)
     torch.testing.assert_close(slower, same, atol=1e-4, rtol=0)
@@ -121,7 +121,9 @@ def test_basis_holds_the_largest_variances(count):
 def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
     mocap, alike = clip_set(24), clip_set(24, seed=1)
     shaky = [trembling(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
-    same, other = (realism.realism(made, mocap, generator=generator(4), settings=QUICK) for made in (alike, shaky))
+    same, other = (
+        realism.measure_realism(made, mocap, generator=generator(4), settings=QUICK) for made in (alike, shaky)
+    )
     assert 0.2 < same.accuracy < 0.8
     assert 0.2 < same.floor_accuracy < 0.8
     assert other.accuracy > 0.9
@@ -133,7 +135,7 @@ def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
 def test_a_quicker_gait_is_far_in_frechet_distance():
     mocap = clip_set(8)
     quick = [walk(61, cadence=1.5, seed=50 + k) for k in range(8)]
-    found = realism.realism(quick, mocap, generator=generator(4), settings=QUICK)
+    found = realism.measure_realism(quick, mocap, generator=generator(4), settings=QUICK)
     assert found.frechet > 3 * found.floor_frechet
 
 
@@ -143,11 +145,11 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
     expected = torch.rand(3)
     torch.manual_seed(7)
     threads = torch.get_num_threads()
-    score = classifier.held_out_accuracy(first, second, generator=generator(5), settings=SMALL)
+    score = classifier.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL)
     assert torch.equal(torch.rand(3), expected)
     assert torch.get_num_threads() == threads
     torch.rand(5)  # another state of the global generator
-    assert classifier.held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
+    assert classifier.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
 
 
 def test_no_clip_is_both_learnt_and_held_out():
@@ -157,18 +159,18 @@ def test_no_clip_is_both_learnt_and_held_out():
         marked[clip, :, :, clip] = 1
     clips = list(marked)
     settings = realism.ClassifierSettings(steps=150, width=8, batch=32)
-    by_heart = classifier.held_out_accuracy(clips[::2], clips[1::2], generator=generator(1), settings=settings)
+    by_heart = classifier.compute_held_out_accuracy(clips[::2], clips[1::2], generator=generator(1), settings=settings)
     assert by_heart < 0.8
 
 
 def test_too_few_or_too_short_clips_are_refused():
     clips = clip_set(8, 31)
     with pytest.raises(RequestError, match="at least 8 clips of each, made and mocap; got 7 and 8"):
-        realism.realism(clips[:7], clips, generator=generator())
+        realism.measure_realism(clips[:7], clips, generator=generator())
     with pytest.raises(RequestError, match="mocap clip 3 of 8: 20 frames"):
-        realism.realism(clips, [*clips[:2], walk(20), *clips[3:]], generator=generator())
+        realism.measure_realism(clips, [*clips[:2], walk(20), *clips[3:]], generator=generator())
     with pytest.raises(RequestError, match="4 folds"):
-        classifier.held_out_accuracy(windows_of(clips[:3]), windows_of(clips), generator=generator())
+        classifier.compute_held_out_accuracy(windows_of(clips[:3]), windows_of(clips), generator=generator())
 
 
 @pytest.mark.parametrize("wrong", [{"folds": 1}, {"steps": 0}, {"batch": 1}, {"width": 0}])
@@ -194,24 +196,24 @@ def test_average_pairwise_distance_is_the_mean_over_pairs():
 def test_diversity_parts_places_from_poses():
     """Copies that stand apart differ in the world alone; joints that swing otherwise differ in both."""
     clip = walk(45)
-    apart = sample_diversity([clip, moved(clip, turn=0.0, shift=(0.3, 0.4))])
+    apart = measure_diversity([clip, moved(clip, turn=0.0, shift=(0.3, 0.4))])
     assert apart.world_cm == pytest.approx(50, rel=1e-6)
     assert apart.root_aligned_cm == pytest.approx(0, abs=1e-4)
-    turned = sample_diversity([clip, moved(clip, turn=1.0, shift=(0.0, 0.0))])
+    turned = measure_diversity([clip, moved(clip, turn=1.0, shift=(0.0, 0.0))])
     assert turned.world_cm > 10
     assert turned.root_aligned_cm == pytest.approx(0, abs=1e-4)
-    assert sample_diversity([clip, walk(45, seed=5)]).root_aligned_cm > 0.5
+    assert measure_diversity([clip, walk(45, seed=5)]).root_aligned_cm > 0.5
 
 
 def test_diversity_needs_samples_of_one_length():
     with pytest.raises(RequestError, match="at least 2 samples of one length, got 1"):
-        sample_diversity([walk(45)])
+        measure_diversity([walk(45)])
     with pytest.raises(RequestError, match=r"got 2 of 1\.5 and 2 s"):
-        sample_diversity([walk(45), walk(60)])
+        measure_diversity([walk(45), walk(60)])
 
 
 def test_from_own_start_stands_at_the_origin_and_faces_ahead():
-    seen = from_own_start(moved(walk(40, turn_rate=0.5), turn=2.0, shift=(3.0, -1.0)).joint_positions())
+    seen = align_to_start(moved(walk(40, turn_rate=0.5), turn=2.0, shift=(3.0, -1.0)).joint_positions())
     torch.testing.assert_close(seen[0, windows.HIPS, ::2], torch.zeros(2).double(), atol=1e-9, rtol=0)
     assert float(windows.facing_angle(seen)[0]) == pytest.approx(0, abs=1e-9)
 
@@ -241,7 +243,7 @@ def test_gait_spread_measures_what_the_walks_were_made_with():
     """Speeds of the procedural walk follow from its cadence; a stride is two steps."""
     cadences = (0.8, 0.9, 1.0)
     clips = [walk(200, cadence=cadence, turn_rate=0.2) for cadence in cadences]
-    spread = realism.gait_spread(clips, seconds=2.0)
+    spread = realism.measure_gait_spread(clips, seconds=2.0)
     speeds = [body.ground_speed(clip.root_position, 30) for clip in clips]
     assert spread["speed_m_s"].pieces == 9
     assert spread["speed_m_s"].std == pytest.approx(np.std(np.repeat(speeds, 3), ddof=1), rel=1e-6)
@@ -253,25 +255,25 @@ def test_gait_spread_measures_what_the_walks_were_made_with():
 def test_spread_is_compared_in_pieces_of_one_length():
     """Doubling every clip's length leaves pieces as they are, so the ratio is one however long clips are."""
     short, long = ([walk(frames, cadence=c) for c in (0.7, 0.9, 1.1)] for frames in (90, 180))
-    ratios = realism.spread_ratios(realism.gait_spread(long), realism.gait_spread(short))
+    ratios = realism.spread_ratios(realism.measure_gait_spread(long), realism.measure_gait_spread(short))
     # three values twice against three values once: their standard deviations differ by sqrt(2/3 / (5/6))
     assert ratios["speed_m_s"] == pytest.approx(math.sqrt((2 * 2) / 5), rel=1e-3)
 
 
 def test_clips_shorter_than_a_piece_add_nothing():
-    both = realism.gait_spread([walk(100), walk(100, cadence=1.1), walk(80)])
+    both = realism.measure_gait_spread([walk(100), walk(100, cadence=1.1), walk(80)])
     assert both["speed_m_s"].pieces == 2
-    none = realism.gait_spread([walk(80)])
+    none = realism.measure_gait_spread([walk(80)])
     assert none["speed_m_s"].pieces == 0
     assert math.isnan(none["speed_m_s"].std)
     assert math.isnan(realism.spread_ratios(none, both)["speed_m_s"])
     with pytest.raises(RequestError, match="needs clips and a length"):
-        realism.gait_spread([])
+        realism.measure_gait_spread([])
     with pytest.raises(RequestError, match="got 1 and 0 s"):
-        realism.gait_spread([walk(90)], seconds=0.0)
+        realism.measure_gait_spread([walk(90)], seconds=0.0)
 
 
 def test_gait_is_of_any_frame_rate():
-    slow, fast = (realism.gait_spread([walk(3 * fps, fps=fps)])["speed_m_s"].mean for fps in (30, 60))
+    slow, fast = (realism.measure_gait_spread([walk(3 * fps, fps=fps)])["speed_m_s"].mean for fps in (30, 60))
     assert fast == pytest.approx(slow, rel=1e-6)
     assert walk(180, fps=60).fps == Fraction(60)

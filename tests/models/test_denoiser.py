@@ -153,7 +153,7 @@ def test_a_long_capture_in_pieces_is_one_pass(monkeypatch):
     """Beside the margin; whole turns of the heading are counted on."""
     noisy = capture(400, degrees=5, centimetres=3, turn_rate=2.0)
     whole = tiny_denoiser(drawn=0.1).clean(noisy)
-    monkeypatch.setattr(denoiser, "_PIECE", 100)
+    monkeypatch.setattr(denoiser, "_CHUNK_FRAMES", 100)
     pieces = tiny_denoiser(drawn=0.1).clean(noisy)
     assert whole.root.shape == pieces.root.shape
     assert torch.allclose(pieces.root, whole.root, atol=1e-3)

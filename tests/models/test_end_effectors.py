@@ -7,9 +7,9 @@ import torch
 from helpers import corpus, finite_difference, generator
 from scipy.spatial.transform import Rotation
 
-from mapctl.features import LAYOUT, Place, decode, mirror_features
+from mapctl.features import LAYOUT, GroundPose, decode, mirror_features
 from mapctl.skeleton import CANONICAL
-from priors.refiner.end_effectors import channels, end_effectors
+from priors.refiner.end_effectors import compute_end_effectors, count_channels
 
 JOINTS = ("hips", "head", "leftHand", "rightToes")
 
@@ -36,39 +36,42 @@ def by_positions(features, joints, start):
 @pytest.mark.parametrize("number", [0, 1, 4])
 def test_they_are_positions_and_velocities_in_the_heading_frame_wherever_the_motion_stands(number):
     features = clip(number=number)
-    found = end_effectors(features[None], JOINTS)[0]
-    assert found.shape == (39, channels(JOINTS))
-    for place in (Place.origin(), Place(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
+    found = compute_end_effectors(features[None], JOINTS)[0]
+    assert found.shape == (39, count_channels(JOINTS))
+    for place in (GroundPose.origin(), GroundPose(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
         torch.testing.assert_close(found, by_positions(features, JOINTS, place), atol=1e-9, rtol=0)
 
 
 def test_the_fast_path_gives_the_same_in_float32():
     features = torch.stack([clip(number=k) for k in range(5)])
     torch.testing.assert_close(
-        end_effectors(features.float(), JOINTS).double(), end_effectors(features, JOINTS), atol=3e-4, rtol=0
+        compute_end_effectors(features.float(), JOINTS).double(),
+        compute_end_effectors(features, JOINTS),
+        atol=3e-4,
+        rtol=0,
     )
 
 
 def test_a_frame_depends_on_itself_and_the_one_before_only():
     """And of the one before on its pose alone: that it turned or went on to get there shows nowhere."""
     features = clip()[None]
-    found = end_effectors(features, JOINTS)
-    torch.testing.assert_close(end_effectors(features[:, 17:19], JOINTS)[0, 0], found[0, 17], atol=1e-9, rtol=0)
+    found = compute_end_effectors(features, JOINTS)
+    torch.testing.assert_close(compute_end_effectors(features[:, 17:19], JOINTS)[0, 0], found[0, 17], atol=1e-9, rtol=0)
     moved = features.clone()
     for block in ("root_displacement_heading", "heading_change"):
         moved[:, 0, LAYOUT.slices[block]] += 0.7
-    torch.testing.assert_close(end_effectors(moved, JOINTS), found, atol=1e-9, rtol=0)
+    torch.testing.assert_close(compute_end_effectors(moved, JOINTS), found, atol=1e-9, rtol=0)
 
 
 def test_a_body_that_stands_has_no_velocity_and_one_that_turns_on_the_spot_keeps_its_place():
     still = clip(1)[None].expand(1, 10, -1).clone()
     still[..., LAYOUT.slices["root_displacement_heading"]] = 0
     still[..., LAYOUT.slices["heading_change"]] = 0
-    found = end_effectors(still, JOINTS)
-    assert float(found[..., channels(JOINTS) // 2 :].abs().max()) < 1e-12
+    found = compute_end_effectors(still, JOINTS)
+    assert float(found[..., count_channels(JOINTS) // 2 :].abs().max()) < 1e-12
     still[..., LAYOUT.slices["heading_change"]] = 0.1
-    turning = end_effectors(still, JOINTS)
-    places = slice(0, channels(JOINTS) // 2)
+    turning = compute_end_effectors(still, JOINTS)
+    places = slice(0, count_channels(JOINTS) // 2)
     torch.testing.assert_close(turning[..., places], found[..., places], atol=1e-9, rtol=0)
     reach = turning[0, 0, 6:9][[0, 2]].norm()  # of the left hand, along the chord of 0.1 rad
     assert float(turning[0, 0, 18:21].norm()) == pytest.approx(30 * 2 * math.sin(0.05) * float(reach), rel=1e-6)
@@ -76,8 +79,8 @@ def test_a_body_that_stands_has_no_velocity_and_one_that_turns_on_the_spot_keeps
 
 def test_a_mirrored_motion_shows_the_mirror_image():
     features = clip(number=2)[None]
-    found = end_effectors(features, ("leftHand", "rightFoot")).unflatten(-1, (2, 2, 3))
-    mirrored = end_effectors(mirror_features(features), ("rightHand", "leftFoot")).unflatten(-1, (2, 2, 3))
+    found = compute_end_effectors(features, ("leftHand", "rightFoot")).unflatten(-1, (2, 2, 3))
+    mirrored = compute_end_effectors(mirror_features(features), ("rightHand", "leftFoot")).unflatten(-1, (2, 2, 3))
     torch.testing.assert_close(mirrored * torch.tensor([-1.0, 1.0, 1.0]), found, atol=1e-9, rtol=0)
 
 
@@ -85,16 +88,16 @@ def test_contact_bits_do_not_show():
     features = clip()[None]
     other = features.clone()
     other[..., LAYOUT.slices["contacts"]] = 1 - other[..., LAYOUT.slices["contacts"]]
-    assert torch.equal(end_effectors(other, JOINTS), end_effectors(features, JOINTS))
+    assert torch.equal(compute_end_effectors(other, JOINTS), compute_end_effectors(features, JOINTS))
 
 
 def test_the_gradient_is_the_slope():
     features = clip(8)[None]
-    shape = end_effectors(features, JOINTS).shape
+    shape = compute_end_effectors(features, JOINTS).shape
     weight = torch.randn(shape, generator=generator(1), dtype=torch.float64)
 
     def value(at):
-        return (weight * end_effectors(at, JOINTS)).sum()
+        return (weight * compute_end_effectors(at, JOINTS)).sum()
 
     at = features.clone().requires_grad_()
     (slope,) = torch.autograd.grad(value(at), at)
@@ -107,9 +110,9 @@ def test_the_gradient_is_the_slope():
 
 def test_the_fast_paths_gradient_is_the_same():
     features = torch.stack([clip(20, number=k) for k in range(3)])
-    weight = torch.randn(3, 19, channels(JOINTS), generator=generator(1), dtype=torch.float64)
+    weight = torch.randn(3, 19, count_channels(JOINTS), generator=generator(1), dtype=torch.float64)
     slopes = []
     for at in (features.clone().requires_grad_(), features.float().requires_grad_()):
-        (slope,) = torch.autograd.grad((weight.to(at.dtype) * end_effectors(at, JOINTS)).sum(), at)
+        (slope,) = torch.autograd.grad((weight.to(at.dtype) * compute_end_effectors(at, JOINTS)).sum(), at)
         slopes.append(slope.double())
     torch.testing.assert_close(slopes[1], slopes[0], atol=float(1e-4 * slopes[0].abs().max()), rtol=0)

@@ -9,7 +9,7 @@ import torch
 from numba import njit
 
 from mapctl.numerics import jit
-from mapctl.protocols import Plan
+from mapctl.protocols import DiscreteChoices
 from priors.lstm_gmm.fast import kernels
 from priors.lstm_gmm.fast.rollout import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
@@ -36,7 +36,7 @@ def make(width: int, batch: int, components: int = 5, *, frames: int = FRAMES, k
     return model.to(kind), LstmState(previous.to(kind), hidden.to(kind), cell.to(kind)), noise.to(kind)
 
 
-def gradients(engine: LstmGmm | FastRollout, state: LstmState, noise: torch.Tensor, plan: Plan):
+def gradients(engine: LstmGmm | FastRollout, state: LstmState, noise: torch.Tensor, plan: DiscreteChoices):
     """Features, densities and the gradient of a random functional of both on the noise and on the state."""
     generator = torch.Generator().manual_seed(5)
     noise = noise.clone().requires_grad_()
@@ -64,7 +64,9 @@ def test_rollout_and_pullback_agree_with_the_reference(width, batch, components)
 def test_long_window_of_any_plan_agrees_in_energy_and_gradient():
     model, state, noise = make(40, 2, frames=100)
     generator = torch.Generator().manual_seed(1)
-    plan = Plan(torch.randint(5, (2, 100), generator=generator), torch.rand(2, 100, 2, generator=generator) < 0.5)
+    plan = DiscreteChoices(
+        torch.randint(5, (2, 100), generator=generator), torch.rand(2, 100, 2, generator=generator) < 0.5
+    )
     assert plan.component.unique().numel() == 5
     for ours, theirs in zip(
         gradients(FastRollout(model), state, noise, plan), gradients(model, state, noise, plan), strict=True
@@ -84,7 +86,7 @@ def test_gradient_matches_finite_differences_of_the_reference_in_float64():
         assert float((gradient * direction).sum()) == pytest.approx((plus - minus) / (2 * step), rel=1e-4)
 
 
-def _functional(model: LstmGmm, state: LstmState, noise: torch.Tensor, plan: Plan) -> float:
+def _functional(model: LstmGmm, state: LstmState, noise: torch.Tensor, plan: DiscreteChoices) -> float:
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         parts = model.rollout(state, noise, plan)
@@ -119,7 +121,7 @@ def test_particles_do_not_touch_each_other():
     plan = fast.plan(state, noise)
     together = gradients(fast, state, noise, plan)[0]
     alone = LstmState(state.previous[2:3], state.hidden[:, 2:3], state.cell[:, 2:3])
-    single, _ = fast.rollout(alone, noise[2:3], Plan(plan.component[2:3], plan.contacts[2:3]))
+    single, _ = fast.rollout(alone, noise[2:3], DiscreteChoices(plan.component[2:3], plan.contacts[2:3]))
     assert torch.allclose(single[0], together[2], rtol=1e-5, atol=1e-5)
 
 
@@ -163,7 +165,7 @@ def test_a_plan_that_does_not_fit_is_refused():
     fast = FastRollout(model)
     plan = fast.plan(state, noise)
     with pytest.raises(ValueError, match="outside 0 to 4"):
-        fast.rollout(state, noise, Plan(plan.component + 5, plan.contacts))
+        fast.rollout(state, noise, DiscreteChoices(plan.component + 5, plan.contacts))
     with pytest.raises(ValueError, match="particles and frames"):
         fast.rollout(state, noise[:, :5], plan)
     with pytest.raises(ValueError, match="65 values a frame"):
@@ -198,7 +200,7 @@ def test_kernels_compile_where_nothing_can_be_kept(monkeypatch):
         return real(**options)
 
     monkeypatch.setattr(jit, "njit", nowhere_to_write)
-    entry, _ = jit.compilers("contract")
+    entry, _ = jit.make_jit_decorators("contract")
     assert entry(lambda x: x + 1)(1) == 2
     assert True in asked
 

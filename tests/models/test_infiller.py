@@ -11,7 +11,7 @@ from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infill
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
-from mapctl.inbetweening.position_image import mirrored_places
+from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
@@ -118,10 +118,10 @@ def test_what_it_proposes_for_the_mirror_image_is_the_mirror_image():
     """Its network alone does not: a left step is not a right one to it."""
     infiller, image = tiny_infiller(drawn=DRAWN), holed()
     there, here = infiller.propose(image.mirrored()), infiller.propose(image)
-    assert torch.allclose(there.places, mirrored_places(here.places), atol=1e-5)
+    assert torch.allclose(there.places, mirror_positions(here.places), atol=1e-5)
     assert torch.allclose(there.contacts, here.contacts.flip(-1), atol=1e-5)
     alone = infiller.network(image.mirrored()).places
-    assert not torch.allclose(alone, mirrored_places(infiller.network(image).places), atol=1e-3)
+    assert not torch.allclose(alone, mirror_positions(infiller.network(image).places), atol=1e-3)
     assert torch.equal(here.places[image.known], image.places[image.known])
 
 

@@ -13,9 +13,9 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training.corpus import Corpus
-from priors.training.initial_states import choose
+from priors.training.initial_states import select_initial_states
 from priors.training.moment_matching import MatchingSettings
-from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings, statistics
+from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings, compute_feature_statistics
 
 CLIPS = ("set_walk_glad_1.bvh", "set_turn-left_glad_2.bvh", "set_turn-right_old_3.bvh", "set_run_old_4.bvh", "odd.bvh")
 PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"
@@ -63,7 +63,7 @@ def test_labels_renamed_keep_what_both_know():
 
 
 def told_network() -> LstmGmm:
-    mean, std = statistics(corpus().features)
+    mean, std = compute_feature_statistics(corpus().features)
     torch.manual_seed(0)
     return LstmGmm(LstmGmmConfig(width=8, components=2, labels=("gait=run", "style=old")), mean=mean, std=std)
 
@@ -85,8 +85,8 @@ def test_half_of_the_windows_are_told_nothing_and_none_more_than_is_known():
     data = corpus(5)
     known = Labels(("gait=walk", "style=old"), torch.tensor([[1.0, 1.0]] * 5))
     settings = TrainingSettings(steps=1, batch=2000, window=6, matching=MatchingSettings(begin=1.0))
-    trainer = Trainer(LstmGmmConfig(width=8, components=1, labels=known.names), settings, data, labels=known)
-    _, told = trainer._windows()
+    trainer = DensityTrainer(LstmGmmConfig(width=8, components=1, labels=known.names), settings, data, labels=known)
+    _, told = trainer._sample_windows()
     silent = float((told.sum(-1) == 0).double().mean())
     assert pytest.approx(silent, abs=0.04) == 0.5 + 0.5 * 0.09
     assert {tuple(row) for row in told.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}
@@ -95,9 +95,9 @@ def test_half_of_the_windows_are_told_nothing_and_none_more_than_is_known():
 def labelled_density() -> LstmGmmDensity:
     model, data = told_network(), corpus(4)
     names = ("a_run_old_1", "a_walk_old_2", "a_walk_new_3", "a_run_new_4")
-    found = choose(model, replace(data, names=names), count=4, generator=generator())
+    found = select_initial_states(model, replace(data, names=names), count=4, generator=generator())
     pattern = r"_(?P<gait>run)?(walk)?_(?P<style>old)?"
-    card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.of_layout())
+    card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.layout_fields())
     return LstmGmmDensity("named", model, found, card, use_fast=False)
 
 
@@ -139,11 +139,11 @@ def test_the_fast_path_is_told_too():
 
 def test_starts_weigh_as_much_as_the_data_has_of_their_speed():
     data, model = corpus(5), told_network()
-    found = choose(model, data, count=5, generator=generator())
+    found = select_initial_states(model, data, count=5, generator=generator())
     assert float(found.weight.sum()) == pytest.approx(1)
     assert found.weight.tolist() == pytest.approx([0.2] * 5)  # each walk has a speed of its own, and all are as long
     longer = Corpus(
         data.names, (*data.lengths[:-1], data.lengths[-1] + 100), torch.cat([data.features, data.features[-100:]])
     )
-    weight = choose(model, longer, count=5, generator=generator()).weight
+    weight = select_initial_states(model, longer, count=5, generator=generator()).weight
     assert sorted(weight.tolist()) == pytest.approx([1 / 6] * 4 + [2 / 6])

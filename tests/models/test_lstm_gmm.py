@@ -7,7 +7,7 @@ from helpers import corpus, finite_difference, generator, noise, tiny_density
 from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, MultivariateNormal
 
 from mapctl.features import LAYOUT
-from mapctl.protocols import Plan
+from mapctl.protocols import DiscreteChoices
 from priors.lstm_gmm.network import LstmState
 
 SIZE = LAYOUT.continuous
@@ -74,7 +74,9 @@ def test_a_rollout_scores_its_component_which_is_part_of_the_mixture(kind):
     assert torch.equal(plan.contacts, mixture.contact_logit > 0)
     # Of one noise, the components' densities differ by their weights and sigmas alone.
     draws = noise(2, 8, dtype=torch.float64)
-    plans = [Plan(torch.full_like(plan.component, k), plan.contacts) for k in range(network.config.components)]
+    plans = [
+        DiscreteChoices(torch.full_like(plan.component, k), plan.contacts) for k in range(network.config.components)
+    ]
     parts = [network.rollout(state, draws, each) for each in plans]
     first = torch.stack([density[:, 0] for _, density in parts])
     expected = mixture.log_weight[:, 0].T
@@ -110,7 +112,7 @@ def test_a_state_advanced_by_frames_continues_their_rollout(kind):
     draws, plan, frames, density = rolled(network, state)
     later = network.advance(state, frames[:, :5])
     torch.testing.assert_close(network.log_prob(frames[:, 5:], later), network.log_prob(frames, state)[:, 5:])
-    rest, scores = network.rollout(later, draws[:, 5:], Plan(plan.component[:, 5:], plan.contacts[:, 5:]))
+    rest, scores = network.rollout(later, draws[:, 5:], DiscreteChoices(plan.component[:, 5:], plan.contacts[:, 5:]))
     torch.testing.assert_close((rest, scores), (frames[:, 5:], density[:, 5:]))
     again = network.plan(later, draws[:, 5:])
     assert torch.equal(again.component, plan.component[:, 5:])
@@ -163,7 +165,7 @@ def test_without_a_say_of_the_network_the_mean_is_the_clamped_share_of_the_last_
         network.out.weight.zero_()
         network.out.bias.zero_()
     previous = network.mean + network.std * torch.linspace(-9, 9, LAYOUT.size).double()
-    plan = Plan(torch.zeros(1, 1, dtype=torch.long), torch.zeros(1, 1, 2, dtype=torch.bool))
+    plan = DiscreteChoices(torch.zeros(1, 1, dtype=torch.long), torch.zeros(1, 1, 2, dtype=torch.bool))
     frames, _ = network.rollout(network.initial_state(previous[None]), torch.zeros(1, 1, SIZE).double(), plan)
     expected = 0.9 * torch.linspace(-9, 9, LAYOUT.size).double().clamp(-5, 5)
     torch.testing.assert_close(network.normalise(frames)[0, 0, :SIZE], expected[:SIZE])
@@ -206,7 +208,7 @@ def test_at_temperature_zero_only_the_discrete_choices_are_drawn():
     network = NETWORKS["one"]
     state = warm(network)
     drawn, _ = network.sample(state, 6, generator(1), temperature=0.0)
-    plan = Plan(torch.zeros(2, 6, dtype=torch.long), drawn[..., SIZE:] > 0.5)
+    plan = DiscreteChoices(torch.zeros(2, 6, dtype=torch.long), drawn[..., SIZE:] > 0.5)
     torch.testing.assert_close(network.rollout(state, torch.zeros(2, 6, SIZE).double(), plan)[0], drawn)
 
 

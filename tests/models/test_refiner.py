@@ -15,7 +15,7 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
 from priors import checkpoints
 from priors.refiner import network as refiners
-from priors.refiner.end_effectors import channels
+from priors.refiner.end_effectors import count_channels
 from priors.refiner.network import LstmRefiner, RefinerConfig, RefinerNetwork
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
@@ -28,7 +28,7 @@ walks = cache(corpus)
 def network_of(config=TINY, *, trained=True, scale=1.0):
     """In float64, with the statistics of the walks; `trained` draws the last layer, which is zero at first."""
     features = walks().features
-    reach = torch.linspace(-0.5, 0.5, channels(config.joints))
+    reach = torch.linspace(-0.5, 0.5, count_channels(config.joints))
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = RefinerNetwork(
@@ -45,7 +45,7 @@ def network_of(config=TINY, *, trained=True, scale=1.0):
 
 
 def refiner_of(config=TINY, **how):
-    card = checkpoints.Card("refiner", config.as_card(), licence="none", **checkpoints.Card.of_layout())
+    card = checkpoints.Card("refiner", config.as_card(), licence="none", **checkpoints.Card.layout_fields())
     return LstmRefiner("tiny", network_of(config, **how), card)
 
 
@@ -100,7 +100,7 @@ def test_pieces_of_any_sizes_give_the_whole(sizes, lookahead, piece):
     features = clips(100).repeat(1, 2, 1)[:, : sum(sizes)]
     pieces = features.split(sizes, dim=1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refiners, "_PIECE", piece)
+        patch.setattr(refiners, "_CHUNK_FRAMES", piece)
         streamed = list(refiner.stream(pieces))
     if not features.shape[1]:
         assert streamed == []

@@ -8,7 +8,7 @@ from helpers import tiny_density, walk
 from mapctl.features import encode
 from mapctl.solver.budget import Budget
 from priors.lstm_gmm.network import LstmState
-from priors.lstm_gmm.state_inference import BeginningSettings, likely_state
+from priors.lstm_gmm.state_inference import StateInferenceSettings, infer_lstm_state
 
 
 @cache
@@ -41,7 +41,7 @@ def prior(state):
 
 def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_one():
     first = frames()[:10]
-    found = tiny().likely_state(frames())
+    found = tiny().infer_state(frames())
     assert nats(found, first) > nats(tiny().initial_state(first[:1]), first) + 10
     known = tiny().starts.state
     for row in range(known.batch):
@@ -51,7 +51,7 @@ def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_o
 
 
 def test_the_same_frames_give_the_same_state():
-    one, other = (tiny().likely_state(frames()) for _ in range(2))
+    one, other = (tiny().infer_state(frames()) for _ in range(2))
     assert torch.equal(one.hidden, other.hidden)
     assert torch.equal(one.cell, other.cell)
     assert torch.equal(one.previous, frames()[:1])
@@ -59,21 +59,21 @@ def test_the_same_frames_give_the_same_state():
 
 def test_without_a_search_it_is_the_best_of_the_known_ones():
     known = tiny().starts.state
-    found = likely_state(tiny().reference, known, frames(), BeginningSettings(budget=Budget(evaluations=1)))
+    found = infer_lstm_state(tiny().reference, known, frames(), StateInferenceSettings(budget=Budget(evaluations=1)))
     apart = (known.hidden - found.hidden).abs().amax(dim=(0, 2))
     assert float(apart.min()) < 1e-5
 
 
 def test_short_motions_and_one_known_state_will_do():
     for count in (1, 2, 5):
-        state = tiny().likely_state(frames()[:count])
+        state = tiny().infer_state(frames()[:count])
         assert state.batch == 1
         assert bool(torch.isfinite(state.cell).all())
     one = tiny().starts.state.pick(torch.tensor([0]))
-    assert bool(torch.isfinite(likely_state(tiny().reference, one, frames()).hidden).all())
+    assert bool(torch.isfinite(infer_lstm_state(tiny().reference, one, frames()).hidden).all())
 
 
 def test_only_the_first_frames_count():
     later = frames().clone()
     later[10:] += 1.0
-    assert torch.equal(tiny().likely_state(later).hidden, tiny().likely_state(frames()).hidden)
+    assert torch.equal(tiny().infer_state(later).hidden, tiny().infer_state(frames()).hidden)

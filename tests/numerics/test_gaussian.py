@@ -12,14 +12,14 @@ LINE = torch.linspace(0, 3, 40, dtype=torch.float64)
 
 
 def test_weights_are_the_gaussian_of_the_frames_between():
-    weight = gaussian.weights(5, 2.0, torch.float64)
+    weight = gaussian.pairwise_weights(5, 2.0, torch.float64)
     assert float(weight[1, 4]) == pytest.approx(math.exp(-9 / 8))
     assert torch.equal(weight, weight.T)
     assert torch.equal(weight.diagonal(), torch.ones(5, dtype=torch.float64))
 
 
 def test_averages_keep_what_is_constant_to_the_very_ends():
-    weight = gaussian.averaging(12, 3.0, torch.float32)
+    weight = gaussian.averaging_matrix(12, 3.0, torch.float32)
     assert weight.dtype == torch.float32
     torch.testing.assert_close(weight.sum(dim=-1), torch.ones(12))
 
@@ -27,22 +27,22 @@ def test_averages_keep_what_is_constant_to_the_very_ends():
 def test_a_kernel_adds_up_to_one_and_keeps_lines_inside():
     kernel = gaussian.kernel(2.0, 6)
     assert (len(kernel), float(kernel.sum()), int(kernel.argmax())) == (13, pytest.approx(1), 6)
-    torch.testing.assert_close(gaussian.convolved(LINE, kernel, "nothing")[6:-6], LINE[6:-6])
+    torch.testing.assert_close(gaussian.convolve(LINE, kernel, "nothing")[6:-6], LINE[6:-6])
 
 
 def test_matrix_and_kernel_say_the_same():
     values = torch.randn(60, 2, 3, generator=generator(), dtype=torch.float64)
     kernel = gaussian.kernel(1.5, 12)
-    wanted = torch.einsum("ts,sjc->tjc", gaussian.averaging(60, 1.5, values.dtype), values)
-    torch.testing.assert_close(gaussian.convolved(values, kernel, "nothing")[12:-12], wanted[12:-12])
-    known = gaussian.convolved(torch.ones_like(values), kernel, "nothing")
-    torch.testing.assert_close(gaussian.convolved(values, kernel, "nothing") / known, wanted)
+    wanted = torch.einsum("ts,sjc->tjc", gaussian.averaging_matrix(60, 1.5, values.dtype), values)
+    torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing")[12:-12], wanted[12:-12])
+    known = gaussian.convolve(torch.ones_like(values), kernel, "nothing")
+    torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing") / known, wanted)
 
 
 @pytest.mark.parametrize("frames", [1, 5])
 def test_beyond_the_ends_the_outermost_frame_goes_on(frames):
     """For motions shorter than the kernel too."""
     level = torch.full((frames, 2), 3.0)
-    found = gaussian.convolved(level, gaussian.kernel(2.0, 6), "repeated")
+    found = gaussian.convolve(level, gaussian.kernel(2.0, 6), "repeated")
     torch.testing.assert_close(found, level)
-    assert gaussian.convolved(level, gaussian.kernel(2.0, 6), "nothing").max() < 3
+    assert gaussian.convolve(level, gaussian.kernel(2.0, 6), "nothing").max() < 3

@@ -13,7 +13,7 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, encode
 from mapctl.problem import density_selection
 from mapctl.rotations import from_rotation_vector, multiply
-from priors.training.recipes.lstm_gmm import window_nats
+from priors.training.recipes.lstm_gmm import compute_window_nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Flat:
     nats: float
     """Of a frame, normalised units."""
     feature_std: torch.Tensor
-    usual_nats: float = 0.0
+    reference_log_density: float = 0.0
 
     def initial_state(self, previous):
         return None
@@ -45,8 +45,8 @@ def tiny():
 def test_densities_are_compared_in_physical_units():
     """The narrower statistics are worth their logarithm; those of the contact bits count for neither."""
     wide, narrow = flat("wide", 0.0), flat("narrow", -10.0, std=0.5)
-    assert density_selection.likeliest_of_motion([wide, narrow], walk(20)).density is narrow
-    found = density_selection.likeliest_of_motion([wide, narrow], walk(20)).nats
+    assert density_selection.select_density_for_motion([wide, narrow], walk(20)).density is narrow
+    found = density_selection.select_density_for_motion([wide, narrow], walk(20)).nats
     assert found == pytest.approx({"wide": 0.0, "narrow": -10 + LAYOUT.continuous * math.log(2)}, rel=1e-5)
 
 
@@ -62,36 +62,36 @@ def test_other_units_of_the_network_change_nothing():
             return (-0.5 * (white / spread).square() - spread.log()).sum(-1)
 
     densities = [Gaussian(f"{std}", 0.0, torch.full((LAYOUT.size,), std)) for std in (0.5, 3.0)]
-    nats = density_selection.likeliest_of_motion(densities, walk(20)).nats
+    nats = density_selection.select_density_for_motion(densities, walk(20)).nats
     assert nats["0.5"] == pytest.approx(nats["3.0"], rel=1e-5)
 
 
 def test_any_rate_will_do_and_too_little_is_refused():
     densities = [flat("a", 1.0), flat("b", 2.0)]
-    assert density_selection.likeliest_of_motion(densities, walk(40, fps=120)).density.name == "b"
+    assert density_selection.select_density_for_motion(densities, walk(40, fps=120)).density.name == "b"
     with pytest.raises(MapctlError, match="at least two frames"):
-        density_selection.likeliest_of_motion(densities, walk(2, fps=120))
+        density_selection.select_density_for_motion(densities, walk(2, fps=120))
     with pytest.raises(RequestError, match="no density"):
-        density_selection.likeliest_of_motion([], walk(20))
+        density_selection.select_density_for_motion([], walk(20))
 
 
 def test_a_density_without_a_finite_answer_is_never_chosen():
-    choice = density_selection.likeliest_of_motion([flat("lost", math.nan), flat("bad", -1e4)], walk(20))
+    choice = density_selection.select_density_for_motion([flat("lost", math.nan), flat("bad", -1e4)], walk(20))
     assert choice.density.name == "bad"
-    lost = density_selection.likeliest_of_motion([flat("lost", math.nan)], walk(20))
+    lost = density_selection.select_density_for_motion([flat("lost", math.nan)], walk(20))
     assert 0 < lost.weight < 1e-3
 
 
 @pytest.mark.parametrize(("lacking", "weight"), [(-50.0, 1.0), (0.0, 1.0), (33.0, 0.5), (99.0, 0.25)])
 def test_the_weight_falls_with_what_is_lacking(lacking, weight):
-    assert density_selection.likeliest_of_motion([flat("a", 0.0, usual=lacking)], walk(20)).weight == pytest.approx(
-        weight
-    )
+    assert density_selection.select_density_for_motion(
+        [flat("a", 0.0, usual=lacking)], walk(20)
+    ).weight == pytest.approx(weight)
 
 
 def test_a_card_that_does_not_say_what_is_usual_leaves_the_weight():
-    assert tiny().usual_nats == -math.inf
-    assert density_selection.likeliest_of_motion([tiny()], walk(20)).weight == 1.0
+    assert tiny().reference_log_density == -math.inf
+    assert density_selection.select_density_for_motion([tiny()], walk(20)).weight == 1.0
 
 
 def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
@@ -99,7 +99,9 @@ def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
     turns = 0.3 * torch.randn(*motion.local_quat_xyzw.shape[:2], 3, generator=generator(), dtype=torch.float64)
     twisted = replace(motion, local_quat_xyzw=multiply(motion.local_quat_xyzw, from_rotation_vector(turns)))
     name = tiny().name
-    plain, other = (density_selection.likeliest_of_motion([tiny()], each).nats[name] for each in (motion, twisted))
+    plain, other = (
+        density_selection.select_density_for_motion([tiny()], each).nats[name] for each in (motion, twisted)
+    )
     assert plain > other + 10
 
 
@@ -107,11 +109,11 @@ def test_blur_widens_the_density_and_nothing_widens_it_by_nothing():
     features = encode(walk(40))[0].float()[None]
     state = tiny().initial_state(features[:, 0])
     sharp = tiny().log_prob(features[:, 1:], state)
-    none = tiny().blurred(torch.zeros(LAYOUT.continuous)).log_prob(features[:, 1:], state)
+    none = tiny().with_observation_noise(torch.zeros(LAYOUT.continuous)).log_prob(features[:, 1:], state)
     assert torch.allclose(none, sharp, rtol=1e-4)
     away = features.clone()
     away[..., 10] += 0.3  # radians, far beyond what the walks show
-    blurs = [tiny().blurred(times * density_selection.spread()) for times in (1, 30)]
+    blurs = [tiny().with_observation_noise(times * density_selection.proposal_sigma()) for times in (1, 30)]
     costs = [
         float((density.log_prob(features[:, 1:], state) - density.log_prob(away[:, 1:], state)).mean())
         for density in (tiny(), *blurs)
@@ -123,7 +125,7 @@ def test_a_blurred_density_is_that_of_a_sum():
     """Of one Gaussian with independent values: its variances and those of the errors add up."""
     density = tiny_density(components=1)
     features = encode(walk(12))[0].float()[None]
-    state, spread = density.initial_state(features[:, 0]), 3 * density_selection.spread()
+    state, spread = density.initial_state(features[:, 0]), 3 * density_selection.proposal_sigma()
     model = density.reference
     with torch.no_grad():
         mixture, _ = model(model.normalise(features[:, :-1]), (state.hidden, state.cell))
@@ -133,15 +135,17 @@ def test_a_blurred_density_is_that_of_a_sum():
         wanted = torch.distributions.Normal(0.0, sigma).log_prob(error).sum(-1)
         signed = torch.where(features[:, 1:, size:] > 0.5, mixture.contact_logit, -mixture.contact_logit)
         wanted = wanted + torch.nn.functional.logsigmoid(signed).sum(-1)
-    assert torch.allclose(density.blurred(spread).log_prob(features[:, 1:], state), wanted, rtol=1e-4)
+    assert torch.allclose(density.with_observation_noise(spread).log_prob(features[:, 1:], state), wanted, rtol=1e-4)
 
 
 def test_what_windows_of_its_own_data_reach_is_below_their_mean():
-    found = window_nats(tiny().reference, [corpus(4, 120)])
+    found = compute_window_nats(tiny().reference, [corpus(4, 120)])
     assert found["p2"] <= found["mean"]
     name, walked = (
         tiny().name,
-        density_selection.likeliest_of_motion([tiny().blurred(density_selection.spread())], walk(100)),
+        density_selection.select_density_for_motion(
+            [tiny().with_observation_noise(density_selection.proposal_sigma())], walk(100)
+        ),
     )
     assert abs(walked.nats[name] - found["mean"]) < 30
 
@@ -151,4 +155,4 @@ def test_what_a_prior_option_leaves_to_choose_from():
     assert [density.name for density in priors.load_choice("locomotion-live")] == ["locomotion-live"]
     bundled = priors.load_choice("auto")
     assert [density.name for density in bundled] == ["locomotion", "general"]
-    assert all(100 < density.usual_nats < density.card.quality["windows"]["mean"] for density in bundled)
+    assert all(100 < density.reference_log_density < density.card.quality["windows"]["mean"] for density in bundled)

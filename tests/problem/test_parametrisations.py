@@ -5,13 +5,13 @@ import torch
 from catalogue import excite
 from helpers import corpus, finite_difference, generator, noise, tiny_model, walk
 
-from mapctl.features import LAYOUT, Place
-from mapctl.problem.context import Context
-from mapctl.problem.feature_states import States
-from mapctl.problem.latent_noise import Latents
+from mapctl.features import LAYOUT, GroundPose
+from mapctl.problem.context import WindowContext
+from mapctl.problem.feature_states import FeatureStates
+from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
-from mapctl.protocols import Plan
-from mapctl.terms import Footing, Likelihood, Noise, Seam
+from mapctl.protocols import DiscreteChoices
+from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood
 
 FRAMES, SIZE = 7, LAYOUT.continuous
 
@@ -26,8 +26,8 @@ def context(model):
     """After some frames of a walk, facing anywhere."""
     seen = corpus().clips()[0][None, :30].double()
     state = model.advance(model.initial_state(seen[:, 0]), seen[:, 1:])
-    place = Place(torch.tensor([1.0, -2.0]).double(), torch.tensor(0.8).double())
-    return Context(model, state, place, walk(10).joint_positions(), FRAMES)
+    place = GroundPose(torch.tensor([1.0, -2.0]).double(), torch.tensor(0.8).double())
+    return WindowContext(model, state, place, walk(10).joint_positions(), FRAMES)
 
 
 MODEL = network()
@@ -38,7 +38,7 @@ def states():
     """The states' unknowns around a stretch of a walk."""
     features = corpus().clips()[0][None, 30 : 30 + FRAMES].double()
     bits = LAYOUT.pick(features, "contacts") > 0.5
-    return features, States(CONTEXT, MODEL.std[:SIZE], MODEL.mean[:SIZE], bits)
+    return features, FeatureStates(CONTEXT, MODEL.std[:SIZE], MODEL.mean[:SIZE], bits)
 
 
 def slope(function, at, direction):
@@ -49,7 +49,7 @@ def slope(function, at, direction):
 
 def test_latents_build_the_rollout_of_their_plan():
     draws = noise(3, FRAMES, dtype=torch.float64)
-    latents = Latents.planned(CONTEXT, draws.flatten(1))
+    latents = LatentNoise.from_unknowns(CONTEXT, draws.flatten(1))
     trial = latents.build(draws.flatten(1))
     features, density = MODEL.rollout(CONTEXT.state.repeat(3), draws, latents.plan)
     torch.testing.assert_close((trial.features, trial.log_density), (features, density))
@@ -61,11 +61,11 @@ def test_latents_build_the_rollout_of_their_plan():
 
 def test_one_plan_serves_many_candidates():
     draws = noise(3, FRAMES, dtype=torch.float64)
-    plan = Latents.planned(CONTEXT, draws[:1].flatten(1)).plan
-    together = Latents(CONTEXT, plan).build(draws.flatten(1))
-    assert isinstance(plan, Plan)
+    plan = LatentNoise.from_unknowns(CONTEXT, draws[:1].flatten(1)).plan
+    together = LatentNoise(CONTEXT, plan).build(draws.flatten(1))
+    assert isinstance(plan, DiscreteChoices)
     for row in range(3):
-        alone = Latents(CONTEXT, plan).build(draws[row : row + 1].flatten(1))
+        alone = LatentNoise(CONTEXT, plan).build(draws[row : row + 1].flatten(1))
         torch.testing.assert_close(together.features[row], alone.features[0])
 
 
@@ -93,12 +93,14 @@ def test_the_input_noise_of_states_is_in_units_of_the_papers_sigma():
 def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences(kind):
     if kind == "latents":
         unknowns = 0.5 * noise(2, FRAMES, dtype=torch.float64).flatten(1)
-        objective = Objective(Latents.planned(CONTEXT, unknowns).build, (Noise(), Footing(), Seam()))
+        objective = Objective(
+            LatentNoise.from_unknowns(CONTEXT, unknowns).build, (LatentPrior(), FootContact(), Jerk())
+        )
     else:
         features, variables = states()
         unknowns = variables.from_features(features)
         unknowns = unknowns + 0.1 * torch.randn(unknowns.shape, generator=generator(), dtype=torch.float64)
-        objective = Objective(variables.build, (Likelihood(), Noise(), Footing()))
+        objective = Objective(variables.build, (Likelihood(), LatentPrior(), FootContact()))
     energy, gradient = objective.energy_and_gradient(unknowns)
     direction = torch.randn(unknowns.shape, generator=generator(4), dtype=torch.float64)
     difference = finite_difference(lambda x: objective.energy(x).sum(), unknowns, direction)
@@ -110,9 +112,9 @@ def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences(kind
 
 def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
     unknowns = noise(1, FRAMES, dtype=torch.float64).flatten(1)
-    terms = (Noise(), Footing(), Seam())
-    objective = Objective(Latents.planned(CONTEXT, unknowns).build, terms)
-    ledger = objective.ledger_of(objective.build(unknowns))
+    terms = (LatentPrior(), FootContact(), Jerk())
+    objective = Objective(LatentNoise.from_unknowns(CONTEXT, unknowns).build, terms)
+    ledger = objective.build_ledger(objective.build(unknowns))
     assert [(e.name, e.unit) for e in ledger.entries] == [(t.name, t.unit) for t in terms]
     total = sum(entry.energy.sum() for entry in ledger.entries)
     torch.testing.assert_close(total, objective.energy(unknowns)[0])

@@ -7,36 +7,38 @@ import pytest
 import torch
 from helpers import generator, tiny_density, tiny_model
 
-from controllers.common.initial_state import choose_start
+from controllers.common.initial_state import select_initial_state
 from mapctl import curves
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, root_places
-from mapctl.problem.context import Context
-from mapctl.problem.latent_noise import Latents
+from mapctl.features import LAYOUT, integrate_root
+from mapctl.problem.context import WindowContext
+from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
-from mapctl.problem.receding_horizon import WindowSettings, WindowSolver
+from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Outcome
-from mapctl.problem.warm_start import BestOf, SteeringKnots, Swarm
-from mapctl.problem.window_solvers import LatentMethod, StateMethod
+from mapctl.problem.warm_start import BestOfSamples, SteeringKnots, SwarmProposal
+from mapctl.problem.window_solvers import FeatureStateSolver, LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
-from mapctl.terms import Footing, Likelihood, Noise, Path
+from mapctl.terms import FootContact, LatentPrior, Likelihood, Path
 
 DENSITY = tiny_density()
 CURVE = curves.circle(radius=2.0)
-SHORT = WindowSettings(frames=10, overlap=4, past=12)
-METHOD = LatentMethod(rounds=2, budget=Budget(evaluations=12))
+SHORT = HorizonSettings(frames=10, overlap=4, past=12)
+METHOD = LatentNoiseSolver(rounds=2, budget=Budget(evaluations=12))
 ARCS = 0.04 * torch.arange(80, dtype=torch.float64)
 
 
 def terms_of(first, frames):
-    return Noise(), Path(CURVE, ARCS[first : first + frames]), Footing()
+    return LatentPrior(), Path(CURVE, ARCS[first : first + frames]), FootContact()
 
 
 def start(seed=0):
-    found = choose_start(DENSITY, CURVE, ARCS, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator(seed))
+    found = select_initial_state(
+        DENSITY, CURVE, ARCS, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator(seed)
+    )
     return found.committed
 
 
@@ -44,7 +46,7 @@ BEGUN = start()
 
 
 def solver(method=METHOD, density=DENSITY, settings=SHORT):
-    return WindowSolver(density, settings, method=method)
+    return RecedingHorizonSolver(density, settings, method=method)
 
 
 def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
@@ -52,14 +54,14 @@ def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
 
 
 def context(committed):
-    return Context(DENSITY, committed.state, committed.place, committed.joints_world, SHORT.frames)
+    return WindowContext(DENSITY, committed.state, committed.place, committed.joints_world, SHORT.frames)
 
 
 METHODS = {
     "zero start": METHOD,
-    "best of": replace(METHOD, proposal=BestOf(count=4)),
-    "swarm": replace(METHOD, proposal=Swarm(SwarmSettings(particles=4, iterations=1))),
-    "states": StateMethod(
+    "best of": replace(METHOD, proposal=BestOfSamples(count=4)),
+    "swarm": replace(METHOD, proposal=SwarmProposal(SwarmSettings(particles=4, iterations=1))),
+    "states": FeatureStateSolver(
         DENSITY.feature_std[: LAYOUT.continuous],
         DENSITY.feature_mean[: LAYOUT.continuous],
         budget=Budget(evaluations=12),
@@ -71,7 +73,7 @@ METHODS = {
 def test_a_window_ends_lower_than_it_began_within_its_budget(name):
     terms = (*terms_of(1, SHORT.frames), Likelihood())
     begun = BEGUN
-    solved = METHODS[name](context(begun), terms, begun.tail, generator())
+    solved = METHODS[name](context(begun), terms, begun.warm_start, generator())
     assert solved.energy < solved.start_energy
     assert solved.evaluations <= 12
     assert sum(float(e.energy.sum()) for e in solved.ledger.entries) == pytest.approx(solved.energy, rel=1e-4)
@@ -86,7 +88,7 @@ def test_windows_join_without_a_seam(method):
     assert len(done.features) == 21
     assert [record.frames for record in done.windows] == [6, 6, 6, 2]
     begun = BEGUN
-    ground, heading = root_places(done.features[1:], begun.place)
+    ground, heading = integrate_root(done.features[1:], begun.place)
     torch.testing.assert_close((done.place.position_xz, done.place.heading), (ground[-1], heading[-1]))
     expected = DENSITY.advance(begun.state, done.features[None, 1:])
     for part in ("previous", "hidden", "cell"):
@@ -98,17 +100,19 @@ def test_windows_join_without_a_seam(method):
 
 def test_the_next_window_starts_from_the_last_ones_tail():
     done, _ = solve(7)
-    assert done.tail.shape == (4, LAYOUT.continuous)
-    spent = LatentMethod(rounds=1, budget=Budget(evaluations=0))(context(done), terms_of(7, 10), done.tail, generator())
-    torch.testing.assert_close(spent.carry[:4], done.tail)
+    assert done.warm_start.shape == (4, LAYOUT.continuous)
+    spent = LatentNoiseSolver(rounds=1, budget=Budget(evaluations=0))(
+        context(done), terms_of(7, 10), done.warm_start, generator()
+    )
+    torch.testing.assert_close(spent.carry[:4], done.warm_start)
     assert float(spent.carry[4:].abs().max()) == 0
 
 
 def test_solving_follows_the_curve_better_than_not_solving():
     errors = []
     for budget in (0, 30):
-        done, _ = solve(31, method=LatentMethod(budget=Budget(evaluations=budget)))
-        ground, _ = root_places(done.features[1:], BEGUN.place)
+        done, _ = solve(31, method=LatentNoiseSolver(budget=Budget(evaluations=budget)))
+        ground, _ = integrate_root(done.features[1:], BEGUN.place)
         errors.append(float((ground - CURVE.point(ARCS[1:31]).float()).norm(dim=-1).mean()))
     assert errors[1] < 0.8 * errors[0]
 
@@ -137,7 +141,7 @@ def test_a_deadline_stops_with_what_there_is():
     assert outcome is Outcome.BUDGET
     assert len(done.features) == 1
     late = time.monotonic() + 0.2
-    done, outcome = solve(80, method=LatentMethod(budget=Budget(evaluations=200)), deadline=late)
+    done, outcome = solve(80, method=LatentNoiseSolver(budget=Budget(evaluations=200)), deadline=late)
     assert outcome is Outcome.BUDGET
     assert time.monotonic() - late < 5
     assert 1 < len(done.features) < 80
@@ -145,7 +149,7 @@ def test_a_deadline_stops_with_what_there_is():
 
 
 def test_a_deadline_reaches_into_a_window():
-    endless = LatentMethod(
+    endless = LatentNoiseSolver(
         lbfgs=LbfgsSettings(
             max_iterations=10**6, gradient_tolerance=0.0, relative_energy_tolerance=-1.0, max_trials=10**6
         ),
@@ -210,7 +214,7 @@ def test_a_density_that_breaks_down_ends_the_solve_with_the_finite_frames(after)
 @pytest.mark.parametrize("settings", [{"frames": 10, "overlap": 10}, {"overlap": -1}, {"past": 0}])
 def test_windows_that_never_advance_are_refused(settings):
     with pytest.raises(RequestError, match="windows need"):
-        WindowSettings(**settings)
+        HorizonSettings(**settings)
 
 
 def test_steering_knots_are_linear_in_time_and_touch_only_their_blocks():
@@ -228,8 +232,8 @@ def test_steering_knots_are_linear_in_time_and_touch_only_their_blocks():
 def test_the_warm_start_is_among_the_candidates():
     begun, terms = BEGUN, terms_of(1, SHORT.frames)
     zero = torch.zeros(1, SHORT.frames * LAYOUT.continuous)
-    plain = Objective(Latents.planned(context(begun), zero).build, terms).energy(zero)
+    plain = Objective(LatentNoise.from_unknowns(context(begun), zero).build, terms).energy(zero)
     for name in ("best of", "swarm"):
         method = replace(METHODS[name], rounds=1, budget=Budget(evaluations=100))
-        solved = method(context(begun), terms, begun.tail, generator())
+        solved = method(context(begun), terms, begun.warm_start, generator())
         assert solved.start_energy <= float(plain) + 1e-3

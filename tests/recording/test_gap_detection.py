@@ -9,7 +9,7 @@ from helpers import quat_xyzw
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.recording.gap_detection import find
+from mapctl.recording.gap_detection import find_gaps
 from mapctl.recording.masks import ALL, ROOT, Mask
 
 RIGS = ("canonical", "bandai", "daz")
@@ -32,12 +32,12 @@ def frozen(motion, start, stop):
 @pytest.mark.parametrize("fps", [30, 120])
 def test_a_body_that_freezes_and_goes_on_elsewhere_has_a_gap_there(rig, fps):
     motion = frozen(on_rig(rig, 3 * fps, fps=fps), fps, 2 * fps)
-    assert find(motion) == (Mask(ALL, fps, 2 * fps),)
+    assert find_gaps(motion) == (Mask(ALL, fps, 2 * fps),)
 
 
 def test_two_freezes_are_two_gaps():
     motion = frozen(frozen(on_rig("bandai", 120), 20, 35), 70, 100)
-    assert find(motion) == (Mask(ALL, 20, 35), Mask(ALL, 70, 100))
+    assert find_gaps(motion) == (Mask(ALL, 20, 35), Mask(ALL, 70, 100))
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -48,7 +48,7 @@ def test_a_leap_of_a_joint_is_found(rig):
     quats[44:46, joint] = rotations.multiply(quats[44:46, joint], turn.expand(2, 4))
     leapt = replace(motion, local_quat_xyzw=quats)
     assert apart_deg(leapt.local_quat_xyzw, motion.local_quat_xyzw).max() > 50
-    found = find(leapt)
+    found = find_gaps(leapt)
     assert {mask.joint for mask in found} == {motion.skeleton.names[joint]}
     assert {frame for mask in found for frame in range(mask.start, mask.stop)} >= {44, 45}
 
@@ -57,7 +57,7 @@ def test_a_leap_of_the_place_is_found():
     motion = on_rig("canonical", 90)
     root = motion.root_position.clone()
     root[50:52, 0] += 1.0
-    assert find(replace(motion, root_position=root)) == (Mask(ROOT, 50, 52),)
+    assert find_gaps(replace(motion, root_position=root)) == (Mask(ROOT, 50, 52),)
 
 
 def test_a_frozen_joint_in_a_body_that_moves_is_found():
@@ -65,7 +65,7 @@ def test_a_frozen_joint_in_a_body_that_moves_is_found():
     quats = motion.local_quat_xyzw.clone()
     joint = motion.skeleton.index("leftLowerArm")
     quats[30:50, joint] = quats[29, joint]
-    (mask,) = find(replace(motion, local_quat_xyzw=quats))
+    (mask,) = find_gaps(replace(motion, local_quat_xyzw=quats))
     assert (mask.joint, mask.stop) == ("leftLowerArm", 50)
     assert mask.start in (29, 30)
 
@@ -83,4 +83,4 @@ def test_a_frozen_joint_in_a_body_that_moves_is_found():
 )
 def test_where_nothing_is_wrong_one_is_asked_to_say_what_is(rig, spoil):
     with pytest.raises(RequestError, match=r"say which frames are missing \(--gap A:B\) or which joints"):
-        find(spoil(on_rig(rig, 90)))
+        find_gaps(spoil(on_rig(rig, 90)))

@@ -7,7 +7,7 @@ import torch
 from captures import DEGREE, apart_deg, on_rig, shaken, trembling
 
 from mapctl import rotations
-from mapctl.recording.inspection import examine
+from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import ROOT, Mask
 
 
@@ -29,7 +29,7 @@ def with_quats(motion, frames, joint, quats):
 def test_a_joint_that_stands_still_is_found_and_only_that(motion):
     joint = moving_joint(motion)
     frozen = with_quats(motion, slice(40, 60), joint, motion.local_quat_xyzw[40, joint])
-    found = examine(frozen)
+    found = inspect_recording(frozen)
     wanted = torch.zeros_like(found.dropouts)
     wanted[41:60, joint] = True  # frame 40 is the last that was true
     assert torch.equal(found.dropouts, wanted)
@@ -39,29 +39,29 @@ def test_a_joint_that_stands_still_is_found_and_only_that(motion):
 
 def test_a_run_to_the_end_is_found_too(motion):
     joint = moving_joint(motion)
-    found = examine(with_quats(motion, slice(100, 120), joint, motion.local_quat_xyzw[100, joint]))
+    found = inspect_recording(with_quats(motion, slice(100, 120), joint, motion.local_quat_xyzw[100, joint]))
     assert found.dropouts.nonzero().tolist() == [[frame, joint] for frame in range(101, 120)]
 
 
 def test_two_frames_alike_are_no_loss(motion):
     joint = moving_joint(motion)
-    assert not examine(with_quats(motion, 41, joint, motion.local_quat_xyzw[40, joint])).dropouts.any()
+    assert not inspect_recording(with_quats(motion, 41, joint, motion.local_quat_xyzw[40, joint])).dropouts.any()
 
 
 def test_a_whole_body_that_stands_still_is_no_loss(motion):
     quats = motion.local_quat_xyzw.clone()
     quats[40:60] = quats[40]
-    found = examine(replace(motion, local_quat_xyzw=quats))
+    found = inspect_recording(replace(motion, local_quat_xyzw=quats))
     assert not found.dropouts.any()
 
 
 def test_a_joint_that_never_moves_is_no_loss(motion):
     still = with_quats(motion, slice(None), moving_joint(motion), motion.local_quat_xyzw[0, moving_joint(motion)])
-    assert not examine(still).dropouts.any()
+    assert not inspect_recording(still).dropouts.any()
 
 
 def test_a_clean_recording_is_believed(motion):
-    found = examine(motion)
+    found = inspect_recording(motion)
     assert found.seen.all()
     assert found.seen_root.all()
     assert torch.rad2deg(found.noise).max() < 0.1
@@ -73,7 +73,7 @@ def test_noise_spikes_and_masks_come_together(motion):
     quats = shaken(motion.local_quat_xyzw, 2 * DEGREE)
     quats[70, joint] = rotations.multiply(quats[70, joint], torch.tensor([0.6, 0.0, 0.0, 0.8], dtype=torch.float64))
     name = motion.skeleton.names[moving_joint(motion)]
-    found = examine(replace(motion, local_quat_xyzw=quats), [Mask(name, 10, 20), Mask(ROOT, 5, 6)])
+    found = inspect_recording(replace(motion, local_quat_xyzw=quats), [Mask(name, 10, 20), Mask(ROOT, 5, 6)])
     assert found.spikes.nonzero().tolist() == [[70, joint]]
     assert found.dropouts.nonzero().tolist() == [[frame, joint] for frame in range(10, 20)]
     assert found.dropouts_root.nonzero().tolist() == [[5]]
@@ -86,7 +86,7 @@ def test_gaps_are_filled_between_the_frames_around_them(motion):
     joint = moving_joint(motion)
     name = motion.skeleton.names[joint]
     wild = with_quats(motion, slice(50, 54), joint, shaken(motion.local_quat_xyzw, 2.0)[50:54, joint])
-    repaired = examine(wild, [Mask(name, 50, 54)]).repaired()
+    repaired = inspect_recording(wild, [Mask(name, 50, 54)]).repaired()
     away = apart_deg(repaired.local_quat_xyzw, motion.local_quat_xyzw)
     start, stop = motion.local_quat_xyzw[[49, 54], joint]
     assert away[50:54, joint].max() < apart_deg(start, stop) + 3
@@ -103,14 +103,16 @@ def test_what_masked_frames_show_changes_nothing(motion):
     found = []
     for seed in (1, 2):
         wild = shaken(motion.local_quat_xyzw, 2.0, seed=seed)[50:60, moving_joint(motion)]
-        found.append(examine(with_quats(noisy, slice(50, 60), moving_joint(motion), wild), [Mask(name, 50, 60)]))
+        found.append(
+            inspect_recording(with_quats(noisy, slice(50, 60), moving_joint(motion), wild), [Mask(name, 50, 60)])
+        )
     first, second = found
     assert torch.allclose(first.noise, second.noise)
     assert apart_deg(first.repaired().local_quat_xyzw, second.repaired().local_quat_xyzw).max() < 1e-5
 
 
 def test_slices_are_of_everything_but_the_noise(motion):
-    found = examine(motion, [Mask(ROOT, 30, 50)])
+    found = inspect_recording(motion, [Mask(ROOT, 30, 50)])
     part = found.slice(20, 60)
     assert part.motion.num_frames == 40
     assert torch.equal(part.dropouts_root, found.dropouts_root[20:60])
@@ -123,7 +125,7 @@ def test_the_joint_that_travels_is_the_one_that_moves():
     """Below a static root it is the hips."""
     for rig, joint in (("canonical", 0), ("bandai", 1), ("daz", 0)):
         motion = on_rig(rig, 60)
-        found = examine(motion)
+        found = inspect_recording(motion)
         assert found.travels == joint
         assert torch.diff(found.place(motion), dim=0).norm(dim=-1).sum() > 1
 
@@ -133,7 +135,7 @@ def test_the_place_below_a_static_root_is_judged_and_repaired():
     hips = motion.moving_offsets[1].clone()
     hips[60] += torch.tensor([0.0, 0.0, 1.5], dtype=torch.float64)
     hips[80:84] = 9.0
-    found = examine(replace(motion, moving_offsets={**motion.moving_offsets, 1: hips}), [Mask(ROOT, 80, 84)])
+    found = inspect_recording(replace(motion, moving_offsets={**motion.moving_offsets, 1: hips}), [Mask(ROOT, 80, 84)])
     assert found.spikes_root.nonzero().tolist() == [[60]]
     repaired = found.repaired()
     assert (found.place(repaired) - motion.moving_offsets[1]).norm(dim=-1).max() < 0.02
@@ -143,6 +145,6 @@ def test_the_place_below_a_static_root_is_judged_and_repaired():
 @pytest.mark.parametrize("frames", [1, 2, 3, 6])
 def test_short_recordings_break_nothing(frames):
     motion = on_rig("canonical", 30).slice(0, frames)
-    found = examine(motion)
+    found = inspect_recording(motion)
     assert found.seen.shape == (frames, motion.num_joints)
     assert found.repaired().num_frames == frames

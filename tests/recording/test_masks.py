@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.recording.masks import ALL, ROOT, Mask, load_masks, masked, part_of
+from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, load_masks, slice_masks
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def motion():
 
 
 def test_a_joint_a_place_and_everything(motion):
-    joints, root = masked(motion, [Mask("lHand", 3, 7), Mask(ROOT, 10, 12), Mask(ALL, 20, 21)])
+    joints, root = expand_valid_masks(motion, [Mask("lHand", 3, 7), Mask(ROOT, 10, 12), Mask(ALL, 20, 21)])
     wanted = torch.zeros(40, motion.num_joints, dtype=torch.bool)
     wanted[3:7, motion.skeleton.index("lHand")] = True
     wanted[20] = True
@@ -73,7 +73,7 @@ def test_a_joint_a_place_and_everything(motion):
 
 
 def test_no_masks_hide_nothing(motion):
-    joints, root = masked(motion, [])
+    joints, root = expand_valid_masks(motion, [])
     assert not joints.any()
     assert not root.any()
 
@@ -91,7 +91,7 @@ def test_no_masks_hide_nothing(motion):
 )
 def test_masks_that_do_not_fit_are_refused(motion, masks, message):
     with pytest.raises(RequestError, match=message):
-        masked(motion, masks)
+        expand_valid_masks(motion, masks)
 
 
 spans = st.tuples(st.integers(0, 38), st.integers(1, 40)).filter(lambda span: span[0] < span[1])
@@ -106,6 +106,6 @@ def test_a_part_of_the_masks_hides_what_they_hide_of_the_part(given_masks, span)
         return hidden
 
     masks, (start, stop) = [Mask("j", *pair) for pair in given_masks], span
-    part = part_of(masks, start, stop)
+    part = slice_masks(masks, start, stop)
     assert all(0 <= mask.start < mask.stop <= stop - start for mask in part)
     assert torch.equal(frames(part, stop - start), frames(masks, 40)[start:stop])

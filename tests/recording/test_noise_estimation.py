@@ -7,7 +7,7 @@ import torch
 from captures import DEGREE, shaken, swaying
 from helpers import generator
 
-from mapctl.recording.noise_estimation import angle_noise, place_noise
+from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 
 
 def all_seen(quats):
@@ -15,7 +15,7 @@ def all_seen(quats):
 
 
 def told_deg(quats, seen=None):
-    return torch.rad2deg(angle_noise(quats, all_seen(quats) if seen is None else seen))
+    return torch.rad2deg(estimate_angle_noise(quats, all_seen(quats) if seen is None else seen))
 
 
 def smooth_place(frames):
@@ -35,7 +35,7 @@ def test_white_noise_of_places_is_told(centimetres):
     places = smooth_place(800)
     noisy = places + centimetres / 100 * torch.randn(800, 3, generator=generator(), dtype=torch.float64)
     seen = torch.ones(800, dtype=torch.bool)
-    assert 100 * place_noise(noisy, seen) == pytest.approx(centimetres, rel=0.12)
+    assert 100 * estimate_position_noise(noisy, seen) == pytest.approx(centimetres, rel=0.12)
 
 
 def test_every_joint_has_its_own():
@@ -47,12 +47,12 @@ def test_every_joint_has_its_own():
 
 def test_smooth_motion_without_noise_has_none():
     assert told_deg(swaying(300)).max() < 0.05
-    assert 100 * place_noise(smooth_place(300), torch.ones(300, dtype=torch.bool)) < 0.05
+    assert 100 * estimate_position_noise(smooth_place(300), torch.ones(300, dtype=torch.bool)) < 0.05
 
 
 def test_a_joint_that_never_moves_has_none():
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(100, 2, 4)
-    assert angle_noise(still, all_seen(still)).tolist() == [0, 0]
+    assert estimate_angle_noise(still, all_seen(still)).tolist() == [0, 0]
 
 
 def test_spikes_do_not_upset_it():
@@ -75,10 +75,10 @@ def test_what_is_masked_does_not_matter():
     seen[100:160, 2] = False
     seen[200:205] = False
     wild = torch.where(seen[..., None], clean, shaken(clean, 2.0, seed=9))
-    assert torch.equal(angle_noise(clean, seen), angle_noise(wild, seen))
+    assert torch.equal(estimate_angle_noise(clean, seen), estimate_angle_noise(wild, seen))
     places = smooth_place(400) + 0.01 * torch.randn(400, 3, generator=generator(), dtype=torch.float64)
     thrown = torch.where(seen[:, 0, None], places, 100.0)
-    assert place_noise(places, seen[:, 0]) == place_noise(thrown, seen[:, 0])
+    assert estimate_position_noise(places, seen[:, 0]) == estimate_position_noise(thrown, seen[:, 0])
 
 
 def test_a_joint_seen_now_and_then_is_taken_to_be_as_noisy_as_the_others():
@@ -92,15 +92,18 @@ def test_a_joint_seen_now_and_then_is_taken_to_be_as_noisy_as_the_others():
 
 def test_nothing_is_known_where_nothing_was_seen():
     quats = shaken(swaying(50), 2 * DEGREE)
-    assert angle_noise(quats, torch.zeros(50, 6, dtype=torch.bool)).tolist() == [0] * 6
-    assert place_noise(smooth_place(50), torch.zeros(50, dtype=torch.bool)) == 0
+    assert estimate_angle_noise(quats, torch.zeros(50, 6, dtype=torch.bool)).tolist() == [0] * 6
+    assert estimate_position_noise(smooth_place(50), torch.zeros(50, dtype=torch.bool)) == 0
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_recordings_too_short_to_tell_have_none(frames):
     quats = shaken(swaying(frames), 5 * DEGREE)
-    assert angle_noise(quats, all_seen(quats)).tolist() == [0] * 6
-    assert place_noise(torch.zeros(min(frames, 2), 3, dtype=torch.float64), torch.ones(min(frames, 2)).bool()) == 0
+    assert estimate_angle_noise(quats, all_seen(quats)).tolist() == [0] * 6
+    assert (
+        estimate_position_noise(torch.zeros(min(frames, 2), 3, dtype=torch.float64), torch.ones(min(frames, 2)).bool())
+        == 0
+    )
 
 
 @pytest.mark.parametrize("frames", range(4, 30))
@@ -114,4 +117,4 @@ def test_short_recordings_are_told_of_roughly(frames):
 def test_the_sign_of_a_quaternion_says_nothing():
     quats = shaken(swaying(200), 2 * DEGREE)
     flipped = quats * torch.where(torch.rand(200, 6, 1, generator=generator(5)) < 0.5, -1.0, 1.0)
-    assert torch.allclose(angle_noise(quats, all_seen(quats)), angle_noise(flipped, all_seen(quats)))
+    assert torch.allclose(estimate_angle_noise(quats, all_seen(quats)), estimate_angle_noise(flipped, all_seen(quats)))

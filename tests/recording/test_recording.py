@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import rotations
-from mapctl.recording import Capture, filled, last_seen, next_seen
+from mapctl.recording import Capture, fill_missing, last_observed, next_observed
 from mapctl.skeleton import CANONICAL
 
 masks = st.lists(st.lists(st.booleans(), min_size=9, max_size=9), min_size=1, max_size=3).map(torch.tensor)
@@ -19,7 +19,7 @@ masks = st.lists(st.lists(st.booleans(), min_size=9, max_size=9), min_size=1, ma
 @settings(max_examples=60, deadline=None)
 @given(masks)
 def test_the_nearest_seen_frames_are_those_that_a_loop_finds(seen):
-    before, after = last_seen(seen), next_seen(seen)
+    before, after = last_observed(seen), next_observed(seen)
     for row in range(len(seen)):
         known = [frame for frame in range(9) if seen[row, frame]]
         for frame in range(9):
@@ -33,7 +33,7 @@ def test_the_nearest_seen_frames_are_those_that_a_loop_finds(seen):
 @given(masks)
 def test_gaps_are_filled_straight_as_a_loop_fills_them(seen):
     values = torch.randn(len(seen), 9, 2, generator=generator(), dtype=torch.float64)
-    found = filled(values, seen)
+    found = fill_missing(values, seen)
     for row in range(len(seen)):
         known = [frame for frame in range(9) if seen[row, frame]]
         for frame in range(9):
@@ -48,8 +48,8 @@ def test_gaps_are_filled_straight_as_a_loop_fills_them(seen):
 
 def test_nothing_seen_breaks_nothing():
     nothing = torch.zeros(2, 5, dtype=torch.bool)
-    assert filled(torch.randn(2, 5, 3, generator=generator()), nothing).isfinite().all()
-    assert 0 <= last_seen(nothing).min() <= next_seen(nothing).max() < 5
+    assert fill_missing(torch.randn(2, 5, 3, generator=generator()), nothing).isfinite().all()
+    assert 0 <= last_observed(nothing).min() <= next_observed(nothing).max() < 5
 
 
 def capture_of(motion, seen=None, seen_root=None):
@@ -69,7 +69,7 @@ def test_rotation_vectors_near_a_half_turn_stay_continuous_and_mean_the_same():
     quats = motion.local_quat_xyzw.clone()
     angle = math.pi + 0.5 * torch.sin(torch.arange(60, dtype=torch.float64) / 6)
     quats[:, 5] = quat_xyzw(angle[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64))
-    quats = rotations.sign_continuous(quats)
+    quats = rotations.make_sign_continuous(quats)
     capture = capture_of(type(motion)(motion.skeleton, motion.fps, motion.root_position, quats))
     assert torch.diff(capture.joints[0, :, 4], dim=0).norm(dim=-1).max() < 0.2
     back = rotations.from_rotation_vector(capture.joints[0].double())

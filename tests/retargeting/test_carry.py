@@ -15,7 +15,7 @@ from mapctl import contacts, retarget, rotations
 from mapctl.commands.shared import character
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.motion import Motion
-from mapctl.retarget.carry import Body, _give_in, carry
+from mapctl.retarget.carry import RiggedCharacter, _soft_clamp, retarget_motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
 USUAL = Performer()
@@ -43,7 +43,7 @@ def low_toes(motion: Motion) -> torch.Tensor:
 def planted_speed(motion: Motion) -> float:
     """Of toes over the ground, m/s."""
     toes = motion.joint_positions()[:, TOES]
-    stands = contacts.planted(toes, motion.fps)[1:]
+    stands = contacts.detect_contacts(toes, motion.fps)[1:]
     return float((toes.diff(dim=0)[..., ::2].norm(dim=-1) * float(motion.fps))[stands].mean())
 
 
@@ -51,7 +51,7 @@ def foot_pitch_deg(motion: Motion) -> torch.Tensor:
     """Of the bones from ankles to toe joints, while these stand and the ankles are at their lowest."""
     ankles, toes = motion.joint_positions()[:, FEET], motion.joint_positions()[:, TOES]
     way = toes - ankles
-    flat = contacts.planted(toes, motion.fps) & (ankles[..., 1] < ankles[..., 1].quantile(0.1, dim=0) + 0.005)
+    flat = contacts.detect_contacts(toes, motion.fps) & (ankles[..., 1] < ankles[..., 1].quantile(0.1, dim=0) + 0.005)
     pitch = torch.rad2deg(torch.asin(way[..., 1] / way.norm(dim=-1)))
     return torch.stack([pitch[flat[:, k], k].median() for k in range(2)])
 
@@ -59,7 +59,7 @@ def foot_pitch_deg(motion: Motion) -> torch.Tensor:
 @pytest.mark.parametrize(("giver", "body", "fps"), [(*pair, 30) for pair in PAIRS] + [(*PAIRS[2], 120)])
 def test_who_carries_a_walk_stands_as_in_its_own(giver, body, fps):
     clip, own = performer(giver).walks(90 * fps // 30, fps), performer(body).walks()
-    done = carry(clip, Body.of(own)[1])
+    done = retarget_motion(clip, RiggedCharacter.of(own)[1])
     assert done.notes == ()
     torch.testing.assert_close(low_toes(done.motion), low_toes(own), atol=0.008, rtol=0)
     torch.testing.assert_close(foot_pitch_deg(done.motion), foot_pitch_deg(own), atol=1.5, rtol=0)
@@ -75,7 +75,7 @@ def test_who_carries_a_walk_stands_as_in_its_own(giver, body, fps):
 def test_nothing_moves_or_turns_faster_than_it_did(giver, body):
     """The worst frame of every joint of the legs, in scale."""
     clip, own = performer(giver).walks(), performer(body).walks()
-    done = carry(clip, Body.of(own)[1]).motion
+    done = retarget_motion(clip, RiggedCharacter.of(own)[1]).motion
     scale = leg_length(own.skeleton) / leg_length(clip.skeleton)
     legs = [j for j, name in enumerate(CANONICAL.names) if name.endswith(("hips", "Leg", "Foot", "Toes"))]
     for order, most in ((1, 1.15), (2, 1.35)):
@@ -86,7 +86,7 @@ def test_nothing_moves_or_turns_faster_than_it_did(giver, body):
 @pytest.mark.parametrize("name", PEOPLE)
 def test_what_is_not_leg_turns_as_it_did(name):
     clip = USUAL.walks()
-    done = carry(clip, PEOPLE[name].body()).motion
+    done = retarget_motion(clip, PEOPLE[name].body()).motion
     rest = [j for j, n in enumerate(CANONICAL.names) if not n.endswith(("Leg", "Foot", "Toes"))]
     dots = (done.local_quat_xyzw[:, rest] * clip.local_quat_xyzw[:, rest]).sum(-1).abs()
     torch.testing.assert_close(dots, torch.ones_like(dots), atol=1e-9, rtol=0)
@@ -96,15 +96,15 @@ def test_what_is_not_leg_turns_as_it_did(name):
 def test_a_clip_of_the_bodys_own_skeleton_stays_to_the_bit():
     clip, body = PEOPLE["drooping T-pose"].walks(), PEOPLE["drooping T-pose"].body()
     lifted = replace(clip, root_position=clip.root_position + 0.5)
-    done = carry(lifted, body).motion
+    done = retarget_motion(lifted, body).motion
     assert torch.equal(done.root_position, lifted.root_position)
     torch.testing.assert_close(done.local_quat_xyzw, lifted.local_quat_xyzw, atol=1e-12, rtol=0)
 
 
 def test_there_and_back_is_where_one_was():
     clip, other = USUAL.walks(), PEOPLE["drooping T-pose"].body()
-    there = carry(clip, other).motion
-    back = carry(there, Body.of(clip)[1]).motion
+    there = retarget_motion(clip, other).motion
+    back = retarget_motion(there, RiggedCharacter.of(clip)[1]).motion
     ends = [0, *FEET, *TOES]
     torch.testing.assert_close(back.joint_positions()[:, ends], clip.joint_positions()[:, ends], atol=0.01, rtol=0)
 
@@ -113,14 +113,14 @@ def test_toes_that_go_through_the_floor_do_so_no_more():
     clip = USUAL.walks()
     sunk = replace(clip, root_position=clip.root_position.clone())
     sunk.root_position[40:43, 1] -= 0.06
-    done = carry(sunk, PEOPLE["tall"].body()).motion
+    done = retarget_motion(sunk, PEOPLE["tall"].body()).motion
     assert float(done.joint_positions()[:, TOES, 1].min()) > 0.02 - 0.01
 
 
 def test_toes_that_sink_at_times_are_not_the_floor():
     """Rigid feet go through the floor as they push off; while they are flat, they stand on it."""
     clip = replace(USUAL, sinks=0.02).walks()
-    done = carry(clip, PEOPLE["tall"].body()).motion
+    done = retarget_motion(clip, PEOPLE["tall"].body()).motion
     flat = (clip.joint_positions()[:, TOES, 1] - TOE_REST_HEIGHT).abs() < 1e-6
     off = done.joint_positions()[:, TOES, 1][flat] - 0.02
     assert float(off.abs().max()) < 0.004
@@ -132,7 +132,7 @@ def test_a_kick_is_the_same_pose():
     up = torch.sin(torch.linspace(0, math.pi, 60, dtype=torch.float64)) ** 2
     clip = USUAL.stands(turned={HIPJOINTS[0]: -1.6 * up})
     for body in (PEOPLE["short legs"], replace(PEOPLE["long flat foot"], thighs_drop=0.12)):
-        done = carry(clip, Body.of(body.walks())[1])
+        done = retarget_motion(clip, RiggedCharacter.of(body.walks())[1])
         assert done.notes == ()
         ways = [m.joint_positions()[30, FEET[0]] - m.joint_positions()[30, HIPJOINTS[0]] for m in (clip, done.motion)]
         assert float(torch.nn.functional.cosine_similarity(*ways, dim=0)) > math.cos(math.radians(1))
@@ -142,7 +142,7 @@ def test_who_taps_a_foot_keeps_the_heel_down():
     """Toes that are raised turn the foot about its heel: the ankle stays, however long the foot is."""
     up = torch.sin(torch.linspace(0, math.pi, 60, dtype=torch.float64)) ** 2
     clip = USUAL.stands(turned={FEET[0]: -0.5 * up})
-    done = carry(clip, PEOPLE["long flat foot"].body()).motion
+    done = retarget_motion(clip, PEOPLE["long flat foot"].body()).motion
     ankle = done.joint_positions()[:, FEET[0]]
     assert float((ankle - ankle[0]).norm(dim=-1).max()) < 0.012
 
@@ -151,7 +151,7 @@ def test_nearly_straight_legs_reach_and_do_not_snap():
     """Who walks on legs that are almost straight, over long feet, is lowered where short feet cannot reach."""
     short = Performer(size=1.02, foot=(-0.03, 0.06), toe_height=0.02)
     clip = Performer(foot=(-0.06, 0.15), upright=0.99).walks(frames=180, fps=60)
-    done = carry(clip, short.body())
+    done = retarget_motion(clip, short.body())
     assert done.notes == ()
     stands = clip.joint_positions()[:, TOES, 1] < TOE_REST_HEIGHT + 1e-4
     assert float((done.motion.joint_positions()[:, TOES, 1] - 0.02)[stands].abs().max()) < 0.004
@@ -163,7 +163,7 @@ def test_nearly_straight_legs_reach_and_do_not_snap():
 def test_a_leg_gives_in_before_it_is_straight():
     """Never beyond the most, untouched well before it, and no faster than what it follows."""
     far, most = torch.linspace(0.5, 1.2, 701, dtype=torch.float64)[:, None].expand(-1, 2), torch.ones(2).double()
-    given = _give_in(far, most)
+    given = _soft_clamp(far, most)
     assert float(given.max()) <= 1.0
     torch.testing.assert_close(given[far < 0.99], far[far < 0.99], atol=0, rtol=0)
     steps = given.diff(dim=0) / far.diff(dim=0)
@@ -175,7 +175,7 @@ def test_a_leg_gives_in_before_it_is_straight():
 def test_legs_are_as_straight_as_they_were(drop):
     """Wherever the hips are over the hip joints."""
     clip = USUAL.walks()
-    done = carry(clip, replace(USUAL, thighs_drop=drop).body()).motion
+    done = retarget_motion(clip, replace(USUAL, thighs_drop=drop).body()).motion
     far = [(m.joint_positions()[:, FEET] - m.joint_positions()[:, HIPJOINTS]).norm(dim=-1) for m in (clip, done)]
     torch.testing.assert_close(far[1], far[0], atol=0.01, rtol=0)
 
@@ -186,7 +186,7 @@ def test_hips_that_shake_do_not_shake_others_more():
     local = clip.local_quat_xyzw.clone()
     noise = 0.01 * torch.randn(240, generator=generator(), dtype=torch.float64)
     local[:, 0] = quat_xyzw(torch.stack([noise, 0 * noise, 0 * noise], dim=-1))
-    done = carry(replace(clip, local_quat_xyzw=local), replace(USUAL, thighs_drop=0.15).body()).motion
+    done = retarget_motion(replace(clip, local_quat_xyzw=local), replace(USUAL, thighs_drop=0.15).body()).motion
     assert float(done.root_position.diff(n=2, dim=0).norm(dim=-1).max()) < 2e-4
 
 
@@ -194,7 +194,10 @@ def test_a_clip_on_a_platform_stays_there():
     clip = USUAL.walks()
     high = replace(clip, root_position=clip.root_position + torch.tensor([0.0, 1.0, 0.0]).double())
     torch.testing.assert_close(
-        low_toes(carry(high, PEOPLE["tall"].body()).motion), torch.full((2,), 1.02).double(), atol=0.012, rtol=0
+        low_toes(retarget_motion(high, PEOPLE["tall"].body()).motion),
+        torch.full((2,), 1.02).double(),
+        atol=0.012,
+        rtol=0,
     )
 
 
@@ -209,14 +212,14 @@ def test_legs_that_cannot_reach_are_named_with_numbers():
     local[:, [CANONICAL.index(side + "LowerLeg") for side in ("left", "right")]] = torch.tensor([0, 0, 0, 1.0]).double()
     wide = replace(clip.skeleton, offsets=clip.skeleton.offsets.clone())
     wide.offsets[[CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")], 0] *= 4
-    done = carry(replace(clip, skeleton=wide, local_quat_xyzw=local), PEOPLE["tall"].body())
+    done = retarget_motion(replace(clip, skeleton=wide, local_quat_xyzw=local), PEOPLE["tall"].body())
     assert done.motion.local_quat_xyzw.isfinite().all()
     assert all("cm off (frame" in note for note in done.notes)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 5])
 def test_a_pose_is_enough(frames):
-    done = carry(USUAL.walks().slice(0, frames), PEOPLE["long flat foot"].body()).motion
+    done = retarget_motion(USUAL.walks().slice(0, frames), PEOPLE["long flat foot"].body()).motion
     assert done.num_frames == frames
     assert float(done.joint_positions()[:, TOES, 1].min()) == pytest.approx(0.015, abs=0.02)
 
@@ -224,10 +227,12 @@ def test_a_pose_is_enough(frames):
 def test_a_table_that_lays_feet_as_anothers_is_put_right():
     """A LaFAN-like rig whose foot is flatter than the table has it: no tip-toe (its own pitch, not the canonical)."""
     clip = _lafan_like()
-    own, body = Body.of(clip)
+    own, body = RiggedCharacter.of(clip)
     assert body.rigmap.rig.name == "lafan1"
     assert float(torch.rad2deg(body.stance.tilt[:, 0]).min()) > 8
-    done = carry(retarget.from_canonical(USUAL.walks(), retarget.map_rig(bandai_skeleton())), body).motion
+    done = retarget_motion(
+        retarget.from_canonical(USUAL.walks(), retarget.identify_rig(bandai_skeleton())), body
+    ).motion
     torch.testing.assert_close(foot_pitch_deg(done), foot_pitch_deg(own), atol=1.5, rtol=0)
 
 
@@ -236,7 +241,7 @@ def test_a_person_of_a_rig_has_flat_feet_and_the_clips_floor(tmp_path):
     clip = replace(_lafan_like(), source=None)
     clip = replace(clip, root_position=clip.root_position - torch.tensor([0.0, 0.04, 0.0]).double())
     clip.save(tmp_path / "rig.bvh")
-    person = character.read(str(tmp_path / "rig.bvh"))
+    person = character.read_character(str(tmp_path / "rig.bvh"))
     own = retarget.to_canonical(mapctl.load(tmp_path / "rig.bvh"))[0]
     assert person.toe_rest_height == pytest.approx(float(low_toes(own).mean()), abs=1e-6)
     assert person.toe_rest_height < -0.005

@@ -92,7 +92,7 @@ def _is_twist(name):
 def walking(rig_skeleton) -> tuple[Motion, Motion]:
     """A canonical walk, and on the rig, its twist bones turning with half of a joint's roll."""
     wanted = person(frames=30)
-    plain = retarget.from_canonical(wanted, retarget.map_rig(rig_skeleton))
+    plain = retarget.from_canonical(wanted, retarget.identify_rig(rig_skeleton))
     noise = random_motion(rig_skeleton, 30).local_quat_xyzw
     local = plain.local_quat_xyzw.clone()
     for joint, name in enumerate(rig_skeleton.names):

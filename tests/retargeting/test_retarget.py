@@ -27,7 +27,7 @@ def random_on(rig, frames=6):
 
 @each_rig
 def test_rigs_are_recognised(rig):
-    assert retarget.map_rig(SKELETONS[rig]).rig.name == rig
+    assert retarget.identify_rig(SKELETONS[rig]).rig.name == rig
 
 
 @each_rig
@@ -43,7 +43,7 @@ def test_there_and_back_is_the_motion_itself(rig):
 
 @each_rig
 def test_back_and_there_is_the_canonical_motion(rig):
-    rigmap = retarget.map_rig(SKELETONS[rig])
+    rigmap = retarget.identify_rig(SKELETONS[rig])
     wanted = replace(random_motion(rigmap.skeleton, seed=3))
     if rig == "cmu-daz":  # it has no toe joints: the toes cannot turn on their own
         toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
@@ -65,7 +65,7 @@ def test_canonical_joints_are_where_the_rigs_are(rig):
 
 @each_rig
 def test_the_t_pose_comes_out_as_identity(rig):
-    rigmap = retarget.map_rig(SKELETONS[rig])
+    rigmap = retarget.identify_rig(SKELETONS[rig])
     tpose = Motion(
         rigmap.skeleton,
         random_on(rig).fps,
@@ -82,11 +82,11 @@ def test_the_t_pose_comes_out_as_identity(rig):
 
 
 def test_bandai_bones_are_the_canonical_ones():
-    np.testing.assert_allclose(retarget.map_rig(bandai_skeleton()).skeleton.offsets, CANONICAL.offsets, atol=1e-9)
+    np.testing.assert_allclose(retarget.identify_rig(bandai_skeleton()).skeleton.offsets, CANONICAL.offsets, atol=1e-9)
 
 
 def test_bent_limbs_of_cmu_are_straight_in_its_t_pose():
-    bones = retarget.map_rig(cmu_skeleton()).skeleton
+    bones = retarget.identify_rig(cmu_skeleton()).skeleton
     for child in ("leftLowerArm", "rightHand", "leftLowerLeg", "rightFoot"):
         joint = CANONICAL.index(child)
         bone, wanted = bones.offsets[joint], CANONICAL.offsets[joint]
@@ -126,7 +126,7 @@ def test_the_static_root_of_an_original_stays():
 def test_one_walk_on_two_rigs_goes_the_same_way():
     motion = walk(10)
     for skeleton in (bandai_skeleton(), cmu_skeleton()):
-        rigmap = retarget.map_rig(skeleton)
+        rigmap = retarget.identify_rig(skeleton)
         again, _ = retarget.to_canonical(retarget.from_canonical(motion, rigmap))
         hand = CANONICAL.index("leftHand")
         assert turn_between(again.joint_rotations()[:, hand], motion.joint_rotations()[:, hand]) < 1e-6
@@ -136,7 +136,7 @@ def test_one_walk_on_two_rigs_goes_the_same_way():
 def test_what_is_no_body_is_refused_with_what_is_missing_and_the_known_rigs():
     strange = Skeleton(("bone_1", "bone_2"), (-1, 0), torch.zeros(2, 3).double())
     with pytest.raises(RequestError, match=r"hips, spine.*bone_1, bone_2.*canonical, bandai-namco,.* cmu-daz"):
-        retarget.map_rig(strange)
+        retarget.identify_rig(strange)
 
 
 @pytest.mark.parametrize("start", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0], [0.6, 0, 0.8], [0.36, 0.48, 0.8]])
@@ -144,7 +144,7 @@ def test_the_shortest_turn_leads_there_even_to_the_opposite(start):
     start = torch.tensor(start).double()
     start = start / start.norm()
     for stop in (-start, start, start.roll(1), torch.nn.functional.normalize(-start + 1e-7 * start.roll(1), dim=0)):
-        turn = retarget._shortest_turn(start, stop)
+        turn = retarget._shortest_rotation(start, stop)
         torch.testing.assert_close(turn @ start, stop, atol=1e-9, rtol=0)
         torch.testing.assert_close(turn @ turn.T, torch.eye(3).double(), atol=1e-9, rtol=0)
         assert float(torch.linalg.det(turn)) == pytest.approx(1)

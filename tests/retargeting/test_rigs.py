@@ -16,10 +16,10 @@ from mapctl import kinematics, retarget, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import bvh
 from mapctl.retarget import rigs
-from mapctl.retarget.joint_matching import ACCEPTED, REQUIRED, match
-from mapctl.skeleton import CANONICAL, Skeleton, mirrored_name
+from mapctl.retarget.joint_matching import MIN_SCORE, REQUIRED, match
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
-PRESETS = [rig.name for rig in rigs.known()]
+PRESETS = [rig.name for rig in rigs.known_rigs()]
 VERSIONS = [(preset, version) for preset in PRESETS for version in range(versions_of(preset))]
 RESTS = {
     "T": Make({}),
@@ -91,13 +91,13 @@ def converted(wish, *, frames=40):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_preset_says_what_it_is_and_names_what_is_required(preset):
-    rig = next(rig for rig in rigs.known() if rig.name == preset)
+    rig = next(rig for rig in rigs.known_rigs() if rig.name == preset)
     assert rig.about
     assert set(REQUIRED) <= rig.joints.keys()
     for version in range(versions_of(preset)):
         names = list(names_of(preset, version).values())
         assert len(set(names)) == len(names)
-    assert rigs.read(preset) == rig
+    assert rigs.load_rig(preset) == rig
 
 
 @pytest.mark.parametrize("rest", RESTS)
@@ -143,7 +143,7 @@ def test_any_motion_at_all_comes_back(preset):
 
 
 @pytest.mark.parametrize("rest", RESTS)
-@pytest.mark.parametrize(("names", "least"), [(INVENTED, 0.75), (NONSENSE, ACCEPTED)], ids=["invented", "nonsense"])
+@pytest.mark.parametrize(("names", "least"), [(INVENTED, 0.75), (NONSENSE, MIN_SCORE)], ids=["invented", "nonsense"])
 def test_a_rig_that_nobody_listed(names, least, rest):
     made, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names))
     assert least < rigmap.match.score <= 1
@@ -228,7 +228,7 @@ def test_a_clip_that_begins_with_a_t_pose_shows_what_its_zero_pose_does_not():
 @pytest.mark.parametrize("rest", RESTS)
 def test_a_part_of_a_clip_is_converted_as_the_whole_was(rest):
     *_, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of("vicon")))
-    part, again = retarget.to_canonical(motion.slice(30, 33), retarget.settled(rigmap))
+    part, again = retarget.to_canonical(motion.slice(30, 33), retarget.as_rig(rigmap))
     assert again.joint_of == rigmap.joint_of
     assert turn_between(part.local_quat_xyzw, canonical.local_quat_xyzw[30:33]) < 1e-6
     torch.testing.assert_close(part.joint_positions(), canonical.joint_positions()[30:33], atol=1e-8, rtol=0)
@@ -282,14 +282,14 @@ def frozen_conversion(motion, rig):
         else:
             picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
-    return rotations.sign_continuous(local), motion.joint_positions()[:, joint_of[0]]
+    return rotations.make_sign_continuous(local), motion.joint_positions()[:, joint_of[0]]
 
 
 @pytest.mark.parametrize(("name", "skeleton"), [("bandai-namco", bandai_skeleton()), ("cmu-daz", cmu_skeleton())])
 def test_the_rigs_that_priors_were_trained_through_convert_bit_for_bit_as_they_did(name, skeleton):
-    for motion in (random_motion(skeleton, 8), retarget.from_canonical(walk(20), retarget.map_rig(skeleton))):
+    for motion in (random_motion(skeleton, 8), retarget.from_canonical(walk(20), retarget.identify_rig(skeleton))):
         canonical, rigmap = retarget.to_canonical(motion)
-        local, hips = frozen_conversion(motion, rigs.read(name))
+        local, hips = frozen_conversion(motion, rigs.load_rig(name))
         assert rigmap.rig.name == name
         assert torch.equal(canonical.local_quat_xyzw, local)
         assert torch.equal(canonical.root_position, hips)
@@ -311,13 +311,13 @@ def test_a_toml_file_wins(tmp_path):
     made, wanted, motion, *_ = converted(Make(INVENTED, zup=True, arms_down_deg=20))
     path = tmp_path / "ours.toml"
     path.write_text(TOML.format(up="z", rest="straighten", facing="-y", unit="cm"))
-    rig = rigs.read(path)
+    rig = rigs.load_rig(path)
     assert (rig.name, rig.up, rig.metres_per_unit) == ("ours", "z", 0.01)
     canonical, rigmap = retarget.to_canonical(motion, rig)
     assert rigmap.rig is rig
     assert_understood(made, wanted, canonical, rigmap)
     path.write_text(TOML.format(up="y", rest="tpose", facing="auto", unit="m"))
-    canonical, rigmap = retarget.to_canonical(motion, rigs.read(path))
+    canonical, rigmap = retarget.to_canonical(motion, rigs.load_rig(path))
     assert (rigmap.up, rigmap.tpose_from) == ("y", "table")
     assert_returns(motion, canonical, rigmap)
 
@@ -336,8 +336,8 @@ def test_a_unit_that_is_set_wins(tmp_path):
 def test_the_rig_of_a_clip_is_one_for_others(tmp_path):
     made, _, motion, _, rigmap = converted(Make(NONSENSE))
     motion.save(tmp_path / "a.bvh")
-    assert rigs.read(tmp_path / "a.bvh").joints == NONSENSE
-    assert retarget.map_rig(made.skeleton, rigs.read(tmp_path / "a.bvh")).joint_of == rigmap.joint_of
+    assert rigs.load_rig(tmp_path / "a.bvh").joints == NONSENSE
+    assert retarget.identify_rig(made.skeleton, rigs.load_rig(tmp_path / "a.bvh")).joint_of == rigmap.joint_of
 
 
 @pytest.mark.parametrize(
@@ -357,18 +357,18 @@ def test_the_rig_of_a_clip_is_one_for_others(tmp_path):
 def test_a_bad_toml_file_is_refused_with_its_name(tmp_path, text, said):
     (tmp_path / "bad.toml").write_text(text)
     with pytest.raises(FileFormatError, match=f"bad.toml.*{said}"):
-        rigs.read(tmp_path / "bad.toml")
+        rigs.load_rig(tmp_path / "bad.toml")
 
 
 def test_what_is_no_rig_at_all_is_refused(tmp_path):
     with pytest.raises(RequestError, match=r"no rig 'mixammo'; known rigs: canonical.*mixamo"):
-        rigs.read("mixammo")
+        rigs.load_rig("mixammo")
     with pytest.raises(FileFormatError, match="no such file"):
-        rigs.read(tmp_path / "none.toml")
+        rigs.load_rig(tmp_path / "none.toml")
     with pytest.raises(RequestError, match=r"mixamo: no joint 'mixamorig:Hips' for hips; the nearest is hip, then "):
-        retarget.map_rig(cmu_skeleton(), rigs.read("mixamo"))
+        retarget.identify_rig(cmu_skeleton(), rigs.load_rig("mixamo"))
 
 
 def test_canonical_joints_mirror_each_other_in_every_preset():
-    for rig in rigs.known():
-        assert {mirrored_name(name) for name in rig.joints} == set(rig.joints)
+    for rig in rigs.known_rigs():
+        assert {mirror_name(name) for name in rig.joints} == set(rig.joints)

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from mapctl.runtime import interruption
-from mapctl.runtime.interruption import SIGNALS, held_back, listen
+from mapctl.runtime.interruption import SIGNALS, defer_signals, raise_on_signals
 
 ALL = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 
@@ -44,7 +44,7 @@ def send(number=signal.SIGINT):
 
 @ALL
 def test_every_signal_interrupts_once_and_is_remembered(number, clock):
-    received = listen()
+    received = raise_on_signals()
     with pytest.raises(KeyboardInterrupt):
         send(number)
     clock.seconds += 0.9
@@ -58,9 +58,9 @@ def test_every_signal_interrupts_once_and_is_remembered(number, clock):
 @ALL
 def test_what_is_to_be_ignored_stays_ignored(number):
     signal.signal(number, signal.SIG_IGN)
-    listen()
+    raise_on_signals()
     send(number)
-    with held_back() as held:
+    with defer_signals() as held:
         send(number)
     assert held.wanted is None
 
@@ -76,7 +76,7 @@ def done_by(work):
 @ALL
 def test_held_signals_wait_until_they_are_released(number, clock):
     def work(done):
-        with held_back() as held:
+        with defer_signals() as held:
             send(number)
             send(signal.SIGINT)
             done.append(held.wanted)
@@ -88,12 +88,12 @@ def test_held_signals_wait_until_they_are_released(number, clock):
 
 def test_a_signal_that_still_waits_at_the_end_is_let_go_then():
     def work(done):
-        with held_back():
+        with defer_signals():
             send(signal.SIGTERM)
             done.append("whole")
         done.append("never")
 
-    received = listen()
+    received = raise_on_signals()
     before = signal.getsignal(signal.SIGTERM)
     assert done_by(work) == ["whole"]
     assert received == [signal.SIGTERM]
@@ -102,12 +102,12 @@ def test_a_signal_that_still_waits_at_the_end_is_let_go_then():
 
 def test_a_second_wish_is_not_held_back_but_saving_is(clock):
     def work(done):
-        with held_back() as held:
+        with defer_signals() as held:
             send()
             clock.seconds += 0.9
             send()
             done.append("a double one")
-            with held.shut():
+            with held.defer_all():
                 clock.seconds += 5
                 send()
                 done.append("saved")
@@ -119,16 +119,16 @@ def test_a_second_wish_is_not_held_back_but_saving_is(clock):
 
 def test_signals_go_through_where_that_is_allowed():
     def at_once(done):
-        with held_back() as held, held.passing():
+        with defer_signals() as held, held.let_through():
             done.append("begun")
             send()
             done.append("never")
 
     def waiting(done):
-        with held_back() as held:
+        with defer_signals() as held:
             send()
             done.append("held")
-            with held.passing():
+            with held.let_through():
                 done.append("never")
 
     assert (done_by(at_once), done_by(waiting)) == (["begun"], ["held"])
@@ -139,9 +139,9 @@ def test_nothing_is_held_where_no_signals_arrive():
     found = []
 
     def work():
-        with held_back() as held:
+        with defer_signals() as held:
             held.release()
-            with held.passing(), held.shut():
+            with held.let_through(), held.defer_all():
                 found.append(held.wanted)
 
     thread = threading.Thread(target=work)
@@ -154,7 +154,7 @@ def test_a_programs_own_handler_is_asked_and_put_back():
     found = []
     own = lambda number, frame: found.append(number)  # noqa: E731
     signal.signal(signal.SIGTERM, own)
-    with held_back() as held:
+    with defer_signals() as held:
         send(signal.SIGTERM)
         assert found == []
         held.release()

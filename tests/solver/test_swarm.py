@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.solver.budget import Budget, Meter
-from mapctl.solver.swarm import SwarmResult, SwarmSettings, best_of, swarm
+from mapctl.solver.swarm import SwarmResult, SwarmSettings, run_best_of_samples, run_swarm
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -41,7 +41,7 @@ def same(a: SwarmResult, b: SwarmResult) -> bool:
 def test_sphere_is_descended(neighbours: int | None):
     options = SwarmSettings(particles=20, iterations=60, neighbours=neighbours)
     start = torch.full((6,), 2.0, dtype=torch.float64)
-    found = swarm(sphere, start=start, spread=1.0, settings=options, generator=seeded())
+    found = run_swarm(sphere, start=start, spread=1.0, settings=options, generator=seeded())
     assert found.energy < 0.05
     assert found.evaluations == 1200
     assert len(found.history) == 60
@@ -55,8 +55,8 @@ def test_many_basins_are_searched_better_than_by_as_many_draws(neighbours: int |
     options, start = SwarmSettings(particles=30, iterations=40, neighbours=neighbours), torch.full((4,), 3.3)
     flown, drawn = [], []
     for seed in range(8):
-        flown.append(swarm(rastrigin, start=start, spread=1.5, settings=options, generator=seeded(seed)))
-        drawn.append(best_of(rastrigin, start=start, spread=1.5, count=1200, generator=seeded(seed)))
+        flown.append(run_swarm(rastrigin, start=start, spread=1.5, settings=options, generator=seeded(seed)))
+        drawn.append(run_best_of_samples(rastrigin, start=start, spread=1.5, count=1200, generator=seeded(seed)))
     assert {f.evaluations for f in flown} == {d.evaluations for d in drawn} == {1200}
     assert np.median([f.energy for f in flown]) < 0.6 * np.median([d.energy for d in drawn])
 
@@ -69,8 +69,8 @@ def test_start_is_the_first_particle_so_the_result_is_never_worse():
         return sphere(x)
 
     for found in (
-        swarm(cost, start=start, spread=2.0, generator=seeded()),
-        best_of(cost, start=start, spread=2.0, count=16, generator=seeded()),
+        run_swarm(cost, start=start, spread=2.0, generator=seeded()),
+        run_best_of_samples(cost, start=start, spread=2.0, count=16, generator=seeded()),
     ):
         assert torch.equal(found.x, start)
         assert found.energy == 0.0
@@ -81,7 +81,7 @@ def test_start_is_the_first_particle_so_the_result_is_never_worse():
 
 def test_draws_have_the_spread_asked_for_by_unknown():
     spread, seen = torch.tensor([0.1, 10.0]), []
-    best_of(
+    run_best_of_samples(
         lambda x: (seen.append(x), sphere(x))[1], start=torch.ones(2), spread=spread, count=4000, generator=seeded()
     )
     torch.testing.assert_close(seen[0].std(0), spread, rtol=0.05, atol=0.0)
@@ -90,7 +90,7 @@ def test_draws_have_the_spread_asked_for_by_unknown():
 
 def test_same_generator_same_bits_whatever_numpys_state():
     def run(generator: torch.Generator) -> SwarmResult:
-        return swarm(rastrigin, start=torch.full((3,), 3.3), spread=1.0, generator=generator)
+        return run_swarm(rastrigin, start=torch.full((3,), 3.3), spread=1.0, generator=generator)
 
     results = []
     for numpy_seed in (1, 2):
@@ -111,7 +111,7 @@ def test_numpys_global_state_is_the_costs_alone():
         return sphere(x)
 
     np.random.seed(3)
-    swarm(cost, start=torch.ones(3), spread=1.0, generator=seeded())
+    run_swarm(cost, start=torch.ones(3), spread=1.0, generator=seeded())
     drawn.append(np.random.random())
     np.random.seed(3)
     assert drawn == [np.random.random() for _ in drawn]
@@ -120,7 +120,7 @@ def test_numpys_global_state_is_the_costs_alone():
 def test_logging_is_left_alone():
     root = logging.getLogger()
     handlers, level, configure = list(root.handlers), root.level, logging.config.dictConfig
-    swarm(sphere, start=torch.ones(3), spread=1.0, settings=SwarmSettings(neighbours=3), generator=seeded())
+    run_swarm(sphere, start=torch.ones(3), spread=1.0, settings=SwarmSettings(neighbours=3), generator=seeded())
     assert (list(root.handlers), root.level, logging.config.dictConfig) == (handlers, level, configure)
 
 
@@ -131,7 +131,7 @@ def test_first_use_in_a_read_only_folder_leaves_no_trace(tmp_path: Path):
         assert "pyswarms" not in sys.modules, "imported early"
         logging.basicConfig(level=logging.ERROR, format="mine %(message)s")
         mine = logging.getLogger().handlers[:]
-        m.swarm(lambda x: x.sum(-1), start=torch.ones(3), spread=1.0, generator=torch.Generator())
+        m.run_swarm(lambda x: x.sum(-1), start=torch.ones(3), spread=1.0, generator=torch.Generator())
         assert logging.getLogger().handlers == mine and logging.getLogger().level == logging.ERROR
         logging.error("still here")
     """
@@ -154,13 +154,13 @@ def test_particles_stay_within_bounds():
         return -x.sum(-1)
 
     start = torch.tensor([0.0, 0.5])
-    found = swarm(cost, start=start, spread=0.05, bounds=(low, high), settings=options, generator=seeded())
+    found = run_swarm(cost, start=start, spread=0.05, bounds=(low, high), settings=options, generator=seeded())
     points = torch.cat(seen)
     assert (points >= low).all()
     assert (points <= high).all()
     assert (seen[0] < high).all()
     assert torch.equal(found.x, high)  # who flies out stops at the border
-    for search in (swarm, partial(best_of, count=3)):
+    for search in (run_swarm, partial(run_best_of_samples, count=3)):
         with pytest.raises(RequestError, match="within its bounds"):
             search(sphere, start=torch.zeros(2), spread=1.0, bounds=(low, high), generator=seeded())
 
@@ -174,11 +174,13 @@ def test_costs_that_are_not_finite_count_as_infinity(bad: float, neighbours: int
         return torch.where(x[:, 0] > 0, sphere(x), bad)
 
     start = torch.tensor([-0.1, 1.0, 1.0])
-    found = swarm(half, start=start, spread=1.0, settings=options, generator=seeded())
+    found = run_swarm(half, start=start, spread=1.0, settings=options, generator=seeded())
     assert math.isfinite(found.energy)
     assert found.x[0] > 0
     assert found.energy == half(found.x[None]).item()
-    never = swarm(lambda x: x.new_full((len(x),), bad), start=start, spread=1.0, settings=options, generator=seeded())
+    never = run_swarm(
+        lambda x: x.new_full((len(x),), bad), start=start, spread=1.0, settings=options, generator=seeded()
+    )
     assert torch.equal(never.x, start)
     assert never.energy == math.inf
 
@@ -193,15 +195,20 @@ def test_budget_is_kept_to_exactly():
 
         meter = Meter(Budget(evaluations=limit))
         options = SwarmSettings(particles=16, iterations=6 if limit >= 16 else 1)
-        found = swarm(cost, start=torch.ones(3), spread=1.0, settings=options, meter=meter, generator=seeded())
+        found = run_swarm(cost, start=torch.ones(3), spread=1.0, settings=options, meter=meter, generator=seeded())
         assert sum(seen) == found.evaluations == meter.evaluations == wanted
         assert found.energy <= 3.0 if limit else found.energy == math.inf
     meter = Meter(Budget(evaluations=10))
-    assert best_of(sphere, start=torch.ones(3), spread=1.0, count=99, meter=meter, generator=seeded()).evaluations == 10
+    assert (
+        run_best_of_samples(
+            sphere, start=torch.ones(3), spread=1.0, count=99, meter=meter, generator=seeded()
+        ).evaluations
+        == 10
+    )
     late = Meter(Budget(seconds=0.0))
     for found in (
-        swarm(sphere, start=torch.ones(3), spread=1.0, meter=late, generator=seeded()),
-        best_of(sphere, start=torch.ones(3), spread=1.0, count=4, meter=late, generator=seeded()),
+        run_swarm(sphere, start=torch.ones(3), spread=1.0, meter=late, generator=seeded()),
+        run_best_of_samples(sphere, start=torch.ones(3), spread=1.0, count=4, meter=late, generator=seeded()),
     ):
         assert torch.equal(found.x, torch.ones(3))
         assert found.evaluations == 0
@@ -211,9 +218,9 @@ def test_budget_is_kept_to_exactly():
 def test_wrong_shapes_and_settings_are_refused():
     for cost in (lambda x: x.sum(), lambda x: x):
         with pytest.raises(RequestError, match=r"energies \(16,\)"):
-            swarm(cost, start=torch.ones(3), spread=1.0, generator=seeded())
+            run_swarm(cost, start=torch.ones(3), spread=1.0, generator=seeded())
     for wrong in ({"particles": 0}, {"iterations": 0}, {"neighbours": 1}):
         with pytest.raises(RequestError, match="or more"):
             SwarmSettings(**wrong)
     with pytest.raises(RequestError, match="at least 1"):
-        best_of(sphere, start=torch.ones(3), spread=1.0, count=0, generator=seeded())
+        run_best_of_samples(sphere, start=torch.ones(3), spread=1.0, count=0, generator=seeded())

@@ -7,17 +7,17 @@ import pytest
 import torch
 from helpers import walk
 
-from controllers.steering.autopilot import Pilot
+from controllers.steering.autopilot import Autopilot
 from controllers.steering.steer import SteerFrames
 from mapctl import curves
-from mapctl.intent.steering import Command, Limits
+from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 
 LINE = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 5.0]]))
 
 
-def at_place(pilot: Pilot, x: float, z: float) -> None:
+def at_place(pilot: Autopilot, x: float, z: float) -> None:
     """The character was shown there."""
     pose = walk(2).slice(0, 1)
     moved = Motion(pose.skeleton, pose.fps, torch.tensor([[x, 0.9, z]], dtype=torch.float64), pose.local_quat_xyzw)
@@ -25,14 +25,14 @@ def at_place(pilot: Pilot, x: float, z: float) -> None:
 
 
 def test_the_last_command_holds():
-    pilot = Pilot(Command(1.0, 0.5), Limits())
+    pilot = Autopilot(Command(1.0, 0.5), SteeringLimits())
     assert pilot.at(0.0) == Command(1.0, 0.5)
     pilot.command(Command(2.0, 1.0, told=("run",)))
     assert pilot.at(9.0) == Command(2.0, 1.0, told=("run",))
 
 
 def test_a_path_is_walked_braked_for_and_stood_at():
-    pilot = Pilot(Command(1.0, 0.5, told=("elderly",)), Limits(braking=2.0))
+    pilot = Autopilot(Command(1.0, 0.5, told=("elderly",)), SteeringLimits(braking=2.0))
     at_place(pilot, 0.0, 0.0)
     pilot.walk(LINE, 1.4)
     speeds = []
@@ -47,7 +47,7 @@ def test_a_path_is_walked_braked_for_and_stood_at():
 
 
 def test_a_command_takes_the_character_off_its_path():
-    pilot = Pilot(Command(1.0, 0.0), Limits())
+    pilot = Autopilot(Command(1.0, 0.0), SteeringLimits())
     at_place(pilot, 0.0, 0.0)
     pilot.walk(LINE, 1.4)
     pilot.command(Command(0.5, math.pi))
@@ -55,7 +55,7 @@ def test_a_command_takes_the_character_off_its_path():
 
 
 def test_a_closed_path_goes_round_and_round():
-    pilot = Pilot(Command(1.0, 0.0), Limits())
+    pilot = Autopilot(Command(1.0, 0.0), SteeringLimits())
     pilot.walk(curves.read("circle:1"), 1.0)
     for turn in torch.linspace(0, 12, 200).tolist():
         x, z = curves.read("circle:1").point(turn).tolist()

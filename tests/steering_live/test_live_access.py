@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection, connect
 
-from scenes.live.access import Quiet, may_come, one_line, only_own_pages
+from scenes.live.access import ServerErrorReporter, format_error, is_own_page, restrict_to_own_pages
 
 OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 
@@ -45,13 +45,13 @@ OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "
 )
 def test_only_pages_of_this_server_may_come(changes, may):
     headers = Headers({name: value for name, value in (OWN | changes).items() if value is not None})
-    assert may_come(headers, 8080) is may
+    assert is_own_page(headers, 8080) is may
 
 
 def test_two_origins_are_none():
     headers = Headers(OWN)
     headers["Origin"] = "http://example.org"
-    assert not may_come(headers, 8080)
+    assert not is_own_page(headers, 8080)
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +61,9 @@ def told() -> list[str]:
 
 @pytest.fixture(scope="module")
 def server(told):
-    with only_own_pages():
+    with restrict_to_own_pages():
         made = viser.ViserServer(host="127.0.0.1", port=8490, verbose=False)
-    quiet = Quiet(made.get_event_loop(), told.append)
+    quiet = ServerErrorReporter(made.get_event_loop(), told.append)
     yield made
     quiet.close()
     made.stop()
@@ -145,20 +145,20 @@ def test_a_value_that_a_control_cannot_have_is_said_and_the_control_stays(server
 
 
 def test_an_error_is_told_in_one_short_line():
-    assert one_line(ValueError("two\n  lines")) == "ValueError: two lines"
-    assert one_line(KeyError()) == "KeyError"
-    assert one_line("plain") == "plain"
-    assert len(one_line(ValueError("x" * 999))) == 200
+    assert format_error(ValueError("two\n  lines")) == "ValueError: two lines"
+    assert format_error(KeyError()) == "KeyError"
+    assert format_error("plain") == "plain"
+    assert len(format_error(ValueError("x" * 999))) == 200
 
 
 def test_who_goes_away_is_not_spoken_of(told):
     told.clear()
-    quiet = Quiet(asyncio.new_event_loop(), told.append)
+    quiet = ServerErrorReporter(asyncio.new_event_loop(), told.append)
     record = logging.LogRecord("websockets.server", logging.ERROR, "", 0, "", (), None)
     for error in (ConnectionResetError(), EOFError()):
         record.exc_info = (type(error), error, None)
-        assert not quiet._heard(record)
+        assert not quiet._filter_record(record)
     record.exc_info = None
-    assert quiet._heard(record)
+    assert quiet._filter_record(record)
     quiet.close()
     assert told == []

@@ -17,10 +17,10 @@ from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import LiveCharacter
 from mapctl.skeleton import CANONICAL
 from scenes.live import ground
-from scenes.live.app import Show
-from scenes.live.inputs import Orders
-from scenes.live.readouts import Gauges
-from scenes.live.recording import Recording, as_file
+from scenes.live.app import LiveApp
+from scenes.live.inputs import SteeringInputs
+from scenes.live.readouts import Readouts
+from scenes.live.recording import Recording, encode_motion
 
 
 @pytest.fixture
@@ -30,8 +30,12 @@ def actors():
 
 @pytest.fixture
 def show(actors):
-    made = Show(
-        actors, [Orders(), Orders()], port=8090, fastest=3.8, labels={"gait": ["run", "walk"], "style": ["old"]}
+    made = LiveApp(
+        actors,
+        [SteeringInputs(), SteeringInputs()],
+        port=8090,
+        fastest=3.8,
+        labels={"gait": ["run", "walk"], "style": ["old"]},
     )
     yield made
     made.close()
@@ -47,8 +51,8 @@ def test_it_listens_on_this_machine_only(show):
 def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys, prior):
     """As `mapctl live` does it; the process of a character is left out."""
     actor = Actor()
-    monkeypatch.setattr(Live, "_characters", lambda live: [actor])
-    monkeypatch.setattr(Show, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(Live, "_start_characters", lambda live: [actor])
+    monkeypatch.setattr(LiveApp, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -113,10 +117,10 @@ def test_a_drawn_path_is_given_to_walk_and_none_is_said(show, actors):
 
 
 def test_rays_meet_the_ground():
-    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, -1, 1])) == (0.0, 2.0)
-    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, 0, 1])) is None
-    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, 1, 1])) is None
-    assert ground.on_the_ground(np.array([0.0, 2, 0]), np.array([0.0, -0.01, 1])) is None, "200 m away"
+    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, -1, 1])) == (0.0, 2.0)
+    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, 0, 1])) is None
+    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, 1, 1])) is None
+    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, -0.01, 1])) is None, "200 m away"
 
 
 @pytest.mark.parametrize("ending", ["bvh", "glb"])
@@ -129,7 +133,7 @@ def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
     motion, whole = recording.motion(), walk(90).slice(0, 30)
     np.testing.assert_allclose(motion.joint_positions(), whole.joint_positions(), atol=1e-9)
     path = tmp_path / f"x.{ending}"
-    path.write_bytes(as_file(motion, ending))
+    path.write_bytes(encode_motion(motion, ending))
     if ending == "bvh":
         read = formats.load(path)
         order = [read.skeleton.index(name) for name in CANONICAL.names]  # a BVH lists joints depth first
@@ -139,7 +143,7 @@ def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
 
 
 def test_a_recording_can_be_a_film():
-    assert as_file(walk(8), "mp4")[4:8] == b"ftyp"
+    assert encode_motion(walk(8), "mp4")[4:8] == b"ftyp"
 
 
 def test_a_recording_begins_and_ends_with_the_button(show, actors):
@@ -156,7 +160,7 @@ def test_a_recording_begins_and_ends_with_the_button(show, actors):
 
 
 def test_gauges_count_late_frames_and_know_the_speed(show):
-    gauges = Gauges(show.server.gui)
+    gauges = Readouts(show.server.gui)
     for first in range(0, 30, 3):
         gauges.add(delivered(first, spare=-0.04 if first == 27 else 0.01), 30)
     gauges.show()

@@ -15,9 +15,9 @@ from mapctl.errors import MapctlError
 from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL
 from scenes.live import recording as recording_module
-from scenes.live.app import Show
-from scenes.live.inputs import Orders
-from scenes.live.recording import Recording, as_some_file, keep
+from scenes.live.app import LiveApp
+from scenes.live.inputs import SteeringInputs
+from scenes.live.recording import Recording, encode_with_fallback, save_without_replacing
 
 
 @pytest.fixture
@@ -27,8 +27,12 @@ def actors():
 
 @pytest.fixture
 def show(actors):
-    made = Show(
-        actors, [Orders(), Orders()], port=8090, fastest=3.8, labels={"gait": ["run", "walk"], "style": ["old"]}
+    made = LiveApp(
+        actors,
+        [SteeringInputs(), SteeringInputs()],
+        port=8090,
+        fastest=3.8,
+        labels={"gait": ["run", "walk"], "style": ["old"]},
     )
     yield made
     made.close()
@@ -148,30 +152,34 @@ def test_a_file_that_cannot_be_made_comes_as_another_and_nothing_is_lost(monkeyp
             raise OSError("no space left")
         return b"HIERARCHY"
 
-    monkeypatch.setattr(recording_module, "as_file", made_up)
-    made = as_some_file(walk(8), "mp4")
-    assert (made.name, made.content, made.why) == ("mapctl.bvh", b"HIERARCHY", "no space left")
-    assert [keep(made, tmp_path).name for _ in range(3)] == ["mapctl.bvh", "mapctl-2.bvh", "mapctl-3.bvh"]
+    monkeypatch.setattr(recording_module, "encode_motion", made_up)
+    made = encode_with_fallback(walk(8), "mp4")
+    assert (made.name, made.content, made.fallback_reason) == ("mapctl.bvh", b"HIERARCHY", "no space left")
+    assert [save_without_replacing(made, tmp_path).name for _ in range(3)] == [
+        "mapctl.bvh",
+        "mapctl-2.bvh",
+        "mapctl-3.bvh",
+    ]
     assert (tmp_path / "mapctl-3.bvh").read_bytes() == b"HIERARCHY"
 
 
 def test_a_recording_that_goes_on_when_all_ends_is_kept(show, tmp_path):
-    assert show.keep_recordings(tmp_path) == []
+    assert show.save_recordings(tmp_path) == []
     show.toggle_recording(None)
     run(show, 5)
-    [path] = show.keep_recordings(tmp_path)
+    [path] = show.save_recordings(tmp_path)
     assert formats.load(path).num_frames == 15
-    assert show.keep_recordings(tmp_path) == []
+    assert show.save_recordings(tmp_path) == []
 
 
 def test_a_recording_for_somebody_who_left_is_written_here_where_nobody_else_is(show, said, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     recording = Recording(CANONICAL)
     recording.add(delivered())
-    show._hand_out(recording, "bvh", None)
+    show._export_recording(recording, "bvh", None)
     assert formats.load(tmp_path / "mapctl.bvh").num_frames == 3
     assert "nobody is left to take the recording" in said()[1]
-    show._hand_out(Recording(CANONICAL), "bvh", None)
+    show._export_recording(Recording(CANONICAL), "bvh", None)
     assert "Nothing saved: RequestError: nothing was recorded" in said()[1]
 
 

@@ -7,9 +7,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mapctl.intent.steering import Command
-from scenes.live.inputs import AS_IT_LIKES, Bounds, Orders
+from scenes.live.inputs import UNCONDITIONED, InputLimits, SteeringInputs
 
-BOUNDS = Bounds(3.8, {"gait": ["run", "walk"], "style": ["old"]})
+BOUNDS = InputLimits(3.8, {"gait": ["run", "walk"], "style": ["old"]})
 ANYTHING = st.one_of(
     st.floats(), st.integers(), st.text(max_size=5), st.none(), st.booleans(), st.lists(st.floats(), max_size=2)
 )
@@ -19,7 +19,7 @@ CHANGES = st.dictionaries(st.sampled_from(["speed", "heading", "facing", "step_l
 @settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)  # on a starved core
 @given(CHANGES, CHANGES)
 def test_whatever_is_asked_the_orders_are_a_command_within_bounds(first, second):
-    orders = Orders()
+    orders = SteeringInputs()
     for changes in (first, second):
         orders, refusals = BOUNDS.changed(orders, changes)
         command = orders.command
@@ -47,7 +47,7 @@ def test_whatever_is_asked_the_orders_are_a_command_within_bounds(first, second)
     ],
 )
 def test_what_cannot_be_is_brought_near_and_said_with_what_can(name, asked, held, text):
-    orders, refusals = BOUNDS.changed(Orders(), {name: asked})
+    orders, refusals = BOUNDS.changed(SteeringInputs(), {name: asked})
     value = getattr(orders, name)
     assert value == held or abs(value) == 180 == abs(held)
     [refusal] = refusals
@@ -56,18 +56,20 @@ def test_what_cannot_be_is_brought_near_and_said_with_what_can(name, asked, held
 
 
 def test_what_can_be_is_taken_as_it_is_without_a_word():
-    orders, refusals = BOUNDS.changed(Orders(), {"speed": 2, "heading": -180, "facing": 90.5, "step_length": 0.8})
-    assert (orders, refusals) == (Orders(2.0, -180.0, 90.5, 0.8), [])
+    orders, refusals = BOUNDS.changed(
+        SteeringInputs(), {"speed": 2, "heading": -180, "facing": 90.5, "step_length": 0.8}
+    )
+    assert (orders, refusals) == (SteeringInputs(2.0, -180.0, 90.5, 0.8), [])
     orders, refusals = BOUNDS.changed(orders, {"facing": None, "step_length": None})
-    assert (orders, refusals) == (Orders(2.0, -180.0), [])
+    assert (orders, refusals) == (SteeringInputs(2.0, -180.0), [])
 
 
 def test_labels_are_of_the_prior_and_of_one_group_at_a_time():
-    orders, refusals = BOUNDS.changed(Orders(), {"told": {"gait": "run"}})
+    orders, refusals = BOUNDS.changed(SteeringInputs(), {"told": {"gait": "run"}})
     orders, more = BOUNDS.changed(orders, {"told": {"style": "old"}})
     assert (orders.told, refusals + more) == ({"gait": "run", "style": "old"}, [])
     assert orders.command == Command(1.2, 0.0, told=("run", "old"))
     orders, refusals = BOUNDS.changed(orders, {"told": {"gait": "swim", "mood": "bad"}})
     assert orders.told == {"gait": "run", "style": "old"}
     assert refusals[0].text == "'swim' is not a gait that this prior knows."
-    assert BOUNDS.changed(orders, {"told": {"gait": AS_IT_LIKES}})[0].told == {"style": "old"}
+    assert BOUNDS.changed(orders, {"told": {"gait": UNCONDITIONED}})[0].told == {"style": "old"}

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from mapctl.runtime.live_protocol import Delivered
-from scenes.live.realtime import Pace
+from mapctl.runtime.live_protocol import FrameChunk
+from scenes.live.realtime import RealtimeMonitor
 
 
-def step(seconds: float, *, spare: float = 0.03, evaluations: int = 14) -> Delivered:
+def step(seconds: float, *, spare: float = 0.03, evaluations: int = 14) -> FrameChunk:
     """Three frames of a stream."""
     three = np.zeros((3, 3))
-    return Delivered(
+    return FrameChunk(
         0.0,
         seconds,
         three,
@@ -25,7 +25,9 @@ def step(seconds: float, *, spare: float = 0.03, evaluations: int = 14) -> Deliv
     )
 
 
-def played(pace: Pace, *, begin: float, until: float, every: float = 0.1, spare: float = 0.03) -> list[float]:
+def played(
+    pace: RealtimeMonitor, *, begin: float, until: float, every: float = 0.1, spare: float = 0.03
+) -> list[float]:
     """Steps that come at an interval; the times at which the judgement changed, looked at four times a second."""
     changes, steps, looks = [], np.arange(begin, until, every), np.arange(begin, until, 0.25) + 0.01
     for now in np.sort(np.concatenate([steps, looks])).tolist():
@@ -37,7 +39,7 @@ def played(pace: Pace, *, begin: float, until: float, every: float = 0.1, spare:
 
 
 def test_who_keeps_up_is_never_called_slow():
-    pace = Pace()
+    pace = RealtimeMonitor()
     assert not pace.judge(0.0)
     assert played(pace, begin=0.0, until=20.0) == []
     assert not pace.slow
@@ -45,7 +47,7 @@ def test_who_keeps_up_is_never_called_slow():
 
 @pytest.mark.parametrize("every", [0.1, 0.15, 0.3, 0.6])
 def test_too_slow_is_noticed_within_a_second_and_over_when_it_is_over(every):
-    pace = Pace()
+    pace = RealtimeMonitor()
     played(pace, begin=0.0, until=10.0)
     [noticed] = played(pace, begin=10.0, until=16.0, every=every, spare=-0.1)
     assert pace.slow
@@ -57,7 +59,7 @@ def test_too_slow_is_noticed_within_a_second_and_over_when_it_is_over(every):
 
 
 def test_half_the_pace_is_told_as_such():
-    pace = Pace()
+    pace = RealtimeMonitor()
     for k in range(40):
         pace.add(0.2 * k, step(0.1 * k, spare=-0.1, evaluations=6))
     assert pace.judge(7.9)
@@ -65,7 +67,7 @@ def test_half_the_pace_is_told_as_such():
 
 
 def test_one_hiccup_is_none_of_it_and_one_in_five_is():
-    pace = Pace()
+    pace = RealtimeMonitor()
     played(pace, begin=0.0, until=5.0)
     pace.add(5.2, step(5.0, spare=-0.1))
     assert not pace.judge(5.2)
@@ -79,7 +81,7 @@ def test_one_hiccup_is_none_of_it_and_one_in_five_is():
 
 
 def test_silence_is_noticed_too_but_not_in_a_pause():
-    pace = Pace()
+    pace = RealtimeMonitor()
     played(pace, begin=0.0, until=3.0)
     assert not pace.judge(3.5)
     assert pace.judge(3.9)

@@ -12,8 +12,8 @@ import pytest
 from tiny_prior import save_tiny_prior
 
 import priors
-from controllers.steering.process import Remote, RemoteRequest
-from controllers.steering.process_worker import work
+from controllers.steering.process import CharacterProcess, CharacterRequest
+from controllers.steering.process_worker import run_worker
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import LiveCharacter
@@ -26,7 +26,7 @@ def load(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def remote(load):
-    made = Remote(RemoteRequest(load, Command(1.2, 0.0), at=(3.0, -1.0)))
+    made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), at=(3.0, -1.0)))
     made.wait()
     yield made
     made.close()
@@ -105,13 +105,13 @@ def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
 
 
 def test_what_it_cannot_load_is_said():
-    broken = Remote(RemoteRequest(functools.partial(priors.load, "nobody"), Command(1.0, 0.0)))
+    broken = CharacterProcess(CharacterRequest(functools.partial(priors.load, "nobody"), Command(1.0, 0.0)))
     with pytest.raises(RequestError, match="no prior 'nobody'"):
         broken.wait()
 
 
 def test_who_is_gone_is_said_after_all_that_came_until_then_and_comes_back_by_a_reset(load):
-    lost = Remote(RemoteRequest(load, Command(1.0, 0.0)))
+    lost = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
     lost.wait()
     assert lost.memory_mb() > 10
     time.sleep(0.5)
@@ -146,7 +146,7 @@ def trapped(load):
 
 
 def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
-    broken = Remote(RemoteRequest(functools.partial(trapped, load), Command(1.0, 0.0)))
+    broken = CharacterProcess(CharacterRequest(functools.partial(trapped, load), Command(1.0, 0.0)))
     broken.wait()
     with pytest.raises(MapctlError, match=r"^a character's process ended: ZeroDivisionError: .*\(rollout, line \d+\)$"):
         collected(broken, 5.0)
@@ -155,7 +155,7 @@ def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
 
 
 def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
-    made = Remote(RemoteRequest(load, Command(1.0, 0.0)))
+    made = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
     for _ in range(20):  # while it imports
         os.kill(made._process.pid, signal.SIGINT)
         time.sleep(0.05)
@@ -176,7 +176,7 @@ def test_an_end_that_is_wanted_is_no_failure(load):
     """Else who is started anew after an end is taken for ended, too."""
     here, there = Pipe()
     here.send(("close",))
-    work(there, RemoteRequest(load, Command(1.0, 0.0)))
+    run_worker(there, CharacterRequest(load, Command(1.0, 0.0)))
     words = []
     while here.poll():
         words.append(here.recv()[0])

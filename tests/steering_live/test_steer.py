@@ -9,10 +9,10 @@ from helpers import generator, tiny_density
 from tiny_prior import save_tiny_prior
 
 import priors
-from controllers.benchmarks.steering import SteeringSettings, steering
+from controllers.benchmarks.steering import SteeringBenchmarkSettings, benchmark_steering
 from controllers.steering import steer
-from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, timing
-from controllers.steering.pure_pursuit import Pursuit
+from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
+from controllers.steering.pure_pursuit import PurePursuit
 from controllers.steering.steer import SteerSettings
 from mapctl import curves
 from mapctl.errors import RequestError
@@ -56,7 +56,7 @@ def test_a_step_is_pure_and_the_same_to_the_bit():
 def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
     _, pieces = steered(3)
     for piece in pieces[1:]:
-        assert piece.motion.num_frames == len(piece.wishes) == len(piece.contacts) == 3
+        assert piece.motion.num_frames == len(piece.steering_targets) == len(piece.contacts) == 3
         assert piece.forecast.shape == (5, 21, 3)
         assert 1 <= piece.evaluations <= 4
         assert {entry.name for entry in piece.ledger.entries} == {"noise", "travel", "footing"}
@@ -69,7 +69,7 @@ def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
 def test_the_state_does_not_grow():
     def size(state):
         done = state.committed
-        return done.features.shape, done.joints_world.shape, state.owed.shape, len(done.windows)
+        return done.features.shape, done.joints_world.shape, state.past_targets.shape, len(done.windows)
 
     early, _ = steered(25)
     late = early
@@ -90,7 +90,7 @@ def test_without_time_it_still_delivers_searches_the_least_and_says_so(least, ma
 
 def test_who_is_stuck_without_time_gets_the_draws_and_half_of_the_least_twice():
     state, _ = steered(8)
-    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, draws=5))
+    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, random_starts=5))
     _, piece = steer.step(stuck, AHEAD, seconds=0.0)
     assert piece.evaluations == 5 + 1 + 1
 
@@ -98,7 +98,7 @@ def test_who_is_stuck_without_time_gets_the_draws_and_half_of_the_least_twice():
 def test_who_is_stuck_is_searched_without_footing_first():
     """Both searches count, and together with the draws they are no more than were allowed."""
     state, _ = steered(8)
-    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, draws=5))
+    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, random_starts=5))
     (_, plain), (_, freed) = steer.step(state, AHEAD), steer.step(stuck, AHEAD)
     assert 5 < freed.evaluations <= 4 + 5
     assert not torch.equal(plain.motion.local_quat_xyzw, freed.motion.local_quat_xyzw)
@@ -106,7 +106,7 @@ def test_who_is_stuck_is_searched_without_footing_first():
 
 def test_motion_that_is_not_finite_is_replaced_by_the_priors_own():
     state, _ = steered(2)
-    broken = replace(state, committed=replace(state.committed, tail=state.committed.tail * math.nan))
+    broken = replace(state, committed=replace(state.committed, warm_start=state.committed.warm_start * math.nan))
     _, piece = steer.step(broken, AHEAD)
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
     assert bool(torch.isfinite(piece.motion.root_position).all())
@@ -148,7 +148,7 @@ def test_the_loop_asks_a_step_before_frames_are_due_and_shows_them_all():
     state, records = drive(state, source, [recorder], frames=20, clock=StreamClock())
     assert state.frames == 22
     assert recorder.motion(20).num_frames == 20
-    assert len(recorder.wishes) == 22
+    assert len(recorder.steering_targets) == 22
     assert source.times == pytest.approx([k / 10 + 1 / 30 - 0.1 for k in range(7)])
     assert [record.due for record in records] == pytest.approx([k / 10 + 1 / 30 for k in range(7)])
     assert all(len(entry.energy) == 21 for entry in recorder.ledger.entries)
@@ -159,7 +159,7 @@ def test_in_stream_time_nothing_is_late_and_the_result_is_always_the_same():
     for _ in range(2):
         state, recorder = begun()[0], Recorder()
         _, records = drive(state, CommandTrack((0.0, 0.5), (AHEAD, Command(0.5, 1.0))), [recorder], frames=30)
-        assert timing(records)["late_frames"] == 0
+        assert summarise_step_timing(records)["late_frames"] == 0
         motions.append(recorder.motion().local_quat_xyzw)
     assert torch.equal(*motions)
 
@@ -177,7 +177,7 @@ class Slow(StreamClock):
 def test_what_comes_too_late_is_counted_and_the_search_is_given_up():
     state, _ = begun()
     _, records = drive(state, Heard(), [], frames=7, clock=Slow())
-    cost = timing(records)
+    cost = summarise_step_timing(records)
     assert cost["late_frames"] == 6
     assert cost["steps_cut_short"] == 2
     assert cost["evaluations_per_frame"] == pytest.approx(2 / 3)
@@ -214,7 +214,7 @@ def test_time_stretches_where_steps_take_longer_than_their_frames_last_and_no_fr
     _, records = drive(begun()[0], clock, [shown], frames=120, clock=clock)
     assert shown.motion().num_frames == 120
     streamed = records[-1].due - records[0].due
-    assert streamed / (streamed + timing(records)["held_s"]) == pytest.approx(rate, abs=0.03)
+    assert streamed / (streamed + summarise_step_timing(records)["held_s"]) == pytest.approx(rate, abs=0.03)
     assert max(record.delivered - record.due for record in records[3:]) <= 0.1 + seconds, "the lag does not grow"
     asked = [record.asked - record.due for record in records]
     assert min(asked) >= -0.1 - 1e-9
@@ -259,16 +259,16 @@ def test_ctrl_c_keeps_what_was_shown():
 
 def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
     records = [StepRecord(3, k / 10, k / 10 + 0.1, k / 10 + 0.05, 0.06, 4, "") for k in range(5)]
-    assert timing(records, [0.1])["command_latency_s"] == pytest.approx(0.1)
-    assert timing(records, [0.11, 0.3])["command_latency_s"] == pytest.approx(0.19)
-    assert timing(records)["command_latency_s"] == pytest.approx(0.2)
-    assert timing(records)["frame_ms_p50"] == pytest.approx(20)
-    assert timing(records)["evaluations_per_frame"] == pytest.approx(4 / 3)
+    assert summarise_step_timing(records, [0.1])["command_latency_s"] == pytest.approx(0.1)
+    assert summarise_step_timing(records, [0.11, 0.3])["command_latency_s"] == pytest.approx(0.19)
+    assert summarise_step_timing(records)["command_latency_s"] == pytest.approx(0.2)
+    assert summarise_step_timing(records)["frame_ms_p50"] == pytest.approx(20)
+    assert summarise_step_timing(records)["evaluations_per_frame"] == pytest.approx(4 / 3)
 
 
 @pytest.mark.slow
 def test_the_bench_sorts_changes_by_kind_and_counts_them_all():
-    rows = steering(DENSITY, SteeringSettings(commands=6, shortest=0.2, longest=0.3, seed=2))
+    rows = benchmark_steering(DENSITY, SteeringBenchmarkSettings(commands=6, shortest=0.2, longest=0.3, seed=2))
     *kinds, whole = rows
     assert whole["change"] == "all"
     assert sum(row["commands"] for row in kinds) == whole["commands"] == 6
@@ -278,7 +278,7 @@ def test_the_bench_sorts_changes_by_kind_and_counts_them_all():
 
 def test_pursuit_heads_for_the_curve_ahead_of_the_character():
     curve = curves.line(length=10)
-    pursuit = Pursuit(curve, speed=1.0, look_ahead=0.5)
+    pursuit = PurePursuit(curve, speed=1.0, look_ahead=0.5)
     assert pursuit.at(0).heading == pytest.approx(curve.start_heading)
     x, z = curve.point(0.3)[[0, -1]].tolist()
     _, first = steer.begin(DENSITY, AHEAD, generator=generator(), at=(x + 0.5, z))
@@ -288,7 +288,7 @@ def test_pursuit_heads_for_the_curve_ahead_of_the_character():
 
 
 def test_pursuit_is_both_ends_of_a_loop():
-    pursuit = Pursuit(curves.circle(radius=2), speed=1.0)
+    pursuit = PurePursuit(curves.circle(radius=2), speed=1.0)
     state, _ = begun(pursuit.first)
     _, records = drive(state, pursuit, [pursuit], frames=10)
     assert len(records) == 3

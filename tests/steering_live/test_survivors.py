@@ -12,9 +12,9 @@ from test_terms_contract import trial
 
 from controllers.steering import loop, steer
 from controllers.steering.loop import LoopSettings
-from mapctl.intent.steering import Command, Limits, Wish
-from mapctl.problem.window_solvers import LatentMethod
-from mapctl.terms import Footing
+from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
+from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.terms import FootContact
 
 
 @pytest.mark.parametrize("planted", [True, False])
@@ -23,7 +23,7 @@ def test_a_toe_below_the_ground_costs_whether_it_is_planted_or_not(planted):
     one = replace(one, contacts=torch.full_like(one.contacts, planted))
     toes = [one.skeleton.index(name) for name in ("leftToes", "rightToes")]
     lowest = float(one.joints_world[..., toes, 1].amin())
-    free = Footing(rest_height=lowest, sigma_speed=1e6, sigma_height=1e6)
+    free = FootContact(rest_height=lowest, sigma_speed=1e6, sigma_height=1e6)
     sunk = replace(free, rest_height=lowest + 0.2)
     below = (one.joints_world[..., toes, 1] - sunk.rest_height).clamp(max=0)
     assert float(free(one).sum()) == pytest.approx(0, abs=1e-6)
@@ -44,7 +44,7 @@ def test_each_window_is_given_what_the_last_found_for_the_same_frames(frames):
     step = SHORT.frames - SHORT.overlap
     for tail, carry in zip(given[1:], found, strict=False):
         assert torch.equal(tail, carry[step:])
-    assert torch.equal(done.tail, found[-1][done.windows[-1].frames :])
+    assert torch.equal(done.warm_start, found[-1][done.windows[-1].frames :])
     assert len(given[1]) == SHORT.overlap
 
 
@@ -63,9 +63,9 @@ def test_a_warm_start_begins_at_the_first_frame_of_the_window(monkeypatch):
 
 
 def test_speed_falls_by_the_braking_limit_and_rises_by_the_acceleration():
-    limits = Limits(acceleration=3.0, braking=0.5)
-    assert Wish(2.0, 0, 0).toward(Command(0, 0), limits, 1.0).speed == pytest.approx(1.5)
-    assert Wish(0.0, 0, 0).toward(Command(9, 0), limits, 1.0).speed == pytest.approx(3.0)
+    limits = SteeringLimits(acceleration=3.0, braking=0.5)
+    assert SteeringTarget(2.0, 0, 0).step_toward(Command(0, 0), limits, 1.0).speed == pytest.approx(1.5)
+    assert SteeringTarget(0.0, 0, 0).step_toward(Command(9, 0), limits, 1.0).speed == pytest.approx(3.0)
 
 
 class Still:
@@ -106,14 +106,14 @@ def test_a_search_ends_by_the_margin_before_its_frames_are_due(monkeypatch, marg
 
 def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypatch):
     budgets = []
-    solve = LatentMethod.__call__
+    solve = LatentNoiseSolver.__call__
 
     def watched(self, context, terms, tail, generator, *, seconds=math.inf):
         budgets.append((self.budget.within(seconds).seconds, {term.name for term in terms}))
         return solve(self, context, terms, tail, generator, seconds=math.inf)
 
-    monkeypatch.setattr(LatentMethod, "__call__", watched)
-    stuck = replace(begun()[0], settings=replace(QUICK, stuck=-1.0, draws=5))
+    monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
+    stuck = replace(begun()[0], settings=replace(QUICK, stuck=-1.0, random_starts=5))
     steer.step(stuck, AHEAD, seconds=60.0)
     (first, loose), (second, whole) = budgets
     assert first == pytest.approx(30)
@@ -123,13 +123,13 @@ def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypat
 
 
 def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
-    given, solve = [], LatentMethod.__call__
+    given, solve = [], LatentNoiseSolver.__call__
 
     def watched(self, context, terms, tail, generator, *, seconds=math.inf):
         given.append(seconds)
         return solve(self, context, terms, tail, generator)
 
-    monkeypatch.setattr(LatentMethod, "__call__", watched)
+    monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
     terms = terms_of(1, SHORT.frames)
-    steer._StepFirst(METHOD, METHOD, terms)(context(BEGUN), terms, BEGUN.tail, generator(), seconds=8.0)
+    steer._RelaxedFootingFirst(METHOD, METHOD, terms)(context(BEGUN), terms, BEGUN.warm_start, generator(), seconds=8.0)
     assert given == [4.0, 4.0]

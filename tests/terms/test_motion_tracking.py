@@ -4,15 +4,15 @@ import pytest
 import torch
 from helpers import generator, walk
 
-from mapctl.features import LAYOUT, Place, encode
-from mapctl.terms import Closeness
+from mapctl.features import LAYOUT, GroundPose, encode
+from mapctl.terms import MotionTracking
 from mapctl.terms.trial import Trial
 
 TARGET = encode(walk(20, turn_rate=0.3))[0]
 
 
 def trial(features: torch.Tensor, *, heading: float = 0.0) -> Trial:
-    place = Place(torch.tensor([2.0, -1.0]).double(), torch.tensor(heading).double())
+    place = GroundPose(torch.tensor([2.0, -1.0]).double(), torch.tensor(heading).double())
     bits = LAYOUT.pick(features, "contacts") > 0.5
     return Trial(
         features[None], place, features[None], features[None, :, 0], bits[None], torch.zeros(0, 21, 3).double()
@@ -21,7 +21,7 @@ def trial(features: torch.Tensor, *, heading: float = 0.0) -> Trial:
 
 @pytest.mark.parametrize("heading", [0.0, 2.0, -7.0])
 def test_the_motion_itself_costs_nothing_wherever_it_stands(heading):
-    term = Closeness(TARGET)
+    term = MotionTracking(TARGET)
     assert float(term(trial(TARGET, heading=heading)).abs().max()) < 1e-12
     assert float(term.residual(trial(TARGET, heading=heading)).max()) < 1e-6
 
@@ -33,28 +33,28 @@ def moved(block: str, by: float, *, column: int = 0) -> torch.Tensor:
 
 
 def test_height_costs_half_its_square_in_sigmas():
-    energy = Closeness(TARGET, sigma_height=0.05)(trial(moved("root_height", 0.1)))
+    energy = MotionTracking(TARGET, sigma_height=0.05)(trial(moved("root_height", 0.1)))
     torch.testing.assert_close(energy[0], torch.full((20,), 0.5 * 4.0).double())
 
 
 def test_the_way_is_counted_from_the_windows_beginning():
     features = TARGET.clone()
     features[0, LAYOUT.slices["root_displacement_heading"].start] += 0.1  # one side step, kept from then on
-    energy = Closeness(TARGET, sigma_way=0.2)(trial(features, heading=1.0))
+    energy = MotionTracking(TARGET, sigma_trajectory=0.2)(trial(features, heading=1.0))
     torch.testing.assert_close(energy[0], torch.full((20,), 0.5 * 0.25).double())
 
 
 def test_a_turn_costs_under_its_own_sigma_and_carries_the_way_along():
     features = TARGET.clone()
     features[-1, LAYOUT.slices["heading_change"]] += 0.3
-    energy = Closeness(TARGET, sigma_turn=0.15)(trial(features))
+    energy = MotionTracking(TARGET, sigma_heading=0.15)(trial(features))
     torch.testing.assert_close(energy[0, -1], torch.tensor(0.5 * 4.0).double())
     assert float(energy[0, :-1].abs().max()) < 1e-12
 
 
 def test_a_pose_costs_the_mean_square_of_its_joints():
     features = moved("joint_rotations", 0.2, column=3 * 9 + 1)
-    term = Closeness(TARGET, sigma_pose=0.02, joints_that_count=5.0)
+    term = MotionTracking(TARGET, sigma_pose=0.02, effective_joints=5.0)
     made, wanted = (trial(f).joints_world - trial(f).joints_world[:, :, :1] for f in (features, TARGET))
     squares = (made - wanted).square().sum(-1).mean(-1)
     torch.testing.assert_close(term(trial(features)), 0.5 * 5.0 * squares / 0.02**2)
@@ -64,7 +64,7 @@ def test_a_pose_costs_the_mean_square_of_its_joints():
 
 def test_its_gradient_is_finite_at_the_target_and_points_back_to_it():
     features = (TARGET + 0.01 * torch.randn(TARGET.shape, generator=generator()).double()).requires_grad_()
-    term = Closeness(TARGET)
+    term = MotionTracking(TARGET)
     energy = term(trial(features)).sum()
     (slope,) = torch.autograd.grad(energy, features)
     nearer = features.detach() - 1e-4 * slope / slope.norm()

@@ -8,7 +8,7 @@ import torch
 from catalogue import FRAMES, TERMS
 from helpers import walk
 
-from mapctl.features import LAYOUT, encode, root_places
+from mapctl.features import LAYOUT, encode, integrate_root
 from mapctl.terms import Observation
 from mapctl.terms.trial import Trial
 
@@ -28,7 +28,7 @@ def trial_of(seed=1) -> Trial:
 
 def observed(trial: Trial, **changes) -> Observation:
     """What a capture without any noise shows of a trial."""
-    ground, heading = root_places(trial.features[0], trial.start)
+    ground, heading = integrate_root(trial.features[0], trial.start)
     height = LAYOUT.pick(trial.features[0], "root_height")
     root = torch.cat([ground[:, :1], height, ground[:, 1:]], dim=-1)
     seen = torch.ones(FRAMES, 21).bool()
@@ -45,7 +45,7 @@ def test_what_was_seen_exactly_costs_nothing():
 
 def test_it_is_half_the_squares_over_the_sigmas():
     trial, term = trial_of(), replace(TERMS["observation"], outlier=1e9)
-    ground, heading = root_places(trial.features[0], trial.start)
+    ground, heading = integrate_root(trial.features[0], trial.start)
     expected = torch.zeros(FRAMES).double()
     for frame in range(FRAMES):
         place = torch.stack([ground[frame, 0], trial.features[0, frame, 3], ground[frame, 1]])

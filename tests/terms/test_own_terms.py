@@ -8,7 +8,7 @@ from test_terms_contract import trial
 
 from mapctl.errors import RequestError
 from mapctl.problem.objective import Objective
-from mapctl.terms import Noise
+from mapctl.terms import LatentPrior
 from mapctl.terms.trial import Trial
 
 
@@ -36,7 +36,7 @@ def objective(term):
         noise = unknowns.unflatten(-1, BASE.noise.shape[1:])
         return Trial(BASE.features, BASE.start, noise, BASE.log_density, BASE.contacts, BASE.before)
 
-    return Objective(build, (Noise(), term))
+    return Objective(build, (LatentPrior(), term))
 
 
 START = torch.zeros_like(BASE.noise).flatten(1)
@@ -59,7 +59,7 @@ def test_a_wrong_shape_is_named_with_the_one_expected(name):
         objective(Own(wrong)).energy_and_gradient(START)
     right = Own(lambda noise: noise.square().sum(-1), wrong)
     with pytest.raises(RequestError, match=f"the term 'own' gave a residual of .*{told}"):
-        objective(right).ledger_of(BASE)
+        objective(right).build_ledger(BASE)
 
 
 @pytest.mark.parametrize("what", NONE)
@@ -68,7 +68,7 @@ def test_what_is_not_finite_is_named(what):
         objective(Own(NONE[what])).energy_and_gradient(START)
     right = Own(lambda noise: noise.square().sum(-1), NONE["energy"])
     with pytest.raises(RequestError, match="the term 'own' gave a residual that is not finite"):
-        objective(right).ledger_of(BASE)
+        objective(right).build_ledger(BASE)
 
 
 def test_a_motion_that_is_not_finite_is_no_terms_fault():

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from mapctl.features import LAYOUT, Place
-from mapctl.terms import Travel
+from mapctl.features import LAYOUT, GroundPose
+from mapctl.terms import RootVelocity
 from mapctl.terms.trial import Trial
 
 FRAMES, PAST = 40, 30
@@ -23,14 +23,14 @@ def gliding(speed: float, direction: float, *, facing: float = 0.0) -> Trial:
     back = -step * torch.arange(PAST - 1, -1, -1)
     before[..., 0] = (back * math.sin(direction))[:, None]
     before[..., 2] = (back * math.cos(direction))[:, None]
-    place = Place(torch.zeros(2, dtype=torch.float64), torch.tensor(facing, dtype=torch.float64))
+    place = GroundPose(torch.zeros(2, dtype=torch.float64), torch.tensor(facing, dtype=torch.float64))
     bits = torch.zeros(1, FRAMES, 2, dtype=torch.bool)
     return Trial(features, place, features, features[..., 0], bits, before)
 
 
-def wanting(speed: float, direction: float, **more) -> Travel:
+def wanting(speed: float, direction: float, **more) -> RootVelocity:
     velocity = speed * torch.tensor([math.sin(direction), math.cos(direction)], dtype=torch.float64)
-    return Travel(velocity.expand(FRAMES, 2), velocity.expand(PAST, 2), **more)
+    return RootVelocity(velocity.expand(FRAMES, 2), velocity.expand(PAST, 2), **more)
 
 
 @pytest.mark.parametrize("direction", [0.0, 2.0, -3.0])

@@ -10,10 +10,10 @@ from helpers import generator, walk
 
 from mapctl import terms
 from mapctl.curves import line
-from mapctl.features import LAYOUT, Place, encode, root_places
+from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.rotations import rotate_ground
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
-from mapctl.terms import Footing, Likelihood, Noise, Path, Seam
+from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood, Path
 from mapctl.terms.trial import Trial
 
 PAST = 8
@@ -25,12 +25,12 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     """Windows of a walk, each disturbed on its own, with the frames of the walk before it."""
     motion = walk(PAST + FRAMES, turn_rate=0.2)
     vectors, start = encode(motion)
-    ground, heading = root_places(vectors[:PAST], start)
+    ground, heading = integrate_root(vectors[:PAST], start)
     scale = disturbed * vectors.std(0)
     features = vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
     bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
-    place = Place(ground[-1].to(dtype), heading[-1].to(dtype))
+    place = GroundPose(ground[-1].to(dtype), heading[-1].to(dtype))
     before = motion.joint_positions()[PAST - past : PAST].to(dtype)
     planted = torch.tensor([True, False])
     return Trial(
@@ -90,7 +90,7 @@ def test_energies_and_residuals_are_not_negative_but_for_densities(name):
 
 @each_term
 def test_some_disturbance_costs_more(name):
-    if not isinstance(TERMS[name], Footing | Seam):
+    if not isinstance(TERMS[name], FootContact | Jerk):
         return  # likelihood and noise do not judge the pose, and the walk is not on the paths to begin with
     calm, wild = (TERMS[name](trial(16, disturbed=size)).sum() for size in (0.0, 1.0))
     assert float(wild) > float(calm)
@@ -151,7 +151,7 @@ def test_the_gradient_is_finite_where_nothing_is_wrong(name):
 def test_moving_the_whole_scene_changes_nothing(name, turn):
     here, term, shift = trial(), TERMS[name], (3.0, -2.0)
     angle = torch.tensor(turn, dtype=torch.float64)
-    place = Place(
+    place = GroundPose(
         rotate_ground(here.start.position_xz, angle) + torch.tensor(shift).double(), here.start.heading + turn
     )
     before = here.before.clone()
@@ -197,12 +197,12 @@ def test_likelihood_and_noise_are_their_formulas():
     torch.testing.assert_close(Likelihood(3.0).residual(whole), -whole.log_density)
     normal = torch.distributions.Normal(0.0, 0.2)
     relative = normal.log_prob(torch.zeros(())) * LAYOUT.continuous - normal.log_prob(whole.noise).sum(-1)
-    torch.testing.assert_close(Noise(0.2)(whole), relative)
+    torch.testing.assert_close(LatentPrior(0.2)(whole), relative)
 
 
 def test_a_walk_to_the_left_of_a_line_is_off_by_as_much():
     whole = trial(1, disturbed=0.0)
-    beside = replace(whole, start=Place(torch.tensor([0.25, 0.0]).double(), torch.tensor(0.0).double()))
+    beside = replace(whole, start=GroundPose(torch.tensor([0.25, 0.0]).double(), torch.tensor(0.0).double()))
     straight = walk(FRAMES + 1)
     vectors, _ = encode(straight)
     beside = replace(beside, features=vectors[None, 1:], before=whole.before[:0])
@@ -223,28 +223,28 @@ def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():
     speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
     above = places[1:, :, 1] - TOE_REST_HEIGHT
     expected = 0.5 * ((speed / 0.03) ** 2 + (above / 0.01) ** 2 + (above.clamp(max=0) / 0.005) ** 2).sum(-1)
-    torch.testing.assert_close(Footing()(resting)[0], expected, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(Footing().residual(resting)[0], speed.amax(-1), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(FootContact()(resting)[0], expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(FootContact().residual(resting)[0], speed.amax(-1), rtol=1e-4, atol=1e-5)
     free = replace(whole, contacts=~planted)
-    assert float(Footing().residual(free).abs().max()) == 0
-    assert float(Footing()(free).max()) < float(Footing()(resting).min()) + 1e-6
+    assert float(FootContact().residual(free).abs().max()) == 0
+    assert float(FootContact()(free).max()) < float(FootContact()(resting).min()) + 1e-6
 
 
 def test_a_toe_that_lands_as_the_window_begins_is_not_held_by_its_swing():
     whole = trial(2, disturbed=0.0)
     both, left = torch.ones_like(whole.contacts), torch.tensor([[True, False], [False, False]])
     landing = replace(whole, contacts=both, contacts_before=torch.zeros(2, dtype=torch.bool))
-    assert float(Footing().residual(landing)[:, 0].max()) == 0
-    standing = Footing().residual(replace(landing, contacts_before=left))
+    assert float(FootContact().residual(landing)[:, 0].max()) == 0
+    standing = FootContact().residual(replace(landing, contacts_before=left))
     assert float(standing[0, 0]) > 0
     assert float(standing[1, 0]) == 0
-    torch.testing.assert_close(standing[:, 1:], Footing().residual(landing)[:, 1:])
+    torch.testing.assert_close(standing[:, 1:], FootContact().residual(landing)[:, 1:])
 
 
 def test_the_seam_sees_a_jump_at_its_start_and_nothing_beyond():
     smooth = trial(1, disturbed=0.0)
     jumped = replace(smooth, before=smooth.before + torch.tensor([0.0, 0.05, 0.0]).double())
-    calm, loud = Seam().residual(smooth)[0], Seam().residual(jumped)[0]
+    calm, loud = Jerk().residual(smooth)[0], Jerk().residual(jumped)[0]
     assert float(loud[:3].min()) > 10 * float(calm.max())
     assert float(loud[3:].abs().max()) == 0
-    assert float(Seam()(replace(smooth, before=smooth.before[:2])).abs().max()) == 0
+    assert float(Jerk()(replace(smooth, before=smooth.before[:2])).abs().max()) == 0

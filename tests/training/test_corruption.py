@@ -9,7 +9,7 @@ from helpers import corpus, generator
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, clean_capture, corrupted
+from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, corrupt, make_clean_capture
 
 JOINTS = CANONICAL.num_joints
 NOTHING = CorruptionSettings(
@@ -23,11 +23,11 @@ BATCH, FRAMES = 40, 50
 def clean():
     features = corpus().features
     starts = torch.arange(BATCH) * 10 % (len(features) - FRAMES)
-    return clean_capture(torch.stack([features[start : start + FRAMES] for start in starts.tolist()]))
+    return make_clean_capture(torch.stack([features[start : start + FRAMES] for start in starts.tolist()]))
 
 
 def spoilt(clean, settings=NOTHING, seed=0):
-    return corrupted(clean, settings, generator(seed))
+    return corrupt(clean, settings, generator(seed))
 
 
 def turned_deg(clean, other):
@@ -42,7 +42,7 @@ def turned_deg(clean, other):
 
 def test_a_clean_capture_is_the_features():
     features = corpus().features[None, :60]
-    capture = clean_capture(features)
+    capture = make_clean_capture(features)
     assert capture.seen.all()
     assert capture.seen_root.all()
     assert not capture.sigma.any()

@@ -8,9 +8,9 @@ from helpers import generator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapctl.numerics.intervals import runs
+from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.gap_masks import GapSettings, known_places
+from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
 
 BATCH, FRAMES = 400, 120
 GAPS = GapSettings(keys=0.0, joints=0.0, partial=0.0, several=1)
@@ -20,13 +20,15 @@ JOINTS = GapSettings(keys=0.0, joints=1.0)
 
 def drawn(recipe, progress=0.0, *, seed=0, frames=FRAMES, present=None):
     present = torch.ones(BATCH, frames, dtype=torch.bool) if present is None else present
-    return known_places(present, recipe, progress=progress, generator=generator(seed))
+    return sample_observation_mask(present, recipe, progress=progress, generator=generator(seed))
 
 
 def lengths(known):
     """Of all gaps that are whole frames and do not reach a window's end."""
     lost = ~known.any(dim=2)
-    return torch.tensor([stop - start for _, start, stop in runs(lost.T) if start > 0 and stop < lost.shape[1]])
+    return torch.tensor(
+        [stop - start for _, start, stop in true_intervals(lost.T) if start > 0 and stop < lost.shape[1]]
+    )
 
 
 def test_a_gap_is_as_long_as_asked_for_and_grows_until_it_is_grown_up():
@@ -40,12 +42,14 @@ def test_a_gap_is_as_long_as_asked_for_and_grows_until_it_is_grown_up():
 
 def test_the_mean_length_is_told():
     recipe = GapSettings(shortest=10, longest=120, grown=0.3)
-    assert [recipe.mean_length(progress) for progress in (0.0, 0.15, 0.3, 0.9)] == pytest.approx([10, 65, 120, 120])
+    assert [recipe.interpolate_mean_length(progress) for progress in (0.0, 0.15, 0.3, 0.9)] == pytest.approx(
+        [10, 65, 120, 120]
+    )
 
 
 def test_there_are_several_gaps_but_not_too_many():
     known = drawn(replace(GAPS, several=3, spread=2.0), 0.2)
-    counts = torch.tensor([len(list(runs(~window.any(dim=1)[:, None]))) for window in known])
+    counts = torch.tensor([len(list(true_intervals(~window.any(dim=1)[:, None]))) for window in known])
     assert counts.max() == 3
     assert all((counts == count).any() for count in (1, 2, 3))
 
@@ -65,7 +69,7 @@ def test_partly_known_gaps_keep_some_joints():
 
 def test_keys_are_single_frames_or_pairs_as_far_apart_as_gaps_are_long():
     known = drawn(KEYS, 0.5).all(dim=2)
-    pairs = [stop - start for _, start, stop in runs(known.T)]
+    pairs = [stop - start for _, start, stop in true_intervals(known.T)]
     assert sum(length <= 2 for length in pairs) > 0.8 * len(pairs)
     early = drawn(KEYS, 0.0).all(dim=2)
     assert early.double().mean() > 3 * known.double().mean()

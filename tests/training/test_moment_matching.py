@@ -7,8 +7,8 @@ from helpers import corpus, finite_difference, generator, tiny_model
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.moment_matching import MatchingSettings, compare, mismatch
-from priors.training.recipes.lstm_gmm import Trainer, TrainingSettings
+from priors.training.moment_matching import MatchingSettings, free_run_moment_loss, moment_loss
+from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 
 SETTINGS = MatchingSettings(batch=8, context=10, wander=0, frames=10)
 
@@ -18,7 +18,7 @@ def windows(frames: int = 24) -> torch.Tensor:
 
 
 def test_windows_compared_with_themselves_match():
-    assert float(compare(windows(), windows(), SETTINGS)) == 0
+    assert float(moment_loss(windows(), windows(), SETTINGS)) == 0
 
 
 def changed(block: str, change) -> torch.Tensor:
@@ -44,14 +44,14 @@ def shaken(values: torch.Tensor) -> torch.Tensor:
 )
 def test_each_fault_costs_under_the_weight_that_is_meant_for_it(made, weight):
     off = {name: 0.0 for name in ("feet", "jerk", "pace", "spread", "drift") if name != weight}
-    assert float(compare(made, windows(), MatchingSettings(**off))) > 0.05
+    assert float(moment_loss(made, windows(), MatchingSettings(**off))) > 0.05
 
 
 def test_stiller_feet_than_mocaps_cost_nothing():
     only_feet = MatchingSettings(jerk=0, pace=0, spread=0, drift=0)
     sliding = changed("root_displacement_heading", lambda step: 1.5 * step)
-    assert float(compare(windows(), sliding, only_feet)) == 0
-    assert float(compare(sliding, windows(), only_feet)) > 0
+    assert float(moment_loss(windows(), sliding, only_feet)) == 0
+    assert float(moment_loss(sliding, windows(), only_feet)) > 0
 
 
 def test_its_gradient_is_that_of_the_run_with_the_draws_held():
@@ -62,7 +62,7 @@ def test_its_gradient_is_that_of_the_run_with_the_draws_held():
     def value(bias: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
             model.out.bias.copy_(bias)
-        return mismatch(model, windows().double(), SETTINGS, generator())
+        return free_run_moment_loss(model, windows().double(), SETTINGS, generator())
 
     (gradient,) = torch.autograd.grad(value(at), model.out.bias)
     expected = finite_difference(lambda bias: value(bias).detach(), at, direction)
@@ -75,7 +75,7 @@ def test_descending_it_lowers_it():
     losses = []
     for _ in range(25):
         optimiser.zero_grad()
-        losses.append(mismatch(model, windows(), SETTINGS, generator()))
+        losses.append(free_run_moment_loss(model, windows(), SETTINGS, generator()))
         losses[-1].backward()
         optimiser.step()
     assert losses[-1].item() < 0.6 * losses[0].item()
@@ -85,7 +85,7 @@ def test_training_runs_free_once_it_has_begun(monkeypatch):
     settings = TrainingSettings(
         steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, every=1, wander=0, batch=4)
     )
-    trainer, runs = Trainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
+    trainer, runs = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
     draw = trainer.model.draw
     monkeypatch.setattr(trainer.model, "draw", lambda *run: (runs.append(trainer.step), draw(*run))[1])
     for _ in range(4):
@@ -94,9 +94,11 @@ def test_training_runs_free_once_it_has_begun(monkeypatch):
 
 
 def test_windows_too_short_for_a_run_are_refused():
-    trainer = Trainer(LstmGmmConfig(width=8, components=1), TrainingSettings(steps=1, batch=2, window=4), corpus())
+    trainer = DensityTrainer(
+        LstmGmmConfig(width=8, components=1), TrainingSettings(steps=1, batch=2, window=4), corpus()
+    )
     with pytest.raises(RequestError, match="at least 6 frames, got 5"):
-        mismatch(trainer.model, windows(5), SETTINGS, generator())
+        free_run_moment_loss(trainer.model, windows(5), SETTINGS, generator())
 
 
 def test_runs_that_wander_first_are_compared_all_the_same():
@@ -104,7 +106,7 @@ def test_runs_that_wander_first_are_compared_all_the_same():
     lengths, model = [], tiny_model()
     sample = model.sample
     model.sample = lambda state, frames, generator: (lengths.append(frames), sample(state, frames, generator))[1]
-    values = [float(mismatch(model, windows(), far, generator(seed))) for seed in range(6)]
+    values = [float(free_run_moment_loss(model, windows(), far, generator(seed))) for seed in range(6)]
     assert len(set(lengths)) > 2
     assert max(lengths) <= 40
     assert all(value > 0 for value in values)
@@ -112,9 +114,9 @@ def test_runs_that_wander_first_are_compared_all_the_same():
 
 def test_it_is_compared_every_so_many_steps():
     settings = TrainingSettings(steps=9, batch=4, window=12, matching=MatchingSettings(begin=0.0, every=4, batch=4))
-    trainer, steps = Trainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
-    match = trainer._match
-    trainer._match = lambda windows: (steps.append(trainer.step), match(windows))[1]
+    trainer, steps = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
+    match = trainer._add_moment_gradient
+    trainer._add_moment_gradient = lambda windows: (steps.append(trainer.step), match(windows))[1]
     for _ in range(9):
         trainer.train_step()
     assert steps == [0, 4, 8]

@@ -21,8 +21,8 @@ from priors import checkpoints
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus as corpora
 from priors.training import refiner_run
-from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, Losses
-from priors.training.refiner_run import RefinerRequest, command, score, train
+from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, RoundLosses
+from priors.training.refiner_run import RefinerRequest, compute_realism_gap, format_refiner_command, train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
 SETTINGS = AdversarialSettings(
@@ -99,7 +99,7 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     for row in card.training["curve"]:
         assert {"jitter_m_s3_ratio", "score"} <= set(row)
         assert row["round"] == 0 or row["critic_loss"] > 0
-    assert card.quality == min(card.training["curve"], key=score)
+    assert card.quality == min(card.training["curve"], key=compute_realism_gap)
     assert f"--density {density}" in card.training["command"]
     assert [line.split(":")[0] for line in news if line.startswith("round")] == ["round 2", "round 4", "round 6"]
     files = {file.name for file in out.iterdir()}
@@ -118,22 +118,24 @@ def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, variant, ch
     """What is typed from the card, the command line reads as the request that wrote it."""
     config, recipe = variant
     wanted = RefinerRequest(data, tmp_path, match="walk-[01]", config=config, settings=replace(recipe, **changes))
-    words = command(wanted).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path)).split()
+    words = (
+        format_refiner_command(wanted).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path)).split()
+    )
     given = cli.parse(words[1:])
     assert isinstance(given, Train)
-    assert train_refiner.request(given) == wanted
+    assert train_refiner.build_refiner_request(given) == wanted
 
 
 def test_samples_go_on_from_the_clips_they_are_drawn_with(data, density, tmp_path):
     prior = priors.load(density)
-    clips = corpora.read(data, match="", cache=tmp_path)
-    drawn = [refiner_run.sampled(prior, clips, 4, 20, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    clips = corpora.read_corpus(data, match="", cache=tmp_path)
+    drawn = [refiner_run.sample_corpus(prior, clips, 4, 20, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     assert drawn[0].lengths == (20,) * 4
     assert drawn[0].features.shape == (80, clips.features.shape[1])
     assert torch.equal(drawn[0].features, drawn[1].features)
     assert not torch.equal(drawn[0].features, drawn[2].features)
     short = corpora.Corpus(("a", "b"), (59, 60), clips.features[:119])
-    assert refiner_run.sampled(prior, short, 3, 5, torch.Generator()).lengths == (5,) * 3  # all after the longer
+    assert refiner_run.sample_corpus(prior, short, 3, 5, torch.Generator()).lengths == (5,) * 3  # all after the longer
 
 
 @pytest.fixture
@@ -146,20 +148,20 @@ def scripted(monkeypatch):
         def train_round(trainer):
             step(trainer)
             with torch.no_grad():
-                trainer.averaged.last.bias.fill_(trainer.round)
+                trainer.averaged_refiner.last.bias.fill_(trainer.round)
             return losses(trainer.round)
 
         def judged(judge, network):
             return {"jitter_m_s3_ratio": scores.get(round(network.last.bias[0].item()), 9.0)}
 
         monkeypatch.setattr(AdversarialTrainer, "train_round", train_round)
-        monkeypatch.setattr(refiner_run.Judge, "__call__", judged)
+        monkeypatch.setattr(refiner_run.RefinerEvaluator, "__call__", judged)
 
     return play
 
 
 def even(number):
-    return Losses(refiner=0.7, critic=0.69, told=0.5, updates=1)
+    return RoundLosses(refiner=0.7, critic=0.69, told=0.5, updates=1)
 
 
 def kept(path):
@@ -231,24 +233,24 @@ def test_weights_that_are_not_finite_are_seen(tmp_path, request_in, monkeypatch)
 
 
 def test_scores_are_distances_from_mocap():
-    assert score({"a_ratio": 1.0, "b_ratio": 1.0, "told_apart": 0.4, "round": 7}) == 0
-    assert score({"a_ratio": 2.0}) == score({"a_ratio": 0.5}) == pytest.approx(math.log(2))
-    assert score({"a_ratio": 1.0, "told_apart": 0.8}) == pytest.approx(0.6)
-    assert score({"a_ratio": None}) == math.inf
+    assert compute_realism_gap({"a_ratio": 1.0, "b_ratio": 1.0, "told_apart": 0.4, "round": 7}) == 0
+    assert compute_realism_gap({"a_ratio": 2.0}) == compute_realism_gap({"a_ratio": 0.5}) == pytest.approx(math.log(2))
+    assert compute_realism_gap({"a_ratio": 1.0, "told_apart": 0.8}) == pytest.approx(0.6)
+    assert compute_realism_gap({"a_ratio": None}) == math.inf
 
 
 def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_path):
-    parts = corpora.split(corpora.read(data, match="", cache=tmp_path), 1)
+    parts = corpora.split_corpus(corpora.read_corpus(data, match="", cache=tmp_path), 1)
     held = torch.cat([parts.validation.features, parts.test.features])
     raw = corpora.Corpus(("a", "b"), (80, 80), held)
     quick = RealismSettings(classifier=ClassifierSettings(folds=2, steps=5, width=4, batch=8), dims=2)
     trainer = AdversarialTrainer(TINY, SETTINGS, parts.train, raw)
-    row = refiner_run.Judge.of(raw, parts, quick)(trainer.refiner)
+    row = refiner_run.RefinerEvaluator.of(raw, parts, quick)(trainer.refiner)
     assert row["jitter_m_s3_ratio"] == pytest.approx(1, abs=1e-3)  # the very same clips
     assert row["contact_speed_cm_s_ratio"] == pytest.approx(1, abs=1e-3)
     assert "told_apart" not in row  # two clips are too few
     many = corpora.Split(parts.train, parts.train, parts.train)
-    judge = refiner_run.Judge.of(corpora.Corpus(tuple("abcd"), (80,) * 4, held.repeat(2, 1)), many, quick)
+    judge = refiner_run.RefinerEvaluator.of(corpora.Corpus(tuple("abcd"), (80,) * 4, held.repeat(2, 1)), many, quick)
     first, again = judge(trainer.refiner), judge(trainer.refiner)
     assert 0 <= first["told_apart"] <= 1
     assert first == again

@@ -10,14 +10,14 @@ from helpers import corpus, generator, walks
 from torch.nn.functional import logsigmoid
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, Place, decode, encode, mirror_features
-from priors.refiner.end_effectors import channels
+from mapctl.features import LAYOUT, GroundPose, decode, encode, mirror_features
+from priors.refiner.end_effectors import count_channels
 from priors.refiner.network import RefinerConfig
-from priors.training.adversarial import Critic, History
+from priors.training.adversarial import Critic, HistoryBuffer
 from priors.training.corpus import Corpus
-from priors.training.moment_matching import compare
+from priors.training.moment_matching import moment_loss
 from priors.training.recipes import refiner as training
-from priors.training.recipes.refiner import MOMENTS, AdversarialSettings, AdversarialTrainer
+from priors.training.recipes.refiner import REFINER_MOMENTS, AdversarialSettings, AdversarialTrainer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
 SETTINGS = AdversarialSettings(
@@ -83,7 +83,7 @@ def slopes(loss, model):
 def test_the_refiner_follows_equations_9_and_13(root):
     """-ln D of what it made, and the squared distance of the decoded hips' ways."""
     trainer = trained(trainer_of(root=root))
-    raw = drawn_next(trainer, trainer._raw)
+    raw = drawn_next(trainer, trainer._sample_raw_windows)
     made, _ = trainer.refiner(raw)
     adversarial = -logsigmoid(trainer.critic(made)).mean()
     trainer.refiner.zero_grad()
@@ -106,21 +106,21 @@ def way_of(features):
 
 def test_the_roots_distance_is_that_of_the_decoded_motions():
     before, after = captured().clips()[0][None, :30], captured().clips()[2][None, :25]
-    hips = [decode(clip[0], Place.origin()).root_position[:25] for clip in (before, after)]
+    hips = [decode(clip[0], GroundPose.origin()).root_position[:25] for clip in (before, after)]
     expected = float((hips[0] - hips[1]).square().sum(-1).mean())
     assert expected > 0.01
-    assert float(training._root_distance(before, after)) == pytest.approx(expected, rel=1e-4)
+    assert float(training._compute_root_error(before, after)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_critic_follows_equation_10_on_as_many_captured_as_made():
     trainer = trained(trainer_of())
-    history = History(trainer.history.windows)
+    history = HistoryBuffer(trainer.history.windows)
 
     def batch():
         with torch.no_grad():
-            fresh = trainer.refiner(trainer._raw())[0]
+            fresh = trainer.refiner(trainer._sample_raw_windows())[0]
         made = history.mix(fresh, trainer.generator)
-        return trainer._windows(trainer.corpus, trainer.captured, SETTINGS.window), made
+        return trainer._sample_windows(trainer.corpus, trainer.captured, SETTINGS.window), made
 
     real, made = drawn_next(trainer, batch)
     odds = trainer.critic(real), trainer.critic(made)
@@ -147,7 +147,7 @@ def test_an_update_of_one_side_leaves_the_other_alone(side):
 @pytest.mark.parametrize(("size", "batch"), [(10, 4), (4, 4), (9, 5), (2, 2)])
 def test_the_history_keeps_its_size_and_gives_half(size, batch):
     kept = torch.arange(size).float()[:, None, None].expand(-1, 3, LAYOUT.size).clone()
-    history = History(kept)
+    history = HistoryBuffer(kept)
     drawn = generator(3)
     for turn in range(6):
         before = set(history.windows[:, 0, 0].tolist())
@@ -239,9 +239,9 @@ def test_the_refiner_lowers_its_loss_and_keeps_the_roots_way_where_that_weighs_m
     trainer = trainer_of(replace(TINY, limit=3.0), refiner_rate=2e-2, root=root)
     trainer.critic.load_state_dict(critic_that_knows())
     losses = [trainer._refine() for _ in range(40)]
-    raw = drawn_next(trainer, trainer._raw)
+    raw = drawn_next(trainer, trainer._sample_raw_windows)
     with torch.no_grad():
-        metres = float(training._root_distance(raw[:, 2:], trainer.refiner(raw)[0])) ** 0.5
+        metres = float(training._compute_root_error(raw[:, 2:], trainer.refiner(raw)[0])) ** 0.5
     if root:
         assert metres < 0.02
     else:
@@ -288,7 +288,7 @@ def test_the_same_seed_gives_the_same_and_the_callers_random_numbers_are_left_al
 
 def test_windows_of_both_kinds_are_mirrored_with_even_odds():
     trainer = trainer_of(batch=200, history=200)
-    drawn = trainer._windows(captured(), torch.tensor([7]), 12)
+    drawn = trainer._sample_windows(captured(), torch.tensor([7]), 12)
     plain = captured().features[7:19]
     mirrored = int((drawn == mirror_features(plain)).all(-1).all(-1).sum())
     assert mirrored + int((drawn == plain).all(-1).all(-1).sum()) == 200
@@ -315,7 +315,7 @@ def test_statistics_are_of_the_captured_clips_with_floors():
     torch.testing.assert_close(network.mean[:SIZE], features.mean(0)[:SIZE])
     assert network.mean[SIZE:].tolist() == network.std[SIZE:].tolist() == [0.5, 0.5]
     assert float(network.std.min()) == pytest.approx(0.002)
-    heights = [decode(clip, Place.origin()).joint_positions()[:, 0, 1] for clip in captured().clips()]
+    heights = [decode(clip, GroundPose.origin()).joint_positions()[:, 0, 1] for clip in captured().clips()]
     assert float(network.reach_mean[1]) == pytest.approx(float(torch.cat(heights).mean()), abs=0.01)
     assert float(network.reach_std.min()) == pytest.approx(0.01)  # of the hips, which stay above themselves
 
@@ -355,7 +355,7 @@ def test_the_critic_can_see_slow_feet_magnified():
     crept[..., LAYOUT.slices["root_displacement_heading"]] += 0.001
     seen = {}
     for slow in (0.0, 0.05):
-        reach, rows = torch.zeros(channels(TINY.joints)), []
+        reach, rows = torch.zeros(count_channels(TINY.joints)), []
         critic = Critic(TINY.joints, width=6, around=0, slow=slow, reach_mean=reach, reach_std=reach + 1)
         critic.first.register_forward_pre_hook(lambda _, given, rows=rows: rows.append(given[0]))
         for given in (windows, crept):
@@ -367,8 +367,8 @@ def test_the_critic_can_see_slow_feet_magnified():
 def test_what_is_kept_is_the_running_mean_of_the_weights():
     last, mean = (trained(trainer_of(average=average), rounds=1) for average in (0.0, 0.9))
     for name, value in last.refiner.state_dict().items():
-        assert torch.equal(value, last.averaged.state_dict()[name])
-    kept, latest = (model.last.weight.detach().norm() for model in (mean.averaged, mean.refiner))
+        assert torch.equal(value, last.averaged_refiner.state_dict()[name])
+    kept, latest = (model.last.weight.detach().norm() for model in (mean.averaged_refiner, mean.refiner))
     assert 0 < float(kept) < 0.7 * float(latest)
 
 
@@ -381,7 +381,7 @@ def test_moments_alone_bring_feet_and_jerk_nearer_to_the_captured():
     def mismatch():
         with torch.no_grad():
             refined = trainer.refiner(given)[0]
-            return float(compare(refined, real[: len(refined), : refined.shape[1]], MOMENTS))
+            return float(moment_loss(refined, real[: len(refined), : refined.shape[1]], REFINER_MOMENTS))
 
     before = mismatch()
     for _ in range(90):

@@ -14,15 +14,15 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.recording import Capture
 from priors.denoiser.network import DenoiserConfig
-from priors.training.augmentation.corruption import CorruptionSettings, clean_capture
+from priors.training.augmentation.corruption import CorruptionSettings, make_clean_capture
 from priors.training.corpus import Corpus
 from priors.training.denoiser_run import DenoiserRequest, train
 from priors.training.recipes.denoiser import (
     DenoiserSettings,
     DenoiserTrainer,
-    Windows,
-    joint_positions,
-    losses,
+    FeatureWindows,
+    compute_denoiser_losses,
+    compute_joint_positions,
     validate,
 )
 
@@ -40,19 +40,19 @@ def test_a_width_of_nothing_is_refused():
     given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", "--width", "0"])
     assert isinstance(given, Train)
     with pytest.raises(RequestError, match="--width must be at least 1"):
-        train_windows.request(given)
+        train_windows.build_window_request(given)
 
 
 def test_windows_are_clips_mirrored_half_of_the_time():
     plain = replace(SETTINGS, calibration_deg=0.0, batch=64, corruption=CorruptionSettings(size=0.0))
     whole = corpus(2, 40)
-    drawn = Windows(whole, plain).draw(generator())
+    drawn = FeatureWindows(whole, plain).draw(generator())
     assert drawn.shape == (64, 16, LAYOUT.size)
     every = whole.features.unfold(0, 16, 1).transpose(1, 2)
     same = torch.cdist(drawn.flatten(1), every.flatten(1)).amin(dim=1) < 1e-3
     assert 0.3 < same.double().mean() < 0.7
-    assert torch.equal(drawn, Windows(whole, plain).draw(generator()))
-    assert not torch.equal(drawn, Windows(whole, plain).draw(generator(1)))
+    assert torch.equal(drawn, FeatureWindows(whole, plain).draw(generator()))
+    assert not torch.equal(drawn, FeatureWindows(whole, plain).draw(generator(1)))
 
 
 def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
@@ -62,7 +62,7 @@ def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
     )
 
     def share(evenness):
-        windows = Windows(uneven, replace(SETTINGS, batch=600, evenness=evenness)).draw(generator())
+        windows = FeatureWindows(uneven, replace(SETTINGS, batch=600, evenness=evenness)).draw(generator())
         return float((windows[:, 0, LAYOUT.slices["root_height"]] > 50).double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.05)
@@ -73,7 +73,7 @@ def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
     """Joint frames turned by a constant: what does not move still does not, the hips' place stays."""
     still = corpus(1, 16).features[:1].expand(16, -1).contiguous()
     settings = replace(SETTINGS, batch=20, calibration_deg=10.0, corruption=CorruptionSettings(size=0.0))
-    drawn = Windows(Corpus(("a",), (16,), still), settings).draw(generator())
+    drawn = FeatureWindows(Corpus(("a",), (16,), still), settings).draw(generator())
     joints = LAYOUT.pick(drawn, "joint_rotations")
     assert torch.diff(joints, dim=1).abs().max() < 1e-5
     turned = (joints - joints[:1]).abs().amax(dim=(1, 2)) > 0.05
@@ -81,14 +81,16 @@ def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
 
 
 def test_positions_of_a_clean_capture_are_those_of_its_motion():
-    from mapctl.features import Place, decode
+    from mapctl.features import GroundPose, decode
     from mapctl.recording import Cleaned
 
     features = corpus(1, 30).features
-    capture: Capture = clean_capture(features[None])
+    capture: Capture = make_clean_capture(features[None])
     angles = torch.cat([capture.tilt, capture.joints.flatten(2)], dim=-1)
-    found = joint_positions(Cleaned(capture.root, capture.heading, angles, LAYOUT.pick(features[None], "contacts")))
-    place = Place(torch.zeros(2, dtype=torch.float64), torch.zeros((), dtype=torch.float64))
+    found = compute_joint_positions(
+        Cleaned(capture.root, capture.heading, angles, LAYOUT.pick(features[None], "contacts"))
+    )
+    place = GroundPose(torch.zeros(2, dtype=torch.float64), torch.zeros((), dtype=torch.float64))
     wanted = decode(features.double(), place).joint_positions()
     assert (found[0] - wanted).abs().max() < 1e-4
 
@@ -99,7 +101,7 @@ def test_a_perfect_proposal_costs_nothing_but_contacts():
     clean = replace(
         SETTINGS, corruption=CorruptionSettings(clean=1.0, markers=0.0, spikes=0.0, dropout=0.0, limb=0.0, gap=0.0)
     )
-    parts = losses(network(), corpus(1, 30).features[None], clean, generator())
+    parts = compute_denoiser_losses(network(), corpus(1, 30).features[None], clean, generator())
     assert parts["error_cm"] < 0.05
     assert parts["angles_deg"] < 0.01
     assert parts["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)  # untrained it does not know

@@ -14,7 +14,7 @@ from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
 from priors.infiller.network import InfillerConfig
 from priors.training.augmentation.gap_masks import GapSettings
-from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, losses, validate
+from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, compute_infiller_losses, validate
 from priors.training.windows import PositionWindows
 
 SETTINGS = InfillerSettings(steps=6, batch=4, window=32)
@@ -33,9 +33,9 @@ def with_hole(window, start, stop):
 def test_a_true_proposal_costs_nothing_but_contacts():
     window = windows_of(corpus(2, 60))
     everything = with_hole(window, 0, 0)
-    parts = losses(network(), window, everything, SETTINGS)
+    parts = compute_infiller_losses(network(), window, everything, SETTINGS)
     assert parts["place"] == parts["pace"] == parts["feet_cm_frame"] == parts["error_cm"] == 0
-    parts = losses(network(), window, with_hole(window, 20, 40), SETTINGS)
+    parts = compute_infiller_losses(network(), window, with_hole(window, 20, 40), SETTINGS)
     assert parts["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)  # untrained it does not know
 
 
@@ -43,7 +43,7 @@ def test_the_error_is_that_of_the_guess_while_it_is_untrained():
     """Root-aligned, over what was missing, in centimetres."""
     window = windows_of(corpus(2, 60))
     known = with_hole(window, 20, 40)
-    parts, image = losses(network(), window, known, SETTINGS), window.image(known)
+    parts, image = compute_infiller_losses(network(), window, known, SETTINGS), window.image(known)
     apart = 100 * (image.to_world(image.places) - window.places)[:, 20:40]
     wanted = (apart - apart[:, :, :1]).norm(dim=-1).mean()
     assert float(parts["error_cm"]) == pytest.approx(float(wanted), rel=1e-3)
@@ -53,7 +53,9 @@ def test_the_error_is_that_of_the_guess_while_it_is_untrained():
 def test_an_autoencoder_answers_for_what_it_was_shown_too():
     window = windows_of(corpus(2, 60))
     everything = with_hole(window, 0, 0)
-    parts = losses(network(config=replace(CONFIG, architecture="manifold")), window, everything, SETTINGS)
+    parts = compute_infiller_losses(
+        network(config=replace(CONFIG, architecture="manifold")), window, everything, SETTINGS
+    )
     assert parts["place"] > 0.1
     assert parts["error_cm"] == 0
 
@@ -63,8 +65,8 @@ def test_frames_that_are_not_there_cost_nothing():
     short, long = (windows_of(data, frames=frames, batch=1) for frames in (40, 64))
     wild = replace(long, places=torch.where(long.present[..., None, None], long.places, 77.0))
     missing = with_hole(long, 25, 35)
-    for name, value in losses(network(), long, missing, SETTINGS).items():
-        assert torch.equal(losses(network(), wild, missing, SETTINGS)[name], value)
+    for name, value in compute_infiller_losses(network(), long, missing, SETTINGS).items():
+        assert torch.equal(compute_infiller_losses(network(), wild, missing, SETTINGS)[name], value)
     assert short.present.all()
 
 

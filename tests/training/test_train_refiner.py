@@ -18,7 +18,7 @@ from priors.training.recipes.refiner import PAPER, AdversarialSettings
 def requested(*words):
     command = cli.parse(["train", "refiner", "--data", "data", "-o", "run", *words])
     assert isinstance(command, Train)
-    return refiner.request(command)
+    return refiner.build_refiner_request(command)
 
 
 def test_what_is_not_asked_for_is_the_measured_recipe():

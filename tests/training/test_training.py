@@ -14,12 +14,12 @@ from safetensors.torch import load_file, save_file
 import priors
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.features import LAYOUT, encode, ground_speed, mirror_features
-from mapctl.metrics.states import state_summary
+from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training import free_run, initial_states, run
-from priors.training.recipes.lstm_gmm import PAPER, Trainer, TrainingSettings, statistics
-from priors.training.run import TrainRequest, train
+from priors.training.recipes.lstm_gmm import PAPER, DensityTrainer, TrainingSettings, compute_feature_statistics
+from priors.training.run import DensityRequest, train
 
 TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
@@ -27,13 +27,13 @@ SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
 
 
 def request_in(out, data, **changes):
     """Checkpoints at every step, so that a kill can come anywhere."""
     settings = replace(SETTINGS, **changes.pop("settings", {}))
-    return TrainRequest(
+    return DensityRequest(
         data,
         out,
         config=TINY,
@@ -80,7 +80,7 @@ def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, data):
 def test_steps_lower_the_loss(recipe):
     config, settings = (TINY, SETTINGS) if recipe == "ours" else PAPER
     config, settings = replace(config, width=8), replace(settings, steps=400, batch=8, window=20, learning_rate=5e-3)
-    trainer = Trainer(config, settings, corpus())
+    trainer = DensityTrainer(config, settings, corpus())
     losses = [trainer.train_step() for _ in range(60)]
     assert sum(losses[-5:]) < sum(losses[:5]) - 10
 
@@ -97,13 +97,13 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert "mapctl train lstm-gmm" in card.training["command"]
     assert "--skip-first" not in card.training["command"]
     other = request_in(out, data, skip_first=True, settings={"bfloat16": True})
-    assert "--skip-first --bfloat16" in run.command(other)
+    assert "--skip-first --bfloat16" in run.format_density_command(other)
     held = card.data["held_out"]["validation"] + card.data["held_out"]["test"]
     assert len(held) == 2
     assert not set(held) & set(card.data["starts"])
     assert {"validation_nats", "free_run_speed_ratio", "free_run_finite"} <= set(card.training["curve"][-1])
     assert card.quality["test_nats_per_frame"]
-    assert prior.usual_nats == card.quality["windows"]["p2"] <= card.quality["windows"]["mean"]
+    assert prior.reference_log_density == card.quality["windows"]["p2"] <= card.quality["windows"]["mean"]
     assert 0 < prior.abilities.slowest < prior.abilities.fastest < 3
     assert any("step 6: " in line for line in news)
     files = {file.name for file in out.iterdir()}
@@ -216,7 +216,7 @@ def test_a_checkpoint_without_a_tensor_is_refused(tmp_path, data, begun, drop):
 
 @pytest.mark.parametrize("how", ["loss", "weights"])
 def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, data, monkeypatch, how):
-    out, step = tmp_path / "run", Trainer.train_step
+    out, step = tmp_path / "run", DensityTrainer.train_step
 
     def diverging(trainer):
         if trainer.step == 3 and how == "weights":
@@ -227,18 +227,18 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, 
             trainer.features = trainer.features * torch.nan
         return step(trainer)
 
-    monkeypatch.setattr(Trainer, "train_step", diverging)
+    monkeypatch.setattr(DensityTrainer, "train_step", diverging)
     with pytest.raises(MapctlError, match=r"training diverged at step 4: .*; the last checkpoint, .* is kept"):
         train(request_in(out, data))
     assert json.loads((out / "checkpoint.json").read_text())["step"] == 3
     assert not (out / "model.safetensors").exists()
     monkeypatch.undo()
-    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
     assert train(request_in(out, data, resume=True)).exists()
 
 
 def test_what_is_not_finite_is_null_in_the_curve(tmp_path, data, monkeypatch):
-    monkeypatch.setattr(run, "free_run", lambda model, corpus: {"free_run_speed_ratio": math.inf})
+    monkeypatch.setattr(run, "measure_free_runs", lambda model, corpus: {"free_run_speed_ratio": math.inf})
     card = priors.load(str(train(request_in(tmp_path / "run", data)))).card
     assert card.training["curve"][-1]["free_run_speed_ratio"] is None
     for file in (tmp_path / "run").glob("*.json"):
@@ -264,7 +264,7 @@ def test_impossible_recipes_are_refused(tmp_path, data, change, message):
 
 
 def test_the_device_and_the_folder_are_checked_before_anything_is_read(tmp_path, data, monkeypatch):
-    monkeypatch.setattr(corpora, "read", None)
+    monkeypatch.setattr(corpora, "read_corpus", None)
     with pytest.raises(RequestError, match="auto, cpu or cuda"):
         train(replace(request_in(tmp_path / "run", data), device="abacus"))
     (tmp_path / "file").touch()
@@ -277,17 +277,17 @@ def test_a_trainer_leaves_the_callers_random_numbers_alone():
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    first = Trainer(TINY, SETTINGS, corpus())
+    first = DensityTrainer(TINY, SETTINGS, corpus())
     assert torch.equal(torch.rand(3), expected)
-    second = Trainer(TINY, SETTINGS, corpus())
+    second = DensityTrainer(TINY, SETTINGS, corpus())
     assert torch.equal(first.model.fc1.weight, second.model.fc1.weight)
 
 
 def test_each_window_is_mirrored_with_even_odds():
-    trainer = Trainer(TINY, replace(SETTINGS, batch=1), corpus())
+    trainer = DensityTrainer(TINY, replace(SETTINGS, batch=1), corpus())
     trainer.starts = trainer.starts[:1]
     plain = trainer.features[: SETTINGS.window + 1]
-    drawn = [trainer._windows()[0][0] for _ in range(200)]
+    drawn = [trainer._sample_windows()[0][0] for _ in range(200)]
     mirrored = sum(torch.equal(window, mirror_features(plain)) for window in drawn)
     assert mirrored + sum(torch.equal(window, plain) for window in drawn) == 200
     assert 70 < mirrored < 130
@@ -330,50 +330,50 @@ def test_a_clip_that_cannot_be_used_is_named(tmp_path):
     ]
     (tmp_path / "odd.bvh").write_text("\n".join(head) + "\n")
     with pytest.raises(MapctlError, match=r"odd\.bvh: "):
-        corpora.read(tmp_path, match="", cache=tmp_path / "cache")
+        corpora.read_corpus(tmp_path, match="", cache=tmp_path / "cache")
 
 
 def test_the_corpus_is_the_features_of_the_clips_and_is_read_once(tmp_path, data, monkeypatch):
-    read = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    read = corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     assert read.names == ("walk-0.bvh", "walk-1.bvh", "walk-2.bvh")
     expected = corpus(3, frames=80)
     torch.testing.assert_close(read.features, expected.features, atol=1e-5, rtol=1e-5)
-    monkeypatch.setattr(corpora, "clip_features", None)  # nothing can be read
-    again = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    monkeypatch.setattr(corpora, "read_clip_features", None)  # nothing can be read
+    again = corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     assert torch.equal(again.features, read.features)
     assert (again.names, again.lengths) == (read.names, read.lengths)
     (data / "walk-0.bvh").touch()
     with pytest.raises(RequestError, match="none of the 3"):  # a changed file is read anew
-        corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+        corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a corpus", None])
 def test_a_damaged_cache_is_read_anew(tmp_path, data, content):
-    whole = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    whole = corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     (stored,) = tmp_path.iterdir()
     stored.write_bytes(stored.read_bytes()[:-100] if content is None else content)
-    again = corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+    again = corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     assert torch.equal(again.features, whole.features)
-    assert corpora.read(data, match="walk-[0-2]", cache=tmp_path).names == whole.names
+    assert corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path).names == whole.names
 
 
 def test_a_cache_of_other_rig_tables_or_contact_thresholds_is_not_taken(tmp_path, data, monkeypatch):
-    corpora.read(data, match="walk-[0-2]", cache=tmp_path)
-    table, contacts = corpora.rigs.known(), corpora.ContactSettings
+    corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
+    table, contacts = corpora.rigs.known_rigs(), corpora.ContactSettings
     for what, other in (
         ("rigs.known", lambda: (*table[:-1], replace(table[-1], straighten=("leftHand",)))),
         ("ContactSettings", partial(contacts, slow=0.4)),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(f"priors.training.corpus.{what}", other)
-            patch.setattr(corpora, "clip_features", None)
+            patch.setattr(corpora, "read_clip_features", None)
             with pytest.raises(RequestError, match="none of the 3"):
-                corpora.read(data, match="walk-[0-2]", cache=tmp_path)
+                corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
 
 
 def test_the_split_is_by_clip_seeded_and_complete():
     many = corpora.Corpus(tuple(map(str, range(60))), (80,) * 60, torch.zeros(4800, LAYOUT.size))
-    first, again, other = (corpora.split(many, seed) for seed in (1, 1, 2))
+    first, again, other = (corpora.split_corpus(many, seed) for seed in (1, 1, 2))
     parts = [set(part.names) for part in (first.train, first.validation, first.test)]
     assert [len(part) for part in parts] == [54, 3, 3]
     assert set.union(*parts) == set(many.names)
@@ -382,14 +382,14 @@ def test_the_split_is_by_clip_seeded_and_complete():
 
 
 def test_windows_stay_within_their_clips():
-    found = corpora.window_starts((5, 2, 4), 3).tolist()
+    found = corpora.find_window_starts((5, 2, 4), 3).tolist()
     assert found == [0, 1, 2, 7, 8]
     with pytest.raises(RequestError, match="no clip is as long as the window of 9 frames"):
-        corpora.window_starts((5, 2, 4), 9)
+        corpora.find_window_starts((5, 2, 4), 9)
 
 
 def test_statistics_are_symmetric_and_floored():
-    mean, std = statistics(corpus().features)
+    mean, std = compute_feature_statistics(corpus().features)
     torch.testing.assert_close(mirror_features(mean[None])[0], mean, atol=1e-5, rtol=0)
     assert float(std.min()) >= 0.001
     assert bool((mean[LAYOUT.continuous :] == 0.5).all())
@@ -398,8 +398,8 @@ def test_statistics_are_symmetric_and_floored():
 
 def test_starts_are_the_states_after_stretches_of_clips():
     data = corpus()
-    trainer = Trainer(TINY, SETTINGS, data)
-    found = initial_states.choose(trainer.model, data, count=3, generator=generator())
+    trainer = DensityTrainer(TINY, SETTINGS, data)
+    found = initial_states.select_initial_states(trainer.model, data, count=3, generator=generator())
     assert len(set(found.names)) == 3
     clips = dict(zip(data.names, data.clips(), strict=True))
     for row, name in enumerate(found.names):
@@ -411,19 +411,19 @@ def test_starts_are_the_states_after_stretches_of_clips():
 
 
 def test_abilities_are_the_speeds_and_turns_of_the_data():
-    found = initial_states.abilities(corpus())
+    found = initial_states.measure_data_limits(corpus())
     speeds = [float(ground_speed(clip).mean()) for clip in corpus().clips()]
     assert min(speeds) * 0.9 < found.slowest < found.fastest < max(speeds) * 1.05
     assert found.turn_rate == pytest.approx(0.3, abs=0.05)
     still = corpora.Corpus(("still",), (80,), torch.zeros(80, LAYOUT.size))
-    assert initial_states.abilities(still).turn_rate == 0
+    assert initial_states.measure_data_limits(still).turn_rate == 0
 
 
 def test_free_runs_are_compared_with_the_data():
     data = corpus()
-    found = free_run.free_run(Trainer(TINY, SETTINGS, data).model, data, runs=4, frames=40)
+    found = free_run.measure_free_runs(DensityTrainer(TINY, SETTINGS, data).model, data, runs=4, frames=40)
     assert found["free_run_finite"] == 1
     assert found["free_run_speed_ratio"] == pytest.approx(1, abs=0.3)
     assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)
-    summary = state_summary(encode(walk(60))[0].float())
+    summary = summarise_states(encode(walk(60))[0].float())
     assert summary["speed"] == pytest.approx(1.24, abs=0.02)

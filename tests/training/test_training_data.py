@@ -16,7 +16,7 @@ from mapctl.errors import RequestError
 from priors.training import corpus as corpora
 from priors.training import denoiser_run, free_run, infiller_run
 from priors.training import run as density_run
-from priors.training.gathering import Source, gather
+from priors.training.gathering import DataSource, gather
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, validate
 
 BALL = (
@@ -27,13 +27,13 @@ ONE_FRAME = "one.bvh: features need at least two frames"
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(density_run, "free_run", partial(free_run.free_run, runs=2, frames=20))
+    monkeypatch.setattr(density_run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
 
 
 def write_walks(folder, *lengths):
     """Walks of so many frames, as BVH files of the Bandai Namco rig."""
     folder.mkdir(parents=True)
-    rigmap = retarget.map_rig(bandai_skeleton())
+    rigmap = retarget.identify_rig(bandai_skeleton())
     for number, motion in enumerate(walks(len(lengths), max(lengths))):
         motion = motion.slice(0, lengths[number])
         retarget.from_canonical(motion, rigmap).save(folder / f"walk-{number}.bvh")
@@ -61,7 +61,7 @@ BAD = ("broken.bvh", "empty.bvh", "folder.bvh", "lost.bvh", "one.bvh", "other.bv
 def gathered(folder, run_folder, **changes):
     """Corpus, and the lines of news and of warning."""
     news, warnings = [], []
-    found, _ = gather(Source(folder, run_folder, **changes), progress=news.append, warn=warnings.append)
+    found, _ = gather(DataSource(folder, run_folder, **changes), progress=news.append, warn=warnings.append)
     return found, news, warnings
 
 
@@ -107,25 +107,25 @@ def test_a_folder_of_nothing_else_is_refused(tmp_path, mixed):
 
 
 def test_a_fault_that_nobody_foresaw_leaves_one_file_out(tmp_path, data, monkeypatch):
-    whole = corpora.clip_features
+    whole = corpora.read_clip_features
 
     def odd(file, *, skip_first):
         return 1 / 0 if file.name == "walk-1.bvh" else whole(file, skip_first=skip_first)
 
-    monkeypatch.setattr(corpora, "clip_features", odd)
+    monkeypatch.setattr(corpora, "read_clip_features", odd)
     found, _, _ = gathered(data, tmp_path / "run")
-    assert found.skipped == (corpora.Skipped("walk-1.bvh", "ZeroDivisionError: division by zero"),)
+    assert found.skipped == (corpora.SkippedFile("walk-1.bvh", "ZeroDivisionError: division by zero"),)
 
 
 def test_the_cache_knows_what_was_left_out_and_tries_it_again(tmp_path, mixed, monkeypatch):
     first, _, warned = gathered(mixed, tmp_path / "run")
-    whole, read = corpora.clip_features, []
+    whole, read = corpora.read_clip_features, []
 
     def counted(file, *, skip_first):
         read.append(file.name)
         return whole(file, skip_first=skip_first)
 
-    monkeypatch.setattr(corpora, "clip_features", counted)
+    monkeypatch.setattr(corpora, "read_clip_features", counted)
     again, _, warned_again = gathered(mixed, tmp_path / "run")
     assert (again.skipped, warned_again) == (first.skipped, warned)
     assert set(read) == set(BAD)
@@ -133,7 +133,9 @@ def test_the_cache_knows_what_was_left_out_and_tries_it_again(tmp_path, mixed, m
     def mended(file, *, skip_first):
         return whole(mixed / "walk-1.bvh" if file.name == "lost.bvh" else file, skip_first=skip_first)
 
-    monkeypatch.setattr(corpora, "clip_features", mended)  # a drive that is there again: the files' dates are the same
+    monkeypatch.setattr(
+        corpora, "read_clip_features", mended
+    )  # a drive that is there again: the files' dates are the same
     after, _, _ = gathered(mixed, tmp_path / "run")
     assert [name for name in after.names if name not in first.names] == ["lost.bvh"]
 
@@ -199,7 +201,7 @@ def test_a_density_of_many_is_tuned_on_two(tmp_path, data):
 
 def test_of_few_clips_the_end_of_the_longest_is_held_out():
     few = corpora.Corpus(("a", "b"), (100, 1000), corpus(11).features)
-    parts = corpora.split(few, 1)
+    parts = corpora.split_corpus(few, 1)
     assert (parts.train.names, parts.train.lengths) == (("a", "b"), (100, 890))
     assert parts.test is parts.validation
     assert (parts.test.names, parts.test.lengths) == (("b[890:1000]",), (110,))
@@ -208,7 +210,7 @@ def test_of_few_clips_the_end_of_the_longest_is_held_out():
 
 def test_what_is_left_of_a_clip_is_no_clip_where_it_is_a_frame():
     few = corpora.Corpus(("a", "b"), (76, 76), corpus(2, 76).features)
-    assert corpora.split(few, 1).train.names == ("b",)
+    assert corpora.split_corpus(few, 1).train.names == ("b",)
 
 
 @pytest.mark.parametrize(("lengths", "got"), [((74, 70), "74, 70"), ((100,), "100"), ((149,), "149")])
@@ -216,11 +218,11 @@ def test_too_little_is_refused_with_what_would_do(lengths, got):
     few = corpora.Corpus(tuple("ab"[: len(lengths)]), lengths, torch.zeros(sum(lengths), corpus(1).features.shape[1]))
     message = f"training needs 75 frames at 30 fps, and 75 to hold out in the longest clip; got clips of {got}"
     with pytest.raises(RequestError, match=f"^{message}$"):
-        corpora.split(few, 1)
+        corpora.split_corpus(few, 1)
 
 
 def test_five_clips_are_held_out_whole():
-    parts = corpora.split(corpus(5), 1)
+    parts = corpora.split_corpus(corpus(5), 1)
     assert [len(part.names) for part in (parts.train, parts.validation, parts.test)] == [3, 1, 1]
 
 

@@ -24,7 +24,7 @@ from mapctl import cli
 from mapctl.commands.shared import resumption
 from mapctl.commands.train import Train
 from mapctl.runtime import interruption
-from mapctl.runtime.interruption import Held
+from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner.network import RefinerConfig
@@ -52,7 +52,7 @@ class Model:
 
 def _density(data, out, prior):
     settings = lstm_gmm.TrainingSettings(steps=6, batch=4, window=20)
-    return run.TrainRequest(
+    return run.DensityRequest(
         data,
         out,
         config=LstmGmmConfig(width=8, components=2),
@@ -95,12 +95,14 @@ def _windowed(runs, request, config):
         usual = request(data, out, config=config, validate_steps=2)
         return replace(usual, settings=replace(usual.settings, steps=6, batch=3, window=32))
 
-    return Model(runs.KIND.name, runs, window_run._Run, runs.KIND.trainer, "train_step", "step", made)
+    return Model(runs.KIND.name, runs, window_run._WindowRun, runs.KIND.trainer, "train_step", "step", made)
 
 
 MODELS = (
-    Model("lstm-gmm", run, run._Run, lstm_gmm.Trainer, "train_step", "step", _density),
-    Model("refiner", refiner_run, refiner_run._Run, refiner.AdversarialTrainer, "train_round", "round", _refiner),
+    Model("lstm-gmm", run, run._DensityRun, lstm_gmm.DensityTrainer, "train_step", "step", _density),
+    Model(
+        "refiner", refiner_run, refiner_run._RefinerRun, refiner.AdversarialTrainer, "train_round", "round", _refiner
+    ),
     _windowed(denoiser_run, denoiser_run.DenoiserRequest, tiny_denoiser.CONFIG),
     _windowed(infiller_run, infiller_run.InfillerRequest, tiny_infiller.CONFIG),
 )
@@ -113,7 +115,7 @@ def model(request):
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(run, "free_run", partial(free_run.free_run, runs=2, frames=20))
+    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
 
 
 @pytest.fixture
@@ -143,7 +145,7 @@ def ended(model, request, *, at, method=None, how=send):
 
     Returns the step that is saved, and the last one of the curve.
     """
-    interruption.listen()
+    interruption.raise_on_signals()
     owner, name = method or (model.trainer, model.step)
     whole = getattr(owner, name)
 
@@ -201,7 +203,7 @@ def test_ended_just_after_a_judgement_it_is_not_judged_again(tmp_path, model, re
         if line.startswith("{") and json.loads(line)[model.counter] == 4:
             send()
 
-    interruption.listen()
+    interruption.raise_on_signals()
     with pytest.raises(KeyboardInterrupt):
         model.runs.train(request_in(tmp_path / "parts"), news)
     model.runs.train(request_in(tmp_path / "parts", resume=True))
@@ -209,7 +211,7 @@ def test_ended_just_after_a_judgement_it_is_not_judged_again(tmp_path, model, re
 
 
 def test_ended_while_it_exports_it_exports_again(tmp_path, model, request_in, whole, monkeypatch):
-    interruption.listen()
+    interruption.raise_on_signals()
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints, "save", lambda *words: send())
         with pytest.raises(KeyboardInterrupt):
@@ -221,24 +223,24 @@ def test_ended_while_it_exports_it_exports_again(tmp_path, model, request_in, wh
 
 def test_signals_while_it_saves_do_not_stop_that(tmp_path, model, request_in, whole, monkeypatch):
     """However often: an impatient user, `timeout` with its two signals."""
-    write = run_files.write
+    write = run_files.write_checkpoint
 
     def bothered(*words, **options):
         send(signal.SIGINT)
-        monkeypatch.setattr(interruption, "ONE_WISH", 0.0)
+        monkeypatch.setattr(interruption, "REPEAT_SECONDS", 0.0)
         send(signal.SIGINT)
         send(signal.SIGTERM)
         write(*words, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_files, "write", bothered)
+        patch.setattr(run_files, "write_checkpoint", bothered)
         assert ended(model, request_in(tmp_path / "parts"), at=2) == (3, 2)
     model.runs.train(request_in(tmp_path / "parts", resume=True))
     assert_same(tmp_path / "parts", whole)
 
 
 def test_a_second_wish_does_not_wait_and_saves_no_half_step(tmp_path, model, request_in, monkeypatch):
-    monkeypatch.setattr(interruption, "ONE_WISH", -1.0)
+    monkeypatch.setattr(interruption, "REPEAT_SECONDS", -1.0)
 
     def twice():
         send()
@@ -250,15 +252,15 @@ def test_a_second_wish_does_not_wait_and_saves_no_half_step(tmp_path, model, req
 
 def test_ended_before_the_first_step_it_saves_nothing(tmp_path, model, request_in, monkeypatch):
     """What is there then cannot be told from a fresh start, and a checkpoint would only stand in its way."""
-    interruption.listen()
-    monkeypatch.setattr(Held, "passing", None)
+    interruption.raise_on_signals()
+    monkeypatch.setattr(DeferredSignals, "let_through", None)
 
     def held_from_the_beginning(words):
-        held = Held(words)
+        held = DeferredSignals(words)
         held.receive(signal.SIGTERM, None)
         return held
 
-    monkeypatch.setattr(interruption, "Held", held_from_the_beginning)
+    monkeypatch.setattr(interruption, "DeferredSignals", held_from_the_beginning)
     with pytest.raises(KeyboardInterrupt):
         model.runs.train(request_in(tmp_path / "run"))
     assert not (tmp_path / "run" / "checkpoint.json").exists()
@@ -292,16 +294,16 @@ def train_words(data, out, *words):
 
 
 def test_the_command_says_in_one_line_how_to_go_on(tmp_path, data, monkeypatch, capsys):
-    out, step = tmp_path / "my run", lstm_gmm.Trainer.train_step
+    out, step = tmp_path / "my run", lstm_gmm.DensityTrainer.train_step
 
     def signalled(trainer):
         if trainer.step == 3:
             send(signal.SIGINT)
         return step(trainer)
 
-    interruption.listen()
+    interruption.raise_on_signals()
     with monkeypatch.context() as patch:
-        patch.setattr(lstm_gmm.Trainer, "train_step", signalled)
+        patch.setattr(lstm_gmm.DensityTrainer, "train_step", signalled)
         assert mapctl_run(*train_words(data, out, "--match", "walk-[0-9]")) == 130
     told = capsys.readouterr().err
     begin, _, typed = told.partition("go on with: ")
@@ -317,8 +319,8 @@ def test_the_command_says_in_one_line_how_to_go_on(tmp_path, data, monkeypatch, 
 
 
 def test_the_command_says_where_nothing_is_saved(tmp_path, data, monkeypatch, capsys):
-    interruption.listen()
-    monkeypatch.setattr(corpus, "clip_features", lambda file, skip_first: send(signal.SIGINT))
+    interruption.raise_on_signals()
+    monkeypatch.setattr(corpus, "read_clip_features", lambda file, skip_first: send(signal.SIGINT))
     assert mapctl_run(*train_words(data, tmp_path / "run")) == 130
     assert capsys.readouterr().err == "mapctl: interrupted; nothing was saved yet\n"
     assert not (tmp_path / "run").exists()
@@ -345,7 +347,7 @@ def test_every_option_is_in_the_line():
     ]
     given = cli.parse(words)
     assert isinstance(given, Train)
-    assert cli.parse(resumption.words(given)[1:]) == given
+    assert cli.parse(resumption.format_command(given)[1:]) == given
 
 
 def test_a_full_disk_ends_it_with_its_last_checkpoint(tmp_path, data, monkeypatch, capsys):

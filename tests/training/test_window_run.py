@@ -22,7 +22,7 @@ from priors.infiller.network import InfillerConfig
 from priors.training import denoiser_run, infiller_run
 from priors.training.recipes.denoiser import DenoiserSettings
 from priors.training.recipes.infiller import InfillerSettings
-from priors.training.window_run import command
+from priors.training.window_run import format_window_command
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ MODELS = (
     Model(
         denoiser_run,
         denoiser_run.DenoiserRequest,
-        windows.request,
+        windows.build_window_request,
         priors.load_denoiser,
         tiny_denoiser.CONFIG,
         replace(tiny_denoiser.CONFIG, width=7),
@@ -70,7 +70,7 @@ MODELS = (
     Model(
         infiller_run,
         infiller_run.InfillerRequest,
-        windows.request,
+        windows.build_window_request,
         priors.load_infiller,
         tiny_infiller.CONFIG,
         replace(tiny_infiller.CONFIG, kernel=5),
@@ -263,7 +263,12 @@ def test_numbers_that_make_no_sense_are_refused(model, words, message):
 def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, model):
     settings = replace(model.usual, steps=7, bfloat16=True, seed=3, learning_rate=2e-4)
     wanted = model.request(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings, skip_first=True)
-    words = command(wanted, model.runs.KIND).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path))
+    words = (
+        format_window_command(wanted, model.runs.KIND)
+        .replace("'", "")
+        .replace("DATA", str(data))
+        .replace("RUN", str(tmp_path))
+    )
     given = cli.parse(words.split()[1:])
     assert isinstance(given, Train)
     assert model.of_command(given) == wanted

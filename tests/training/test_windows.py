@@ -8,18 +8,18 @@ import torch
 from helpers import corpus, generator, walks
 from scipy.spatial.transform import Rotation
 
-from mapctl.features import LAYOUT, Place, decode
-from mapctl.inbetweening.missing import Lost, straight
+from mapctl.features import LAYOUT, GroundPose, decode
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus
-from priors.training.windows import PositionWindows, local_places
+from priors.training.windows import PositionWindows, compute_local_positions
 
 SWAP = CANONICAL.mirror_partners()
 
 
 def decoded(features):
-    return decode(features.double(), Place(torch.zeros(2).double(), torch.zeros(()).double()))
+    return decode(features.double(), GroundPose(torch.zeros(2).double(), torch.zeros(()).double()))
 
 
 def about_y(angle):
@@ -43,7 +43,9 @@ def seen_from_the_root(motion):
 
 def test_local_places_are_the_motions_seen_from_its_root():
     features = corpus(3, 60).features[60:120]
-    assert (local_places(features).double() - seen_from_the_root(decoded(features))).norm(dim=-1).max() < 1e-5
+    assert (compute_local_positions(features).double() - seen_from_the_root(decoded(features))).norm(
+        dim=-1
+    ).max() < 1e-5
 
 
 def test_a_window_is_the_motion_from_that_frame_on():
@@ -150,7 +152,7 @@ def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
     known[:, 10:25] = False
     motion = Motion(CANONICAL, Fraction(30), window.places[0, :, 0].double(), window.quats[0].double())
     gone = ~known[0, :, 0]
-    lost = Lost(gone[:, None].expand(-1, CANONICAL.num_joints), gone)
-    wanted = straight(motion, lost).joint_positions()
+    lost = MissingMask(gone[:, None].expand(-1, CANONICAL.num_joints), gone)
+    wanted = interpolate_missing(motion, lost).joint_positions()
     image = window.image(known)
     torch.testing.assert_close(image.to_world(image.places)[0].double(), wanted, atol=1e-4, rtol=0)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from mapctl.inbetweening.effector_targets import Targets
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 
 
@@ -24,7 +24,7 @@ class GapSource:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Proposal:
     """A proposal for all gaps of a motion."""
 
     motion: Motion
@@ -35,6 +35,6 @@ class Answer:
     """Of gaps that the infiller did not propose, in the order of time."""
 
 
-Another = Callable[[CanonicalGap, Motion, Float[Tensor, "frames 2"], Targets | None], Answer]
+Proposer = Callable[[CanonicalGap, Motion, Float[Tensor, "frames 2"], EffectorTargets | None], Proposal]
 """From what an infiller proposes for a gap, the log odds of its contacts and the places that are wanted on the way, to
 another answer."""

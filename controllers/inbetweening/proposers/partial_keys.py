@@ -16,27 +16,27 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.proposers.answers import Another, Answer
-from controllers.inbetweening.proposers.positions import proposed
+from controllers.inbetweening.proposers.answers import Proposal, Proposer
+from controllers.inbetweening.proposers.positions import propose_motion
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import LIMBS, Targets
+from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets
 from mapctl.kinematics import heading
-from mapctl.kinematics.whole_body import bend_limbs, reach_with_body
+from mapctl.kinematics.whole_body import bend_limbs, reach_targets
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import last_seen, next_seen, runs
-from mapctl.numerics.smooth_offsets import spread
+from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
+from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 
-_SINGLE = 5  # frames at the prior's rate: hips that are known for longer, a network goes along with
-_STILL = 0.02  # metres by which somebody who stands may stand elsewhere
-_ASTRAY = 0.4  # of the way that is gone meanwhile: how far a trajectory may well lead elsewhere
-_STROLL = 0.2  # m/s from which a trajectory tells where somebody faces
+_MAX_ROOT_KEY_FRAMES = 5  # frames at the prior's rate: hips that are known for longer, a network goes along with
+_MIN_ROOT_UNCERTAINTY = 0.02  # metres by which somebody who stands may stand elsewhere
+_ROOT_UNCERTAINTY_SHARE = 0.4  # of the way that is gone meanwhile: how far a trajectory may well lead elsewhere
+_MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory tells where somebody faces
 _STEP_SECONDS = 0.25
-_ARM_SECONDS, _ARM_CALM = 0.15, 15.0
+_MIN_LIMB_SECONDS, _LIMB_ACCELERATION = 0.15, 15.0
 """Least time over which a limb goes to its place, and the acceleration (m/s^2) at which it goes farther: a sixth of
 what hands and feet of walking people reach."""
-_TRUNK_SECONDS, _TRUNK_CALM = 0.25, 3.0
+_MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION = 0.25, 3.0
 """The same of hips and trunk."""
 _ARMS = tuple(
     joint
@@ -48,36 +48,47 @@ _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
 def propose_through(
-    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool, another: Another | None = None
-) -> tuple[Answer, Targets | None]:
+    gap: CanonicalGap,
+    infiller: Inbetweener,
+    targets: EffectorTargets | None,
+    *,
+    held: bool,
+    another: Proposer | None = None,
+) -> tuple[Proposal, EffectorTargets | None]:
     """What an infiller, or `another` that starts from its proposal, makes of a gap (see
     `controllers.inbetweening.proposers.positions`), with hands and feet at their places and the hips at theirs where
     single frames tell no more; and the places, brought in reach where they are not.
     """
-    hips = _hips_alone(gap)
+    hips = _find_root_only_keys(gap)
     wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
     blind = replace(gap, turns=gap.turns.index_put((hips, torch.tensor(0)), torch.tensor(True)), root=gap.root | hips)
-    first, bits = proposed(blind, infiller, None, held=held)
+    first, bits = propose_motion(blind, infiller, None, held=held)
     if not bool((hips | wanted).any()):
-        return _asked(another, gap, Answer(first, bits), targets, hips), targets
+        return _apply_proposer(another, gap, Proposal(first, bits), targets, hips), targets
     led, second = blind, first
     if bool(gap.root.any()):
-        led = _lead(gap, blind, first, targets, hips)
-        second, bits = proposed(led, infiller, None, held=True)
-    answer = _asked(another, led, Answer(second, bits), targets, hips)
+        led = _interpolate_trajectory(gap, blind, first, targets, hips)
+        second, bits = propose_motion(led, infiller, None, held=True)
+    answer = _apply_proposer(another, led, Proposal(second, bits), targets, hips)
     second = answer.motion
-    posed = _under_hips(second, gap.motion, hips)
+    posed = _set_hips(second, gap.motion, hips)
     if targets is None:
-        return replace(answer, motion=_go_there(second, posed, hips, blind)), None
-    posed = reach_with_body(posed, targets, turning=gap.turns, moving=gap.root, stray=torch.full(hips.shape, _STILL))[0]
+        return replace(answer, motion=_blend_key_poses(second, posed, hips, blind)), None
+    posed = reach_targets(
+        posed, targets, turning=gap.turns, moving=gap.root, stray=torch.full(hips.shape, _MIN_ROOT_UNCERTAINTY)
+    )[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
-    there = replace(answer, motion=_go_there(second, posed, hips | wanted, blind))
-    return there, Targets(reached, targets.wanted)
+    there = replace(answer, motion=_blend_key_poses(second, posed, hips | wanted, blind))
+    return there, EffectorTargets(reached, targets.wanted)
 
 
-def _asked(
-    another: Another | None, gap: CanonicalGap, answer: Answer, targets: Targets | None, hips: Bool[Tensor, " frames"]
-) -> Answer:
+def _apply_proposer(
+    another: Proposer | None,
+    gap: CanonicalGap,
+    answer: Proposal,
+    targets: EffectorTargets | None,
+    hips: Bool[Tensor, " frames"],
+) -> Proposal:
     """What another makes of an answer, told where hands, feet and hips are wanted on the way."""
     if another is None:
         return answer
@@ -88,20 +99,20 @@ def _asked(
         if targets is not None:
             places = torch.where(targets.wanted[..., None], targets.places, places)
             wanted = wanted | targets.wanted
-        targets = Targets(places, wanted)
+        targets = EffectorTargets(places, wanted)
     return another(gap, answer.motion, answer.odds, targets)
 
 
-def _hips_alone(gap: CanonicalGap) -> Bool[Tensor, " frames"]:
+def _find_root_only_keys(gap: CanonicalGap) -> Bool[Tensor, " frames"]:
     """Single frames, or a few, of which nothing is known but where the hips are and how they are turned."""
     alone = ~gap.root & ~gap.turns[:, 0] & gap.turns[:, 1:].all(dim=1)
-    for _, start, stop in runs(alone[:, None].clone()):
-        alone[start:stop] = stop - start <= _SINGLE
+    for _, start, stop in true_intervals(alone[:, None].clone()):
+        alone[start:stop] = stop - start <= _MAX_ROOT_KEY_FRAMES
     return alone
 
 
-def _lead(
-    gap: CanonicalGap, blind: CanonicalGap, body: Motion, targets: Targets | None, hips: Bool[Tensor, " frames"]
+def _interpolate_trajectory(
+    gap: CanonicalGap, blind: CanonicalGap, body: Motion, targets: EffectorTargets | None, hips: Bool[Tensor, " frames"]
 ) -> CanonicalGap:
     """The gap with its hips guessed along a trajectory through all that keys tell of it, facing as it leads."""
     root, facing = body.root_position.clone(), rotations.unwrap_angle(heading(body.local_quat_xyzw[:, 0]))
@@ -113,13 +124,19 @@ def _lead(
         wanted = targets.wanted.any(dim=1) & blind.root & ~hips
         root = (
             root
-            + reach_with_body(body, targets, turning=blind.turns, moving=blind.root, stray=_stray(body, blind.root))[1]
+            + reach_targets(
+                body,
+                targets,
+                turning=blind.turns,
+                moving=blind.root,
+                stray=_estimate_root_uncertainty(body, blind.root),
+            )[1]
         )
-        places = _through(root, knots | wanted, gap.seconds)
-        facing = facing + torch.where(knots, 0.0, _turned_by(body.root_position, places, float(body.fps)))
+        places = _interpolate_knots(root, knots | wanted, gap.seconds)
+        facing = facing + torch.where(knots, 0.0, _compute_heading_change(body.root_position, places, float(body.fps)))
         knots = knots | wanted
-    places = _through(root, knots, gap.seconds)
-    turned = _through(facing[:, None], knots, gap.seconds)[:, 0]
+    places = _interpolate_knots(root, knots, gap.seconds)
+    turned = _interpolate_knots(facing[:, None], knots, gap.seconds)[:, 0]
     shown = gap.motion
     quats = shown.local_quat_xyzw.clone()
     turn = torch.where(blind.root, turned - heading(quats[:, 0]), 0.0)
@@ -128,18 +145,18 @@ def _lead(
     return replace(blind, motion=replace(shown, root_position=led, local_quat_xyzw=quats))
 
 
-def _stray(body: Motion, lost: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+def _estimate_root_uncertainty(body: Motion, lost: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
     """How far hips that are not known may well be from where they are proposed, metres: the farther, the faster they
     go and the longer they are on their way from or to where they are known.
     """
     known, frame, fps = ~lost[None], torch.arange(len(lost)), float(body.fps)
-    before, after = last_seen(known)[0], next_seen(known)[0]
+    before, after = last_observed(known)[0], next_observed(known)[0]
     away = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
     way = (body.root_position[after] - body.root_position[before])[:, ::2].norm(dim=-1)
-    return _STILL + _ASTRAY * away * way * fps / (after - before).clamp_min(1)
+    return _MIN_ROOT_UNCERTAINTY + _ROOT_UNCERTAINTY_SHARE * away * way * fps / (after - before).clamp_min(1)
 
 
-def _through(
+def _interpolate_knots(
     values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
 ) -> Float[Tensor, "frames width"]:
     """The values at the knots, and monotone cubics in time between them; beyond the first and last, as these are."""
@@ -153,16 +170,21 @@ def _through(
     return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
 
 
-def _turned_by(
+def _compute_heading_change(
     before: Float[Tensor, "frames 3"], after: Float[Tensor, "frames 3"], fps: float
 ) -> Float[Tensor, " frames"]:
     """How much more one trajectory turns than another, radians; where either stands, neither tells."""
-    (one, pace), (other, pace_too) = _course(before[:, ::2], fps), _course(after[:, ::2], fps)
+    (one, pace), (other, pace_too) = (
+        _compute_travel_direction(before[:, ::2], fps),
+        _compute_travel_direction(after[:, ::2], fps),
+    )
     believed = torch.minimum(pace, pace_too).square()
-    return rotations.wrap_angle(other - one) * believed / (believed + _STROLL**2)
+    return rotations.wrap_angle(other - one) * believed / (believed + _MIN_DIRECTION_SPEED**2)
 
 
-def _course(ground: Float[Tensor, "frames 2"], fps: float) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
+def _compute_travel_direction(
+    ground: Float[Tensor, "frames 2"], fps: float
+) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
     """Which way a trajectory leads, radians, and how fast, m/s, without the sway of single steps."""
     reach, frame = max(1, round(_STEP_SECONDS * fps)), torch.arange(len(ground))
     start, stop = (frame - reach).clamp_min(0), (frame + reach).clamp(max=len(ground) - 1)
@@ -170,7 +192,7 @@ def _course(ground: Float[Tensor, "frames 2"], fps: float) -> tuple[Float[Tensor
     return torch.atan2(way[:, 0], way[:, 1]), way.norm(dim=1)
 
 
-def _under_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
+def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
     """The motion with the hips of `known` in these frames; it faces with them, and what they carry keeps its tilt."""
     quats, root = body.local_quat_xyzw.clone(), body.root_position.clone()
     facing = heading(known.local_quat_xyzw[:, 0]) - heading(quats[:, 0])
@@ -182,7 +204,7 @@ def _under_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) ->
     return replace(body, local_quat_xyzw=quats, root_position=root)
 
 
-def _go_there(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], gap: CanonicalGap) -> Motion:
+def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], gap: CanonicalGap) -> Motion:
     """`body` that goes to the poses `posed` in the frames of keys and comes back, feet staying on their own tracks."""
     fps = float(body.fps)
     turn = rotations.to_rotation_vector(
@@ -190,23 +212,27 @@ def _go_there(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], gap: C
     )
     places, goals = body.joint_positions(), posed.joint_positions()
     away = torch.where(keys[:, None], (goals - places).norm(dim=-1), 0.0)
-    limb = _duration(away[:, [limb.end for limb in LIMBS.values()]], _ARM_SECONDS, _ARM_CALM)
-    trunk = _duration(away[:, :1], _TRUNK_SECONDS, _TRUNK_CALM)
+    limb = _compute_duration(away[:, [limb.end for limb in LIMBS.values()]], _MIN_LIMB_SECONDS, _LIMB_ACCELERATION)
+    trunk = _compute_duration(away[:, :1], _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION)
     known = ~gap.turns | keys[:, None]
     quats = body.local_quat_xyzw.clone()
     for joint in range(body.num_joints):
         seconds = limb if joint in _ARMS else trunk
-        turned = spread(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
+        turned = interpolate_offsets(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
         quats[:, joint] = rotations.multiply(quats[:, joint], rotations.from_rotation_vector(turned))
-    moved = spread((posed.root_position - body.root_position) * keys[:, None], ~gap.root | keys, seconds=trunk, fps=fps)
+    moved = interpolate_offsets(
+        (posed.root_position - body.root_position) * keys[:, None], ~gap.root | keys, seconds=trunk, fps=fps
+    )
     made = replace(body, root_position=body.root_position + moved, local_quat_xyzw=quats)
     ends, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
     for foot in _FEET:
         firm = keys | ~gap.turns[:, CANONICAL.parents[foot]]
-        ends[:, foot] = places[:, foot] + spread((goals - places)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps)
+        ends[:, foot] = places[:, foot] + interpolate_offsets(
+            (goals - places)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
+        )
     return bend_limbs(made, body, ends, wanted, gap.turns)
 
 
-def _duration(away: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
+def _compute_duration(away: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
     """Seconds over which the farthest goes to its place and back: a spring's, which is `calm` at its place."""
     return max(least, math.sqrt(float(away.max()) / calm))

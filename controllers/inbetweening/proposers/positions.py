@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.geometry.seam_blending import closed_places, closed_rotations
+from controllers.inbetweening.geometry.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.effector_targets import LIMBS, Targets
+from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets
 from mapctl.kinematics import heading, inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
@@ -22,26 +22,28 @@ from mapctl.skeleton import CANONICAL
 from mapctl.terms.foot_contact import TOES
 
 _TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
-_TREMBLE, _MOMENT = 0.8, 10  # frames at the prior's rate
-_FIDGET = 0.005  # metres
-_SWAY, _PASSES = 10, 4  # frames at the prior's rate: slower than a step
-_SURE = 4.0  # log odds of contacts that are known
-_SWINGS = 0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
+_JITTER_SIGMA, _POWER_SIGMA = 0.8, 10  # frames at the prior's rate
+_MIN_CHANGE = 0.005  # metres
+_SWAY_SIGMA, _DRIFT_PASSES = 10, 4  # frames at the prior's rate: slower than a step
+_KNOWN_CONTACT_LOGIT = 4.0  # log odds of contacts that are known
+_MIN_SWING_SPEED = (
+    0.5  # m/s from which a proposed toe swings, whatever the odds that it stands: held, it would jerk the leg
+)
 
 
-def proposed(
-    gap: CanonicalGap, infiller: Inbetweener, targets: Targets | None, *, held: bool
+def propose_motion(
+    gap: CanonicalGap, infiller: Inbetweener, targets: EffectorTargets | None, *, held: bool
 ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
     """The infiller's motion on rigid bones, its seams closed, and the log odds of its contacts; `held` to its guess of
     where the hips go, but for their sway.
     """
     shown = gap.motion
     body = Motion(CANONICAL, shown.fps, shown.root_position / gap.scale, shown.local_quat_xyzw)
-    places, known = body.joint_positions(), gap.places_known()
+    places, known = body.joint_positions(), gap.compute_known_positions()
     if targets is not None:
         places = torch.where(targets.wanted[..., None], targets.places / gap.scale, places)
         known = known | targets.wanted
-    stands = contacts.planted(places[:, list(_TOES)], PRIOR_FPS).float()
+    stands = contacts.detect_contacts(places[:, list(_TOES)], PRIOR_FPS).float()
     image = PositionImage.of_world(
         places.float()[None],
         heading(shown.local_quat_xyzw[:, 0]).float()[None],
@@ -51,49 +53,51 @@ def proposed(
         toes=_TOES,
     )
     answer = infiller.propose(image)
-    wanted = image.to_world(_without_tremble(answer.places, image))[0].double()
+    wanted = image.to_world(_remove_jitter(answer.places, image))[0].double()
     if held:
-        wanted = wanted - _slow_way_off(wanted[:, 0] - body.root_position, gap.root)[:, None]
+        wanted = wanted - _estimate_root_drift(wanted[:, 0] - body.root_position, gap.root)[:, None]
     root = torch.where(gap.root[:, None], wanted[:, 0], body.root_position)
-    quats = inverse.solve(
-        wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root, limbs=_limbs(gap.turns)
+    quats = inverse.solve_inverse_kinematics(
+        wanted, shown.local_quat_xyzw, CANONICAL, free=gap.turns, root_position=root, limbs=_select_limbs(gap.turns)
     )
     quats = torch.where(gap.turns[..., None], quats, shown.local_quat_xyzw)
-    quats = closed_rotations(quats, gap.turns, fps=PRIOR_FPS)
-    root = closed_places(root * gap.scale, gap.root, fps=PRIOR_FPS)
+    quats = blend_seams_in_rotations(quats, gap.turns, fps=PRIOR_FPS)
+    root = blend_seams_in_positions(root * gap.scale, gap.root, fps=PRIOR_FPS)
     made = replace(shown, root_position=root, local_quat_xyzw=quats)
-    bits = torch.where(_toe_speeds(made) < _SWINGS * gap.scale, answer.contacts[0], -_SURE)
-    return made, torch.where(image.known[0][:, list(_TOES)], _SURE * (2 * stands - 1), bits)
+    bits = torch.where(
+        _compute_toe_speeds(made) < _MIN_SWING_SPEED * gap.scale, answer.contacts[0], -_KNOWN_CONTACT_LOGIT
+    )
+    return made, torch.where(image.known[0][:, list(_TOES)], _KNOWN_CONTACT_LOGIT * (2 * stands - 1), bits)
 
 
-def _limbs(lost: Bool[Tensor, "frames joints"]) -> list[inverse.Limb]:
+def _select_limbs(lost: Bool[Tensor, "frames joints"]) -> list[inverse.Limb]:
     """Arms and legs; how those bend that are known in no frame nothing tells but the proposal."""
     return [
         replace(limb, shown=not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all())) for limb in LIMBS.values()
     ]
 
 
-def _without_tremble(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
+def _remove_jitter(places: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
     """A network's frames are each a little off on their own: what it changes is smoothed over about a frame. Where it
     changes next to nothing it only fidgets, and the guess is as good. What it leaves alone stays.
     """
     change = (places - image.places)[0]
-    smooth = gaussian.convolved(change, gaussian.kernel(_TREMBLE, 3), "repeated")
-    power = gaussian.convolved(smooth.square().sum(dim=-1), gaussian.kernel(_MOMENT, 3 * _MOMENT), "repeated")
-    smooth = smooth * (power / (power + _FIDGET**2))[..., None]
+    smooth = gaussian.convolve(change, gaussian.kernel(_JITTER_SIGMA, 3), "repeated")
+    power = gaussian.convolve(smooth.square().sum(dim=-1), gaussian.kernel(_POWER_SIGMA, 3 * _POWER_SIGMA), "repeated")
+    smooth = smooth * (power / (power + _MIN_CHANGE**2))[..., None]
     return torch.where(image.known[..., None], places, image.places + smooth)
 
 
-def _slow_way_off(off: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
+def _estimate_root_drift(off: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
     """What hips stray by over the ground, without their sway; nothing where they are known."""
     off = torch.where(lost[:, None], off, 0.0) * torch.tensor([1.0, 0.0, 1.0], dtype=off.dtype)
-    slow, taps = torch.zeros_like(off), gaussian.kernel(_SWAY, 4 * _SWAY)
-    for _ in range(_PASSES):  # each takes the slow part of what the ones before it left
-        slow = slow + torch.where(lost[:, None], gaussian.convolved(off - slow, taps, "repeated"), 0.0)
+    slow, taps = torch.zeros_like(off), gaussian.kernel(_SWAY_SIGMA, 4 * _SWAY_SIGMA)
+    for _ in range(_DRIFT_PASSES):  # each takes the slow part of what the ones before it left
+        slow = slow + torch.where(lost[:, None], gaussian.convolve(off - slow, taps, "repeated"), 0.0)
     return slow
 
 
-def _toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
+def _compute_toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
     """Over the ground, m/s."""
     toes = motion.joint_positions()[:, list(_TOES)][..., ::2]
     return torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)

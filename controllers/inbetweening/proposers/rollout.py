@@ -13,30 +13,30 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.common.map_refinement import rest_height
+from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.canonical_gap import CanonicalGap
 from controllers.inbetweening.geometry.footholds import hold_planted
-from controllers.inbetweening.geometry.seam_blending import closed_places, closed_rotations
-from controllers.inbetweening.proposers.answers import Answer, GapSource
+from controllers.inbetweening.geometry.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
+from controllers.inbetweening.proposers.answers import GapSource, Proposal
 from mapctl import contacts, rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, Place, decode, encode, root_places
-from mapctl.inbetweening.effector_targets import Targets
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, decode, encode, integrate_root
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
-from mapctl.numerics.intervals import runs
+from mapctl.numerics.intervals import true_intervals
 from mapctl.problem import density_selection
-from mapctl.problem.context import Context
-from mapctl.problem.warm_start import SteeringKnots, Swarm, zero_start
-from mapctl.problem.window_solvers import LatentMethod, SolvedWindow
+from mapctl.problem.context import WindowContext
+from mapctl.problem.warm_start import SteeringKnots, SwarmProposal, keep_warm_start
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
-from mapctl.terms import Footing, Keyframe, Noise
+from mapctl.terms import FootContact, Keyframe, LatentPrior
 
-_SURE = 4.0  # log odds of a rollout's contacts
-_BEFORE = 5  # frames that tell how somebody goes on
-_PAST = 3  # frames before a gap that terms look back on
+_ROLLOUT_CONTACT_LOGIT = 4.0  # log odds of a rollout's contacts
+_MIN_KNOWN_FRAMES = 5  # frames that tell how somebody goes on
+_PAST_FRAMES = 3  # frames before a gap that terms look back on
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,13 @@ class RolloutSettings:
     do not tremble differently."""
     sigma_noise: float = 2.0
     """Of the noise prior while steering: above 1 leaves more of what was drawn."""
-    arrival: float = 0.03
+    sigma_arrival: float = 0.03
     """Distance of every joint from the known frame at which a rollout arrives, metres."""
     ahead: int = 15
     """Frames after a gap that are rolled with it, so that it arrives as those known among them ask."""
-    footing: Footing = field(default_factory=lambda: Footing(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05))
+    footing: FootContact = field(
+        default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05)
+    )
     """Planted feet."""
     shortest: int = 2
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
@@ -68,27 +70,27 @@ class RolloutSettings:
     A step that would end too early or too late ends in time."""
     longest: int = 180
     """Frames that are rolled at a time; what is longer is left to the given proposal."""
-    method: LatentMethod = field(
-        default_factory=lambda: LatentMethod(
+    method: LatentNoiseSolver = field(
+        default_factory=lambda: LatentNoiseSolver(
             rounds=2,
             lbfgs=LbfgsSettings(max_iterations=24),
             budget=Budget(evaluations=96),
-            proposal=Swarm(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
+            proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
         )
     )
     """The swarm and the search after it."""
 
 
-def rolled(
+def roll_through_gaps(
     gap: CanonicalGap,
     proposal: Motion,
     odds: Float[Tensor, "frames 2"],
-    targets: Targets | None = None,
+    targets: EffectorTargets | None = None,
     *,
     densities: Sequence[Any],
     generator: torch.Generator,
     settings: RolloutSettings | None = None,
-) -> Answer:
+) -> Proposal:
     """The proposal with rollouts in those of its gaps in which nothing is known and that have known frames on both
     sides; the log odds of its contacts; and which gaps these are.
 
@@ -96,17 +98,17 @@ def rolled(
     """
     settings = settings or RolloutSettings()
     roller, sources = Roller.of(gap, proposal, odds, densities, targets), []
-    for start, stop in whole_gaps(gap):
+    for start, stop in find_whole_gaps(gap):
         if settings.shortest <= stop - start <= settings.longest:
-            roller.put_in(roller.roll(start, stop, generator, settings))
+            roller.accept_rollout(roller.roll(start, stop, generator, settings))
             sources.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
-    return Answer(roller.motion, roller.odds, tuple(sources))
+    return Proposal(roller.motion, roller.odds, tuple(sources))
 
 
-def whole_gaps(gap: CanonicalGap) -> list[tuple[int, int]]:
+def find_whole_gaps(gap: CanonicalGap) -> list[tuple[int, int]]:
     """First frames and one past the last of gaps in which nothing is known, with known frames on both sides."""
     lost = gap.turns.all(dim=1) & gap.root
-    return [(start, stop) for _, start, stop in runs(lost[:, None]) if start > 0 and stop < len(lost)]
+    return [(start, stop) for _, start, stop in true_intervals(lost[:, None]) if start > 0 and stop < len(lost)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,7 @@ class Roller:
     """Log odds of contacts."""
     density: Any
     """That is rolled."""
-    targets: Targets | None
+    targets: EffectorTargets | None
     """Places wanted on the way."""
     state: Any = None
     """Of the density, after `done` frames."""
@@ -146,54 +148,56 @@ class Roller:
 
     @staticmethod
     def of(
-        gap: CanonicalGap, proposal: Motion, odds: Tensor, densities: Sequence[Any], targets: Targets | None
+        gap: CanonicalGap, proposal: Motion, odds: Tensor, densities: Sequence[Any], targets: EffectorTargets | None
     ) -> "Roller":
         """By the density under which the proposal is likeliest."""
         body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
-        return Roller(gap, proposal.skeleton, body, odds.clone(), likeliest(densities, body), targets)
+        return Roller(gap, proposal.skeleton, body, odds.clone(), select_likeliest_density(densities, body), targets)
 
     @property
     def motion(self) -> Motion:
         """So far, on the performer's bones."""
-        return self.on_performer(self.body)
+        return self.scale_to_character(self.body)
 
-    def on_performer(self, body: Motion) -> Motion:
+    def scale_to_character(self, body: Motion) -> Motion:
         """On the performer's bones."""
         return replace(body, skeleton=self.skeleton, root_position=body.root_position * self.gap.scale)
 
     def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
         """A rollout through frames start to stop; changes nothing but what was seen before them."""
-        features, place = _until(self.body, self.odds, start)
-        state = self.density.likely_state(features) if self.state is None else self.state
+        features, place = _encode_before_gap(self.body, self.odds, start)
+        state = self.density.infer_state(features) if self.state is None else self.state
         if self.done < start:
             state = self.density.advance(state, features[None, self.done :])
         self.state, self.done = state, start
-        arrival = self._arrival(start, stop, settings)
-        context = Context(self.density, self.state, place, _past(self.body, start), len(arrival.places))
+        arrival = self._build_arrival_target(start, stop, settings)
+        context = WindowContext(
+            self.density, self.state, place, _compute_past_joints(self.body, start), len(arrival.places)
+        )
         wishes = [arrival]
         if settings.trajectory is not None:
-            wishes.append(self._trajectory(start, stop, context.frames, settings))
-        noise = _drawn(context.frames, generator, settings)
+            wishes.append(self._build_trajectory_target(start, stop, context.frames, settings))
+        noise = _sample_smooth_noise(context.frames, generator, settings)
         for frames in range(settings.stage, context.frames, settings.stage) if settings.stage else ():
-            window = _solved(replace(context, frames=frames), wishes, noise[:frames], generator, settings)
+            window = _solve_rollout(replace(context, frames=frames), wishes, noise[:frames], generator, settings)
             noise = torch.cat([window.carry, noise[frames:]])
-        window = _solved(context, wishes, noise, generator, settings)
-        body, odds, missed = _put_in(self.body, self.odds, window, place, start, stop, settings.tempo)
+        window = _solve_rollout(context, wishes, noise, generator, settings)
+        body, odds, missed = _insert_rollout(self.body, self.odds, window, place, start, stop, settings.tempo)
         return Rollout(start, self._planted(body, odds, start, stop), odds, missed)
 
-    def put_in(self, rollout: Rollout) -> None:
+    def accept_rollout(self, rollout: Rollout) -> None:
         """Go on from this one."""
         self.body, self.odds = rollout.body, rollout.odds
 
     def _planted(self, body: Motion, odds: Tensor, start: int, stop: int) -> Motion:
         """With toes that stay where they stand in the gap: arriving where it must has moved them."""
-        stands, free = contacts.steadied(odds > 0), torch.zeros(len(odds), dtype=torch.bool)
+        stands, free = contacts.debounced(odds > 0), torch.zeros(len(odds), dtype=torch.bool)
         free[start:stop] = True
-        held = hold_planted(body, stands, free=free, rest_height=rest_height(body, stands))
+        held = hold_planted(body, stands, free=free, rest_height=estimate_rest_height(body, stands))
         quats = torch.where(free[:, None, None], held.local_quat_xyzw, body.local_quat_xyzw)
         return replace(body, local_quat_xyzw=quats)
 
-    def _trajectory(self, start: int, stop: int, frames: int, settings: RolloutSettings) -> Keyframe:
+    def _build_trajectory_target(self, start: int, stop: int, frames: int, settings: RolloutSettings) -> Keyframe:
         """Where the proposal has the hips in the gap, in the rollout's own time."""
         count = stop - start
         own = max(1, round(count * settings.tempo))
@@ -204,7 +208,7 @@ class Roller:
         goals[:own, 0], asked[:own, 0] = hips.float(), True
         return Keyframe(goals, asked, settings.trajectory or 1.0, name="trajectory")
 
-    def _arrival(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
+    def _build_arrival_target(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
         """Where a rollout is to be in the known frames after its gap, and at places wanted on the way, in its own
         time.
         """
@@ -220,24 +224,24 @@ class Roller:
             places = torch.where(told[..., None], self.targets.places[part][:last] / self.gap.scale, places)
             wanted = wanted | told
         if own == count:
-            return Keyframe(places.float(), wanted, settings.arrival)
+            return Keyframe(places.float(), wanted, settings.sigma_arrival)
         frames, joints = own + last - count, CANONICAL.num_joints
         goals, asked = torch.zeros(frames, joints, 3), torch.zeros(frames, joints, dtype=torch.bool)
         goals[own:], asked[own:] = places[count:].float(), wanted[count:]
         for frame in wanted[:count].any(dim=1).nonzero()[:, 0].tolist():
             at = min(own - 1, round((frame + 1) * (own + 1) / (count + 1)) - 1)
             goals[at], asked[at] = places[frame].float(), wanted[frame]
-        return Keyframe(goals, asked, settings.arrival)
+        return Keyframe(goals, asked, settings.sigma_arrival)
 
 
-def extended(
+def extrapolate_end(
     gap: CanonicalGap,
     proposal: Motion,
     odds: Float[Tensor, "frames 2"],
     *,
     densities: Sequence[Any],
     settings: RolloutSettings | None = None,
-) -> Answer:
+) -> Proposal:
     """The proposal with the likeliest rollout from where it is last known to its end, if nothing is known there; the
     log odds of its contacts; and by which density, if it does not stay as it is.
 
@@ -248,73 +252,81 @@ def extended(
     start, stop = len(lost) - int(lost.flip(0).long().cumprod(0).sum()), len(lost)
     # What stood before other gaps tells, and not what fills them.
     since = int(lost[:start].nonzero()[-1]) + 1 if bool(lost[:start].any()) else 0
-    if start == stop or start - since < _BEFORE or not densities:
-        return Answer(proposal, odds)
+    if start == stop or start - since < _MIN_KNOWN_FRAMES or not densities:
+        return Proposal(proposal, odds)
     body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
     known = body.slice(since, start)
-    judge = densities[0].blurred(density_selection.spread())
-    if density_selection.likeliest_of_motion([judge], known).weight < 1:
-        return Answer(proposal, odds)
-    density, first = likeliest(densities, known), start
+    judge = densities[0].with_observation_noise(density_selection.proposal_sigma())
+    if density_selection.select_density_for_motion([judge], known).weight < 1:
+        return Proposal(proposal, odds)
+    density, first = select_likeliest_density(densities, known), start
     while start < stop:
-        features, place = _until(body, odds, start)
-        state = density.advance(density.likely_state(features), features[None])
-        context = Context(density, state, place, _past(body, start), min(settings.longest, stop - start))
-        terms = (Noise(settings.sigma_noise), settings.footing)
+        features, place = _encode_before_gap(body, odds, start)
+        state = density.advance(density.infer_state(features), features[None])
+        context = WindowContext(
+            density, state, place, _compute_past_joints(body, start), min(settings.longest, stop - start)
+        )
+        terms = (LatentPrior(settings.sigma_noise), settings.footing)
         still = torch.zeros(context.frames, LAYOUT.continuous)
-        window = replace(settings.method, proposal=zero_start)(context, terms, still, torch.Generator())
-        body, odds, _ = _put_in(body, odds, window, place, start, start + context.frames)
+        window = replace(settings.method, proposal=keep_warm_start)(context, terms, still, torch.Generator())
+        body, odds, _ = _insert_rollout(body, odds, window, place, start, start + context.frames)
         start += context.frames
     body = replace(body, skeleton=proposal.skeleton, root_position=body.root_position * gap.scale)
-    return Answer(body, odds, (GapSource(first, stop, f"density {density.name}"),))
+    return Proposal(body, odds, (GapSource(first, stop, f"density {density.name}"),))
 
 
-def likeliest(densities: Sequence[Any], motion: Motion) -> Any:
+def select_likeliest_density(densities: Sequence[Any], motion: Motion) -> Any:
     """The density under which a canonical motion, seen with a proposal's errors, is likeliest."""
     if len(densities) == 1:
         return densities[0]
-    blurred = [density.blurred(density_selection.spread()) for density in densities]
-    return densities[blurred.index(density_selection.likeliest_of_motion(blurred, motion).density)]
+    blurred = [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
+    return densities[blurred.index(density_selection.select_density_for_motion(blurred, motion).density)]
 
 
-def _until(body: Motion, odds: Tensor, start: int) -> tuple[Float[Tensor, "frames size"], Place]:
+def _encode_before_gap(body: Motion, odds: Tensor, start: int) -> tuple[Float[Tensor, "frames size"], GroundPose]:
     """What there is before a gap, with the proposal's own contacts, single precision; and where it ends."""
     features, before = encode(body.slice(0, max(2, start)))
-    ground, heading = root_places(features, before)
+    ground, heading = integrate_root(features, before)
     features[:, LAYOUT.slices["contacts"]] = (odds[: len(features)] > 0).to(features)
-    return features[:start].float(), Place(ground[start - 1].float(), heading[start - 1].float())
+    return features[:start].float(), GroundPose(ground[start - 1].float(), heading[start - 1].float())
 
 
-def _past(body: Motion, start: int) -> Float[Tensor, "past joints 3"]:
-    first = max(0, start - _PAST)
+def _compute_past_joints(body: Motion, start: int) -> Float[Tensor, "past joints 3"]:
+    first = max(0, start - _PAST_FRAMES)
     return body.slice(first, start).joint_positions().float()
 
 
-def _solved(
-    context: Context, wishes: Sequence[Keyframe], noise: Tensor, generator: torch.Generator, settings: RolloutSettings
+def _solve_rollout(
+    context: WindowContext,
+    wishes: Sequence[Keyframe],
+    noise: Tensor,
+    generator: torch.Generator,
+    settings: RolloutSettings,
 ) -> SolvedWindow:
     """The rollout of the context's frames that comes nearest to the wishes, from this noise on."""
     part = slice(0, context.frames)
     near = [replace(wish, places=wish.places[part], wanted=wish.wanted[part]) for wish in wishes]
-    return settings.method(context, (Noise(settings.sigma_noise), settings.footing, *near), noise, generator)
+    return settings.method(context, (LatentPrior(settings.sigma_noise), settings.footing, *near), noise, generator)
 
 
-def _drawn(frames: int, generator: torch.Generator, settings: RolloutSettings) -> Float[Tensor, "frames continuous"]:
+def _sample_smooth_noise(
+    frames: int, generator: torch.Generator, settings: RolloutSettings
+) -> Float[Tensor, "frames continuous"]:
     """Noise that changes slowly."""
     white = torch.randn(frames, LAYOUT.continuous, generator=generator)
-    weight = gaussian.weights(frames, settings.slow, white.dtype)
+    weight = gaussian.pairwise_weights(frames, settings.slow, white.dtype)
     return settings.temperature * (weight / weight.square().sum(dim=-1, keepdim=True).sqrt()) @ white
 
 
-def _put_in(
-    body: Motion, odds: Tensor, window: SolvedWindow, place: Place, start: int, stop: int, tempo: float = 1.0
+def _insert_rollout(
+    body: Motion, odds: Tensor, window: SolvedWindow, place: GroundPose, start: int, stop: int, tempo: float = 1.0
 ) -> tuple[Motion, Float[Tensor, "frames 2"], float]:
     """The rollout in its gap, moved so that it arrives at the frame after it, if there is one; its contacts; and by how
     much it had missed that frame, mean distance of the joints, metres.
     """
-    made = decode(window.trial.features[0], Place(place.position_xz.double(), place.heading.double()))
+    made = decode(window.trial.features[0], GroundPose(place.position_xz.double(), place.heading.double()))
     stands, count, missed = window.trial.contacts[0], stop - start, 0.0
-    made, stands = _in_time(made, stands, max(1, round(count * tempo)), count)
+    made, stands = _warp_time(made, stands, max(1, round(count * tempo)), count)
     share = torch.sin(0.5 * torch.pi * torch.arange(1, count + 1) / (count + 1)).square()[:, None].double()
     root, quats, odds = body.root_position.clone(), body.local_quat_xyzw.clone(), odds.clone()
     root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
@@ -327,13 +339,13 @@ def _put_in(
         quats[start:stop] = rotations.multiply(quats[start:stop], turned)
     put = torch.zeros(len(root), dtype=torch.bool)
     put[start:stop] = True
-    root = closed_places(root, put, fps=PRIOR_FPS)
-    quats = closed_rotations(quats, put[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
-    odds[start:stop] = _SURE * (2 * stands[:count].to(odds) - 1)
+    root = blend_seams_in_positions(root, put, fps=PRIOR_FPS)
+    quats = blend_seams_in_rotations(quats, put[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
+    odds[start:stop] = _ROLLOUT_CONTACT_LOGIT * (2 * stands[:count].to(odds) - 1)
     return replace(body, root_position=root, local_quat_xyzw=quats), odds, missed
 
 
-def _in_time(
+def _warp_time(
     made: Motion, stands: Bool[Tensor, "rolled 2"], own: int, count: int
 ) -> tuple[Motion, Bool[Tensor, "frames 2"]]:
     """What took `own` frames, from the frame before to the one after them, in `count`; nothing more after that."""

@@ -17,7 +17,7 @@ OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
 
 
 @dataclass(frozen=True, eq=False)
-class Wearer:
+class Character:
     """Who is to move."""
 
     skeleton: "Skeleton"
@@ -38,13 +38,13 @@ class Wearer:
         return replace(retarget.from_canonical(motion, self.rigmap), source=self.source)
 
 
-def read(text: str) -> Wearer:
+def read_character(text: str) -> Character:
     """The person of a --rig option: canonical, of a clip's skeleton, or with canonical bones on a preset's joints."""
     from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 
     if text == "canonical":
-        return Wearer(CANONICAL, TOE_REST_HEIGHT)
-    from mapctl.retarget.carry import Body
+        return Character(CANONICAL, TOE_REST_HEIGHT)
+    from mapctl.retarget.carry import RiggedCharacter
 
-    body = Body.of(*options.read_figure(text))[1]
-    return Wearer(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)
+    body = RiggedCharacter.of(*options.read_rig_clip(text))[1]
+    return Character(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)

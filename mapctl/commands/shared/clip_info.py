@@ -16,18 +16,18 @@ def is_clip(name: str) -> bool:
     return Path(name).suffix.lower() in formats.READERS
 
 
-def tell(path: Path, rig: str | None, *, as_json: bool) -> None:
+def print_clip(path: Path, rig: str | None, *, as_json: bool) -> None:
     """Print it; RequestError where the rig cannot be told, naming what is missing."""
     from mapctl import report
 
-    told = outline(path, rig)
+    told = describe_clip(path, rig)
     if as_json:
-        print(report.as_json(told), end="")
+        print(report.to_json(told), end="")
         return
     shown = {key: value for key, value in told.items() if key not in ("joints", "unmapped")}
     shown["fps"] = f"{told['fps']:.6g}"
     shown["seconds"] = f"{told['seconds']:.2f}"
-    shown["unit"] = _unit(told["metres_per_unit"])
+    shown["unit"] = _format_unit(told["metres_per_unit"])
     shown["up"] = f"+{told['up']}" if len(told["up"]) == 1 else told["up"]
     del shown["metres_per_unit"]
     print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
@@ -35,7 +35,7 @@ def tell(path: Path, rig: str | None, *, as_json: bool) -> None:
     print(f"not canonical ({len(told['unmapped'])}): {', '.join(told['unmapped']) or 'none'}")
 
 
-def outline(path: Path, rig_text: str | None) -> dict[str, Any]:
+def describe_clip(path: Path, rig_text: str | None) -> dict[str, Any]:
     """By name, everything about a clip that `mapctl info` tells."""
     from mapctl import retarget
     from mapctl.formats import bvh
@@ -67,5 +67,5 @@ def outline(path: Path, rig_text: str | None) -> dict[str, Any]:
     }
 
 
-def _unit(metres: float) -> str:
+def _format_unit(metres: float) -> str:
     return f"{_UNITS[metres]} ({metres:g} m)" if metres in _UNITS else f"{metres:g} m"

@@ -12,17 +12,17 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics import realism
 from mapctl.metrics.comparison import make_comparable
-from mapctl.metrics.realism.diversity import diversity_of_positions, from_own_start
+from mapctl.metrics.realism.diversity import align_to_start, measure_position_diversity
 from mapctl.metrics.realism.gait import PIECE_SECONDS
 from mapctl.motion import Motion
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 SETTINGS = realism.RealismSettings()
 """How folders are told apart."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Clip:
+class _MeasuredClip:
     """One file of a folder."""
 
     motion: Motion
@@ -37,14 +37,14 @@ class _Clip:
     """What could not be made comparable."""
 
     @staticmethod
-    def read(path: Path, *, with_windows: bool) -> "_Clip":
+    def read(path: Path, *, with_windows: bool) -> "_MeasuredClip":
         """MapctlError for what cannot be read, measured or cut."""
         motion, notes = make_comparable(formats.load(path))
         measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
         if with_windows:
             positions = realism.canonical_positions(motion)
-            windows = realism.clip_windows(positions, SETTINGS.windows)
-        return _Clip(motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
+            windows = realism.cut_windows(positions, SETTINGS.windows)
+        return _MeasuredClip(motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +74,12 @@ class ClipSet:
         paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
         if not paths:
             raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
-        clips: list[_Clip] = []
+        clips: list[_MeasuredClip] = []
         skipped: dict[str, str] = {}
-        with bar(f"reading {folder}") as progress:
+        with show_progress(f"reading {folder}") as progress:
             for number, path in enumerate(paths, start=1):
                 try:
-                    clips.append(_Clip.read(path, with_windows=with_windows))
+                    clips.append(_MeasuredClip.read(path, with_windows=with_windows))
                 except MapctlError as error:
                     skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
                 if progress is not None:
@@ -90,7 +90,7 @@ class ClipSet:
         return ClipSet(
             folder,
             [clip.motion for clip in clips],
-            _means([clip.measures for clip in clips]),
+            _average_measures([clip.measures for clip in clips]),
             positions,
             windows,
             skipped,
@@ -103,34 +103,34 @@ class ClipSet:
         Each clip is seen from its own start, so that sets which did not begin in one place can be compared.
         """
         frames = round(PIECE_SECONDS * PRIOR_FPS)
-        pieces = [from_own_start(clip)[:frames] for clip in self.positions if len(clip) >= frames]
+        pieces = [align_to_start(clip)[:frames] for clip in self.positions if len(clip) >= frames]
         if len(pieces) < 2:
             return realism.Diversity(math.nan, math.nan)
-        return diversity_of_positions(torch.stack(pieces))
+        return measure_position_diversity(torch.stack(pieces))
 
 
-def compared_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Realism:
+def compare_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Realism:
     """Ours against the reference; RequestError, which says what is left to do, for too few clips."""
-    fewest = SETTINGS.fewest_clips
+    fewest = SETTINGS.min_clips
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
             raise RequestError(
                 f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in "
-                f"each folder{_left_out(clips)} (without --reference a folder of any size is "
+                f"each folder{_describe_skipped(clips)} (without --reference a folder of any size is "
                 "measured)"
             )
     draws = torch.Generator().manual_seed(seed)
-    with bar("telling apart") as progress:
-        return realism.realism_of_windows(
+    with show_progress("telling apart") as progress:
+        return realism.measure_window_realism(
             ours.windows, reference.windows, generator=draws, settings=SETTINGS, progress=progress
         )
 
 
-def compared_spread(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, float]]:
+def compare_variability(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, float]]:
     """By measure ours, the reference's and their ratio: standard deviations of gait, average pairwise distances."""
     sides = []
     for clips in (ours, reference):
-        gait = {f"std_of_{name}": spread.std for name, spread in realism.gait_spread(clips.motions).items()}
+        gait = {f"std_of_{name}": spread.std for name, spread in realism.measure_gait_spread(clips.motions).items()}
         apart = clips.diversity()
         sides.append(gait | {f"pairwise_distance_{name}": value for name, value in apart._asdict().items()})
     mine, theirs = sides
@@ -140,11 +140,11 @@ def compared_spread(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, fl
     }
 
 
-def _left_out(clips: ClipSet) -> str:
+def _describe_skipped(clips: ClipSet) -> str:
     first = next(iter(clips.skipped.values()), None)
     return "" if first is None else f", and {len(clips.skipped)} cannot be measured: {first}"
 
 
-def _means(rows: list[dict[str, float]]) -> dict[str, float]:
+def _average_measures(rows: list[dict[str, float]]) -> dict[str, float]:
     """NaN, a clip that cannot give a measure, is left out."""
     return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in rows[0]}

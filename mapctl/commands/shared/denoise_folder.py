@@ -6,37 +6,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options, outputs
-from mapctl.commands.shared.resumption import telling_what_is_finished
+from mapctl.commands.shared.resumption import explain_progress
 from mapctl.errors import RequestError
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
-    from controllers.denoising.batch import Done, Job
-    from controllers.denoising.result import Denoised
+    from controllers.denoising.batch import FileJob, FileResult
+    from controllers.denoising.result import DenoiseResult
     from mapctl.commands.denoise import Denoise
 
-_NOT_ALL_HOLDS = 3
+_EXIT_NOT_SATISFIED = 3
 
 
 def run(given: "Denoise") -> int:
     """Check, denoise what is not done yet, list what failed."""
-    jobs, there = jobs_of(given)
+    jobs, there = collect_jobs(given)
     import priors
-    from controllers.denoising.batch import Cleaner, over_cluster, over_processes
+    from controllers.denoising.batch import FileDenoiser, run_over_cluster, run_over_processes
 
     priors.load_denoiser(given.denoiser)  # a typing error is said once, now
     load = partial(priors.load_denoiser, given.denoiser)
-    after = None if given.report is None else WriteReport(given, given.report)
-    cleaner = Cleaner(load, given.settings(), options.read_rig(given.rig), after)
+    after = None if given.report is None else ReportWriter(given, given.report)
+    cleaner = FileDenoiser(load, given.settings(), options.read_rig(given.rig), after)
     if given.cluster is not None:
-        ended = over_cluster(jobs, cleaner, address=given.cluster, workers=given.jobs)
+        ended = run_over_cluster(jobs, cleaner, address=given.cluster, workers=given.jobs)
     else:
-        ended = over_processes(jobs, cleaner, processes=given.jobs)
-    failed: list[Done] = []
+        ended = run_over_processes(jobs, cleaner, processes=given.jobs)
+    failed: list[FileResult] = []
     frames, seconds = 0, 0.0
     again = "" if given.again else "the same command goes on with the others"
-    counted = telling_what_is_finished(len(jobs), "files", again)
-    with bar("denoising", quiet=given.quiet) as progress, counted as finished:
+    counted = explain_progress(len(jobs), "files", again)
+    with show_progress("denoising", quiet=given.quiet) as progress, counted as finished:
         for number, done in enumerate(ended, start=1):
             failed += [done] if done.error else []
             frames, seconds = frames + done.frames, seconds + done.seconds
@@ -50,12 +50,12 @@ def run(given: "Denoise") -> int:
         # A reader's message names its file already.
         text = done.error if str(done.job.source) in done.error else f"{done.job.source}: {done.error}"
         print(f"failed: {text}")
-    return _NOT_ALL_HOLDS if failed else 0
+    return _EXIT_NOT_SATISFIED if failed else 0
 
 
-def jobs_of(given: "Denoise") -> tuple[list["Job"], int]:
+def collect_jobs(given: "Denoise") -> tuple[list["FileJob"], int]:
     """What there is to do, and how many files are done already; RequestError for what folders do not take."""
-    from controllers.denoising.batch import Job
+    from controllers.denoising.batch import FileJob
     from mapctl import formats
 
     for name in ("mask", "plot", "video", "prior", "causal", "strict"):
@@ -76,7 +76,7 @@ def jobs_of(given: "Denoise") -> tuple[list["Job"], int]:
     )
     if not sources:
         raise RequestError(f"no {' or '.join(formats.READERS)} below {given.source}")
-    jobs = [Job(path, given.out / _written(path.relative_to(given.source))) for path in sources]
+    jobs = [FileJob(path, given.out / _choose_output_name(path.relative_to(given.source))) for path in sources]
     names: dict[Path, Path] = {}
     for job in jobs:
         if (other := names.setdefault(job.out, job.source)) != job.source:
@@ -85,7 +85,7 @@ def jobs_of(given: "Denoise") -> tuple[list["Job"], int]:
     return left, len(jobs) - len(left)
 
 
-def _written(path: Path) -> Path:
+def _choose_output_name(path: Path) -> Path:
     """The same name, with an ending that can be written."""
     from mapctl import formats
 
@@ -93,7 +93,7 @@ def _written(path: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class WriteReport:
+class ReportWriter:
     """Writes a report for each file, in the process that cleaned it."""
 
     given: "Denoise"
@@ -101,10 +101,10 @@ class WriteReport:
     folder: Path
     """Where reports go, by the names of the results."""
 
-    def __call__(self, job: "Job", done: "Denoised") -> None:
+    def __call__(self, job: "FileJob", done: "DenoiseResult") -> None:
         """One report."""
         from mapctl import report
 
         place = (self.folder / job.out.relative_to(self.given.out)).with_suffix(".json")
         place.parent.mkdir(parents=True, exist_ok=True)
-        report.write(self.given.as_report(done), place)
+        report.write_report(self.given.as_report(done), place)

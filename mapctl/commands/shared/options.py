@@ -37,7 +37,7 @@ MaybeSize = Annotated[str | None, arg(metavar="WxH")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
-MOST_FRAMES = 3_600_000
+MAX_FRAMES = 3_600_000
 """Longest motion asked for in one go: 33 hours at the priors' rate."""
 
 
@@ -47,14 +47,14 @@ def check_seed(seed: int) -> None:
         raise RequestError(f"the seed must be a whole number from 0 to 2^63 - 1, got {seed}")
 
 
-def frames_of(seconds: float) -> int:
+def count_frames(seconds: float) -> int:
     """Frames of a motion of so many seconds at the priors' rate; RequestError for none or too many."""
     from mapctl.features import PRIOR_FPS
 
     if not seconds > 0:
         raise RequestError(f"seconds must be positive, got {seconds:g}")
-    if seconds * PRIOR_FPS > MOST_FRAMES:
-        raise RequestError(f"seconds must be at most {MOST_FRAMES // PRIOR_FPS}, got {seconds:g}")
+    if seconds * PRIOR_FPS > MAX_FRAMES:
+        raise RequestError(f"seconds must be at most {MAX_FRAMES // PRIOR_FPS}, got {seconds:g}")
     return max(2, round(seconds * PRIOR_FPS))
 
 
@@ -79,10 +79,10 @@ def read_rig(text: str | None) -> "Rig | None":
     """The rig of a --rig option: a preset, a TOML file, or that of a clip; None where none is asked for."""
     from mapctl.retarget import rigs
 
-    return None if text is None else rigs.read(text)
+    return None if text is None else rigs.load_rig(text)
 
 
-def read_figure(text: str) -> "tuple[Motion, Rig | None]":
+def read_rig_clip(text: str) -> "tuple[Motion, Rig | None]":
     """Whose skeleton a --rig option asks for: a clip; or somebody who stands on the joints of a preset or a TOML file,
     and its rig."""
     from mapctl import formats
@@ -90,8 +90,8 @@ def read_figure(text: str) -> "tuple[Motion, Rig | None]":
 
     if Path(text).suffix.lower() in formats.READERS:
         return formats.load(text), None
-    rig = rigs.read(text)
-    return figure.stand(rig), rig
+    rig = rigs.load_rig(text)
+    return figure.make_tpose_clip(rig), rig
 
 
 def read_motion(path: Path, rig: "Rig | None", *, fps: "Fraction | None" = None) -> "Motion":
@@ -101,21 +101,21 @@ def read_motion(path: Path, rig: "Rig | None", *, fps: "Fraction | None" = None)
     return formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
 
 
-def read_lossy(path: Path, rig: "Rig | None") -> "tuple[Motion, tuple[Mask, ...], bool]":
+def read_motion_with_gaps(path: Path, rig: "Rig | None") -> "tuple[Motion, tuple[Mask, ...], bool]":
     """The same, of a file that may have NaN where something was lost; masks of what was, and whether it has any."""
     from mapctl import formats
-    from mapctl.recording.masks import of_missing
+    from mapctl.recording.masks import masks_from_missing
 
-    motion, missing = formats.load_lossy(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
-    return motion, of_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())
+    motion, missing = formats.load_with_missing(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())
 
 
-def as_request(name: str, command: Any) -> dict[str, Any]:
+def describe_request(name: str, command: Any) -> dict[str, Any]:
     """A command and its options as a report shows them."""
     values = {field.name: getattr(command, field.name) for field in fields(command)}
     return {"command": name} | {key: str(v) if isinstance(v, Path) else v for key, v in values.items()}
 
 
-def given(*paths: Path | None) -> list[Path]:
+def collect_paths(*paths: Path | None) -> list[Path]:
     """The paths that were asked for."""
     return [path for path in paths if path is not None]

@@ -57,7 +57,7 @@ def check_folder(folder: str | PathLike[str]) -> None:
 
 
 @contextmanager
-def made_folder(folder: Path) -> Iterator[Path]:
+def make_folder(folder: Path) -> Iterator[Path]:
     """The folder, made with its parents; those made here are removed again if the work leaves them empty."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:

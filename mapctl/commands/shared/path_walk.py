@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from mapctl.commands.shared.character import Wearer
+from mapctl.commands.shared.character import Character
 from mapctl.runtime.progress import Progress
 
 if TYPE_CHECKING:
     from mapctl.curves.curve import Curve
-    from mapctl.intent.path import Follow
+    from mapctl.intent.path import PathRequest
     from mapctl.motion import Motion
     from mapctl.problem.solution import Solution
     from priors.lstm_gmm.density import LstmGmmDensity
 
 
-INTERRUPTED = 130
+EXIT_INTERRUPTED = 130
 """Exit status after Ctrl-C; what was solved until then is written, films are not."""
 
 
@@ -25,7 +25,7 @@ INTERRUPTED = 130
 class Walk:
     """A solved walk."""
 
-    request: "Follow"
+    request: "PathRequest"
     """What was asked for."""
     prior: "LstmGmmDensity"
     """What moved the character."""
@@ -35,7 +35,7 @@ class Walk:
     """What came out."""
     seconds: float
     """Wall clock of the solve."""
-    person: Wearer | None = None
+    person: Character | None = None
     """Who walks, where that is not the canonical body."""
 
     @property
@@ -58,7 +58,7 @@ class Walk:
 
         motion = self.solution.motion
         wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
-        return report.path_measures(motion, self.request.curve, wanted_m=wanted)
+        return report.measure_path(motion, self.request.curve, wanted_m=wanted)
 
     def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """The report of this walk; `request` is what the user wrote."""
@@ -66,7 +66,7 @@ class Walk:
 
         card = self.prior.card
         prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
-        return report.build(
+        return report.build_report(
             self.solution, request=request, seed=self.seed, measures=self.measures, seconds=self.seconds, prior=prior
         )
 
@@ -75,7 +75,7 @@ class Walk:
         from mapctl import report
 
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
-        cost = report.timing(self.solution.windows, seconds=self.seconds)
+        cost = report.summarise_timing(self.solution.windows, seconds=self.seconds)
         motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
@@ -90,23 +90,23 @@ class Walk:
 
 def walk(
     prior: "LstmGmmDensity",
-    request: "Follow",
+    request: "PathRequest",
     *,
     seed: int,
     progress: Progress | None = None,
-    person: Wearer | None = None,
+    person: Character | None = None,
 ) -> Walk:
     """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
     import torch
 
     from controllers.following.follow import FollowSettings, follow
     from mapctl.skeleton import CANONICAL
-    from mapctl.terms import Footing
+    from mapctl.terms import FootContact
 
     if prior.use_fast:
         _ = prior.fast
     bones = CANONICAL if person is None else person.skeleton
-    settings = None if person is None else FollowSettings(footing=Footing(rest_height=person.toe_rest_height))
+    settings = None if person is None else FollowSettings(footing=FootContact(rest_height=person.toe_rest_height))
     began = time.perf_counter()
     solution = follow(
         prior,
@@ -121,12 +121,12 @@ def walk(
     return Walk(request, prior, seed, solution, time.perf_counter() - began, person)
 
 
-def as_follow(curve: "Curve", speed: str | float | None, seconds: float | None) -> "Follow":
+def parse_follow(curve: "Curve", speed: str | float | None, seconds: float | None) -> "PathRequest":
     """The wish, checked: RequestError for speeds and durations that make no sense or take too long."""
     from mapctl.features import PRIOR_FPS
-    from mapctl.intent.path import Follow, SpeedProfile
+    from mapctl.intent.path import PathRequest, SpeedProfile
 
     profile = SpeedProfile.parse(str(1.2 if speed is None else speed))
-    request = Follow(curve, profile, seconds)
+    request = PathRequest(curve, profile, seconds)
     request.frames(PRIOR_FPS)
     return request

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 _SIZE = (1280, 720)
 
 
-def check(out: Path, video: Path | None, *others: Path | None, given: Sequence[Path]) -> None:
+def check_destinations(out: Path, video: Path | None, *others: Path | None, given: Sequence[Path]) -> None:
     """RequestError unless the motion, its film and the other files can be written, none over a given file; leaves no
     trace.
     """
     from mapctl import formats
 
     formats.check_ending(out)
-    outputs.check_files(options.given(out, video, *others), given=given)
+    outputs.check_files(options.collect_paths(out, video, *others), given=given)
     if video is not None:
         outputs.check_film(video, _SIZE)
 
@@ -34,28 +34,28 @@ def check_method(method: str, *, prior: str | None = None, infiller: str | None)
         raise RequestError(f"--method {method} knows no network; leave --infiller out")
 
 
-def film(before: "Motion", after: "Motion", video: Path | None, *, rig: "Rig | None", quiet: bool) -> None:
+def film_comparison(before: "Motion", after: "Motion", video: Path | None, *, rig: "Rig | None", quiet: bool) -> None:
     """Both side by side, if a film is asked for."""
     if video is None:
         return
-    from mapctl.runtime.progress import bar
-    from scenes.plots.denoising import side_by_side
+    from mapctl.runtime.progress import show_progress
+    from scenes.plots.denoising import film_side_by_side
 
-    with bar("filming", quiet=quiet) as progress:
-        side_by_side(before, after, video, rig=rig, progress=progress)
+    with show_progress("filming", quiet=quiet) as progress:
+        film_side_by_side(before, after, video, rig=rig, progress=progress)
 
 
-def report(name: str, command: Any, motion: "Motion", found: dict[str, Any]) -> dict[str, Any]:
+def build_report(name: str, command: Any, motion: "Motion", found: dict[str, Any]) -> dict[str, Any]:
     """The request, versions, what was found, and the motion's measures, as `mapctl measure` takes them."""
     from mapctl import __version__, metrics
     from mapctl import report as reports
     from mapctl.metrics.comparison import make_comparable
 
-    request = {key: value for key, value in options.as_request(name, command).items() if value is not None}
+    request = {key: value for key, value in options.describe_request(name, command).items() if value is not None}
     return {
         "mapctl": __version__,
         "request": request,
-        "versions": reports.versions(),
+        "versions": reports.package_versions(),
         **found,
         "measures": metrics.measure(make_comparable(motion, options.read_rig(command.rig))[0]),
     }

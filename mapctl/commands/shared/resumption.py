@@ -13,18 +13,18 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def telling_how_to_go_on(given: "Train") -> Iterator[None]:
+def explain_resumption(given: "Train") -> Iterator[None]:
     """What Ctrl-C, SIGTERM or a full disk ends within says what is saved, and what to type."""
     try:
         yield
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(_how(given) or "nothing was saved yet") from stop
+        raise KeyboardInterrupt(_describe_resumption(given) or "nothing was saved yet") from stop
     except WriteError as error:
-        raise WriteError(_joined(str(error), _how(given))) from error
+        raise WriteError(_join_sentences(str(error), _describe_resumption(given))) from error
 
 
 @contextmanager
-def telling_what_is_finished(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
+def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
     """Yield a function that is told how many are finished; Ctrl-C, SIGTERM and a full disk say it, and what to do
     `then`.
     """
@@ -40,12 +40,12 @@ def telling_what_is_finished(count: int, what: str, then: str = "") -> Iterator[
     try:
         yield tell
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(_joined(str(stop), *kept())) from stop
+        raise KeyboardInterrupt(_join_sentences(str(stop), *kept())) from stop
     except WriteError as error:
-        raise WriteError(_joined(str(error), *kept())) from error
+        raise WriteError(_join_sentences(str(error), *kept())) from error
 
 
-def words(given: "Train") -> list[str]:
+def format_command(given: "Train") -> list[str]:
     """What to type for a command; options that are the defaults are left out."""
     typed = ["mapctl", "train", given.model]
     for option in fields(given):
@@ -61,14 +61,14 @@ def words(given: "Train") -> list[str]:
     return typed
 
 
-def _joined(*parts: str) -> str:
+def _join_sentences(*parts: str) -> str:
     return "; ".join(filter(None, parts))
 
 
-def _how(given: "Train") -> str:
+def _describe_resumption(given: "Train") -> str:
     """Empty where the run folder holds no checkpoint."""
-    from priors.training.run_files import last_step
+    from priors.training.run_files import read_last_step
 
-    step = last_step(given.out)
-    typed = shlex.join([*words(replace(given, resume=False)), "--resume"])
+    step = read_last_step(given.out)
+    typed = shlex.join([*format_command(replace(given, resume=False)), "--resume"])
     return "" if step is None else f"step {step} is saved; go on with: {typed}"

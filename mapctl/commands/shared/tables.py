@@ -17,7 +17,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, tit
         numeric = any(isinstance(row[number], int | float) for row in rows)
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
-        table.add_row(*(cell(value) for value in row))
+        table.add_row(*(format_cell(value) for value in row))
     console.print(table)
 
 
@@ -27,7 +27,7 @@ def print_records(records: Sequence[Mapping[str, object]], *, title: str | None 
     print_table(columns, [[record.get(name) for name in columns] for record in records], title=title)
 
 
-def cell(value: object) -> str:
+def format_cell(value: object) -> str:
     """One value as a table shows it."""
     if value is None or value != value:
         return "-"

@@ -5,7 +5,7 @@ import os
 _VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-def compute_on_one() -> None:
+def use_single_thread() -> None:
     """One thread for torch and BLAS; takes full effect before numpy is first imported."""
     for name in _VARIABLES:
         os.environ.setdefault(name, "1")

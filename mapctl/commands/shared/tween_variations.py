@@ -8,78 +8,80 @@ from typing import TYPE_CHECKING, Any
 
 from mapctl.commands.shared import options, results
 from mapctl.errors import RequestError
-from mapctl.runtime.progress import bar
+from mapctl.runtime.progress import show_progress
 
 if TYPE_CHECKING:
-    from controllers.inbetweening.keyframe_poses import Keyed
-    from controllers.inbetweening.pipeline import Infilled, InfillSettings
+    from controllers.inbetweening.keyframe_poses import KeyframeClip
+    from controllers.inbetweening.pipeline import InfillResult, InfillSettings
     from controllers.inbetweening.variations import Variations
     from mapctl.commands.tween import Tween
 
-_MOST = 1000
-_FIRST_DRAWN = 3  # answers before it are the infiller's and slerp's
+_MAX_ANSWERS = 1000
+_FIRST_SAMPLED = 3  # answers before it are the infiller's and slerp's
 
 
-def numbered(path: Path, count: int) -> list[Path]:
+def number_paths(path: Path, count: int) -> list[Path]:
     """walk_000.bvh, walk_001.bvh, ... of walk.bvh."""
     return [path.with_name(f"{path.stem}_{number:03d}{path.suffix}") for number in range(count)]
 
 
-def check(command: "Tween", given: Sequence[Path]) -> None:
+def check_answers(command: "Tween", given: Sequence[Path]) -> None:
     """RequestError for what several answers cannot be made of, and files that cannot be written."""
     options.check_seed(command.seed)
     for name, count in (("--variations", command.variations), ("--best-of", command.best_of)):
-        if not 1 <= count <= _MOST:
-            raise RequestError(f"{name} must be 1 to {_MOST}, got {count}")
+        if not 1 <= count <= _MAX_ANSWERS:
+            raise RequestError(f"{name} must be 1 to {_MAX_ANSWERS}, got {count}")
         if count > 1 and command.method == "slerp":
             raise RequestError(f"--method slerp knows one answer only; leave {name} out")
     if command.variations > 1 and command.best_of > 1:
         raise RequestError("--variations keeps all answers and --best-of one; choose one")
     if command.variations == 1:
-        if command.seed and command.best_of < _FIRST_DRAWN:
+        if command.seed and command.best_of < _FIRST_SAMPLED:
             raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --best-of 3")
-        results.check(command.out, command.video, command.report, given=given)
+        results.check_destinations(command.out, command.video, command.report, given=given)
         return
     if command.suggest_timing:
         raise RequestError("--suggest-timing tells of one answer; leave --variations out")
     if command.video is not None:
         raise RequestError("--video shows one answer; leave it out, and film OUT_000 by `mapctl render`")
-    first, *others = numbered(command.out, command.variations)
-    results.check(first, None, *others, command.report, given=given)
+    first, *others = number_paths(command.out, command.variations)
+    results.check_destinations(first, None, *others, command.report, given=given)
 
 
-def best(command: "Tween", asked: "Keyed", infiller: Any, settings: "InfillSettings") -> "Infilled":
+def tween_lowest_energy(
+    command: "Tween", asked: "KeyframeClip", infiller: Any, settings: "InfillSettings"
+) -> "InfillResult":
     """The likeliest of several answers."""
-    from controllers.inbetweening.variations import best_of
+    from controllers.inbetweening.variations import lowest_energy
 
-    with bar("answers", quiet=command.quiet) as progress:
-        return best_of(
+    with show_progress("answers", quiet=command.quiet) as progress:
+        return lowest_energy(
             asked.motion,
             asked.keys,
             infiller,
             command.best_of,
             settings=settings,
-            **_drawn(command, asked),
+            **_load_rollout_arguments(command, asked),
             progress=progress,
         )
 
 
-def run(command: "Tween", asked: "Keyed") -> None:
+def run_variations(command: "Tween", asked: "KeyframeClip") -> None:
     """Make, write, tell; the report names every file with its energy."""
     from mapctl import formats
 
-    found = _made(command, asked)
-    files = numbered(command.out, command.variations)
+    found = _make_variations(command, asked)
+    files = number_paths(command.out, command.variations)
     for one, file in zip(found.each, files, strict=True):
-        formats.save(one.infilled.motion, file)
+        formats.save(one.infill_result.motion, file)
     if command.report is not None:
         from mapctl import report
 
-        report.write(_as_report(command, asked, found, files), command.report)
+        report.write_report(_report_variations(command, asked, found, files), command.report)
     if not command.quiet:
         for one, file in zip(found.each, files, strict=True):
-            frames = one.infilled.motion.num_frames
-            ms = 1000 * one.infilled.seconds / frames
+            frames = one.infill_result.motion.num_frames
+            ms = 1000 * one.infill_result.seconds / frames
             print(
                 f"{file}: {frames} frames through {len(asked.keys.frames)} keys; energy {one.energy:.1f} nats a"
                 f" frame; {ms:.1f} ms a frame"
@@ -88,31 +90,31 @@ def run(command: "Tween", asked: "Keyed") -> None:
             f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
             f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips"
         )
-        first = found.each[0].infilled
+        first = found.each[0].infill_result
         for note in (*first.notes, *first.gap_notes):
             print(note)
 
 
-def _made(command: "Tween", asked: "Keyed") -> "Variations":
+def _make_variations(command: "Tween", asked: "KeyframeClip") -> "Variations":
     import priors
     from controllers.inbetweening.pipeline import InfillSettings
-    from controllers.inbetweening.variations import variations
+    from controllers.inbetweening.variations import sample_variations
 
     settings = InfillSettings(method="infiller" if command.method == "infiller" else "map")
     infiller = priors.load_infiller(command.infiller or "infiller")
-    with bar("variations", quiet=command.quiet) as progress:
-        return variations(
+    with show_progress("variations", quiet=command.quiet) as progress:
+        return sample_variations(
             asked.motion,
             asked.keys,
             infiller,
             command.variations,
             settings=settings,
-            **_drawn(command, asked),
+            **_load_rollout_arguments(command, asked),
             progress=progress,
         )
 
 
-def _drawn(command: "Tween", asked: "Keyed") -> dict[str, Any]:
+def _load_rollout_arguments(command: "Tween", asked: "KeyframeClip") -> dict[str, Any]:
     """What rollouts are made by, and the rig."""
     import torch
 
@@ -126,19 +128,21 @@ def _drawn(command: "Tween", asked: "Keyed") -> dict[str, Any]:
     }
 
 
-def _as_report(command: "Tween", asked: "Keyed", found: "Variations", files: list[Path]) -> dict[str, Any]:
-    from controllers.inbetweening.tween import key_errors
+def _report_variations(
+    command: "Tween", asked: "KeyframeClip", found: "Variations", files: list[Path]
+) -> dict[str, Any]:
+    from controllers.inbetweening.tween import measure_keyframe_errors
 
     rows = []
     for one, file in zip(found.each, files, strict=True):
-        made = one.infilled
-        told = {"keys": key_errors(made.motion, asked.motion, asked.keys, asked.rig), **made.summary()}
+        made = one.infill_result
+        told = {"keys": measure_keyframe_errors(made.motion, asked.motion, asked.keys, asked.rig), **made.summary()}
         rows.append(
             {
                 "file": str(file),
                 "energy_nats": one.energy,
                 "energy": one.ledger.summary(),
-                **results.report("tween", command, made.motion, told),
+                **results.build_report("tween", command, made.motion, told),
             }
         )
     shared = ("mapctl", "request", "versions")

@@ -14,7 +14,7 @@ from mapctl.errors import RequestError
 if TYPE_CHECKING:
     from priors.lstm_gmm.network import LstmGmmConfig
     from priors.training.recipes.lstm_gmm import TrainingSettings
-    from priors.training.run import TrainRequest
+    from priors.training.run import DensityRequest
 
 
 _Models = Literal["lstm-gmm", "refiner", "denoiser", "infiller"]
@@ -78,37 +78,37 @@ class Train:
 
     def run(self) -> int:
         """Check, train, name the result."""
-        from mapctl.commands.shared.resumption import telling_how_to_go_on
+        from mapctl.commands.shared.resumption import explain_resumption
 
-        with telling_how_to_go_on(self):
-            path, use = self._trained((lambda line: None) if self.quiet else _say)
+        with explain_resumption(self):
+            path, use = self._run_training((lambda line: None) if self.quiet else _print_line)
         if not self.quiet:
             print(f"wrote {path}; use it with {use} {self.out}")
         return 0
 
-    def _trained(self, say: Callable[[str], None]) -> tuple[Path, str]:
+    def _run_training(self, say: Callable[[str], None]) -> tuple[Path, str]:
         """The result, and the option that takes it."""
         if self.model == "refiner":
             from mapctl.commands.train import refiner
 
-            return refiner.run(self, say), "--refiner"
+            return refiner.train_refiner(self, say), "--refiner"
         if self.model in ("denoiser", "infiller"):
             from mapctl.commands.train import windows
 
-            return windows.run(self, say), f"--{self.model}"
+            return windows.train_on_windows(self, say), f"--{self.model}"
         request = self.request()
         outputs.check_folder(self.out)
         from priors.training import run
 
         return run.train(request, say, warn=checks.warn), "--prior"
 
-    def request(self) -> "TrainRequest":
+    def request(self) -> "DensityRequest":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
-        from priors.training.run import TrainRequest
+        from priors.training.run import DensityRequest
 
-        checks.check(self, model="a density", foreign=("architecture",), on_gpu=True)
+        checks.check_options(self, model="a density", foreign=("architecture",), on_gpu=True)
         config, settings = self._recipe()
-        return TrainRequest(
+        return DensityRequest(
             data=self.data,
             out=self.out,
             match=self.match or "",
@@ -129,15 +129,15 @@ class Train:
         from priors.training.recipes.lstm_gmm import PAPER, TrainingSettings
 
         config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
-        shape = checks.asked(self, "width", "components")
+        shape = checks.select_given(self, "width", "components")
         if self.init is not None and (self.paper or shape):
             raise RequestError(
                 "with --init the network is that prior's; --width, --components and --paper do not apply"
             )
-        recipe = checks.asked(self, "steps", "batch", "window", "learning_rate", "seed")
+        recipe = checks.select_given(self, "steps", "batch", "window", "learning_rate", "seed")
         return replace(config, **shape), replace(settings, bfloat16=self.bfloat16, **recipe)
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     # Flushed, so that a log file shows how far a run of hours has come.
     print(line, flush=True)

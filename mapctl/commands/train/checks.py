@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _COUNTS = ("width", "components", "steps", "batch", "window")
 
 
-def check(given: "Train", *, model: str, foreign: Collection[str] = (), on_gpu: bool = False) -> None:
+def check_options(given: "Train", *, model: str, foreign: Collection[str] = (), on_gpu: bool = False) -> None:
     """RequestError for an option that a model has not, and for numbers that make no sense for any.
 
     `model` is as a message names it ("a refiner"), `foreign` are the fields of `Train` that are for others, and
@@ -26,7 +26,7 @@ def check(given: "Train", *, model: str, foreign: Collection[str] = (), on_gpu: 
             raise RequestError(f"--{name.replace('_', '-')} is for other models; {model} has no such option")
     if given.device == "cuda" and not on_gpu:
         raise RequestError(f"{model} is trained on the processor; leave --device out")
-    for name, value in asked(given, *_COUNTS).items():
+    for name, value in select_given(given, *_COUNTS).items():
         if value < 1:
             raise RequestError(f"--{name} must be at least 1, got {value}")
     if given.seed is not None:
@@ -42,7 +42,7 @@ def warn(line: str) -> None:
     print(f"mapctl: {line}", file=sys.stderr, flush=True)
 
 
-def asked(given: "Train", *names: str, **renamed: str) -> dict[str, Any]:
+def select_given(given: "Train", *names: str, **renamed: str) -> dict[str, Any]:
     """The options among `names` that were given, for `replace`; `renamed` are those that a recipe calls otherwise, as
     in `rounds="steps"`.
     """

@@ -6,34 +6,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import outputs
-from mapctl.commands.shared.threads import compute_on_one
+from mapctl.commands.shared.threads import use_single_thread
 from mapctl.commands.train import checks
 
 if TYPE_CHECKING:
     from mapctl.commands.train import Train
     from priors.training.refiner_run import RefinerRequest
 
-_OF_OTHERS = ("width", "components", "learning_rate", "labels", "init", "skip_first", "architecture")
+_FOREIGN_OPTIONS = ("width", "components", "learning_rate", "labels", "init", "skip_first", "architecture")
 
 
-def run(given: "Train", say: Callable[[str], None]) -> Path:
+def train_refiner(given: "Train", say: Callable[[str], None]) -> Path:
     """Check, train, and return where the refiner lies."""
-    wanted = request(given)
+    wanted = build_refiner_request(given)
     outputs.check_folder(given.out)
-    compute_on_one()
+    use_single_thread()
     from priors.training import refiner_run
 
     return refiner_run.train(wanted, say, warn=checks.warn)
 
 
-def request(given: "Train") -> "RefinerRequest":
+def build_refiner_request(given: "Train") -> "RefinerRequest":
     """The options as the trainer takes them; RequestError for those that a refiner has not."""
     from priors.training.recipes.refiner import PAPER, AdversarialSettings
     from priors.training.refiner_run import RefinerConfig, RefinerRequest
 
-    checks.check(given, model="a refiner", foreign=_OF_OTHERS)
+    checks.check_options(given, model="a refiner", foreign=_FOREIGN_OPTIONS)
     config, settings = PAPER if given.paper else (RefinerConfig(), AdversarialSettings())
-    recipe = checks.asked(given, "batch", "window", "seed", rounds="steps")
+    recipe = checks.select_given(given, "batch", "window", "seed", rounds="steps")
     return RefinerRequest(
         data=given.data,
         out=given.out,

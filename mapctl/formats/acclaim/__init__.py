@@ -23,7 +23,7 @@ from mapctl.formats.acclaim import asf as asf_skeleton
 from mapctl.formats.acclaim.asf import AsfSkeleton
 from mapctl.formats.bvh import euler
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
-from mapctl.formats.missing import Missing
+from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import check_extent, read_bytes
 from mapctl.formats.units import metres_per_unit
 from mapctl.motion import Motion
@@ -45,44 +45,46 @@ def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> M
     return _read(path, fps=fps, lossy=False)[0]
 
 
-def load_lossy(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> tuple[Motion, Missing]:
+def load_with_missing(
+    path: str | PathLike[str], *, fps: Fraction | float | None = None
+) -> tuple[Motion, MissingValues]:
     """Read a take in which some values are NaN, and which they are; FileFormatError where all of them are."""
     return _read(path, fps=fps, lossy=True)
 
 
-def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: bool) -> tuple[Motion, Missing]:
+def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: bool) -> tuple[Motion, MissingValues]:
     if fps is not None and not SLOWEST <= fps <= FASTEST:
         raise RequestError(f"the frame rate must be {SLOWEST:g} to {FASTEST:g}, got {float(fps):g}")
     try:
-        subject, take = paths(path)
+        subject, take = find_paths(path)
     except OSError as error:  # as a name that is too long, or a folder that may not be listed
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
     asf = asf_skeleton.read(subject)
     text = amc.read(take, asf, lossy=lossy)
     check_extent(take, len(text.values), len(asf.names))
-    missing.check_any(take, np.isnan(text.values))
+    missing.check_any_known(take, np.isnan(text.values))
     degrees = asf.degrees if text.degrees is None else text.degrees
-    skeleton, scale = _skeleton(asf)
-    places = missing.bridged(_positions(asf, text.values), np.zeros(3))
+    skeleton, scale = _build_skeleton(asf)
+    places = missing.interpolate_nan(_positions(asf, text.values), np.zeros(3))
     motion = Motion(
         skeleton=skeleton,
         fps=Fraction(fps or text.fps or USUAL_FPS).limit_denominator(100_000),
         root_position=torch.from_numpy((places + asf.root_position) * scale),
-        local_quat_xyzw=_quaternions(asf, missing.held(text.values), degrees=degrees),
+        local_quat_xyzw=_quaternions(asf, missing.hold_last(text.values), degrees=degrees),
     )
-    return motion, _missing(asf, np.isnan(text.values))
+    return motion, _find_missing(asf, np.isnan(text.values))
 
 
-def _missing(asf: AsfSkeleton, lost: np.ndarray) -> Missing:
+def _find_missing(asf: AsfSkeleton, lost: np.ndarray) -> MissingValues:
     """By bone. Where all channels are lost, bones are that have none."""
     whole = lost.all(axis=1)
     turns = [lost[:, columns].any(axis=1) | whole for _, columns in _columns(asf, "r")]
     places = np.zeros((len(lost), len(turns)), dtype=bool)
     places[:, 0] = lost[:, _columns(asf, "t")[0][1]].any(axis=1)
-    return Missing(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(places))
+    return MissingValues(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(places))
 
 
-def paths(path: str | PathLike[str]) -> tuple[Path, Path]:
+def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
     """The skeleton's and the motion's file. FileFormatError names the candidates where the first is not clear.
 
     In `folder/subject.asf+take.amc` the take lies in the same folder unless it names one; `subject.asf+.amc` are two
@@ -107,7 +109,7 @@ def paths(path: str | PathLike[str]) -> tuple[Path, Path]:
     return found[0], file
 
 
-def _skeleton(asf: AsfSkeleton) -> tuple[Skeleton, float]:
+def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, float]:
     """Joints at the bones' starts, in metres, and how long the file's unit is."""
     parents = list(asf.parents)
     offsets = np.concatenate([np.zeros((1, 3)), asf.ends[parents[1:]]])
@@ -144,11 +146,11 @@ def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Floa
     for bone, (axes, columns) in enumerate(_columns(asf, "r")):
         angles = values[:, columns[::-1]]
         # About fixed axes the first named turn comes first; about moving ones, last.
-        turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, _reversed(axes))
+        turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, _reverse_axes(axes))
     frame = torch.from_numpy(asf.axis_quat_xyzw).expand(len(values), -1, 4)
     about = rotations.multiply(rotations.multiply(frame, torch.from_numpy(turns)), rotations.inverse(frame))
-    return rotations.sign_continuous(about)
+    return rotations.make_sign_continuous(about)
 
 
-def _reversed(axes: Sequence[int]) -> tuple[int, ...]:
+def _reverse_axes(axes: Sequence[int]) -> tuple[int, ...]:
     return tuple(axes[::-1])

@@ -73,7 +73,7 @@ class _Reader:
     values: array = field(default_factory=lambda: array("d"))
     seen: set[int] = field(default_factory=set)
     """Bones of the frame so far."""
-    used: set[int] = field(default_factory=set)
+    expected_bones: set[int] = field(default_factory=set)
     """Bones of the first frame; of a full file those of all."""
 
     def __post_init__(self):
@@ -145,7 +145,7 @@ class _Reader:
             value = nan if self.lossy and missing.is_nan(word) else finite_number(word)
             if value is None:
                 channel = self.skeleton.channels[bone][column - start]
-                got = f"{shorten(word)}{missing.hint(word)}"
+                got = f"{shorten(word)}{missing.missing_hint(word)}"
                 self.fail(f"{shorten(words[0])} {channel}: expected {NUMBER}, got {got}", line)
             self.row[column] = value
         self.seen.add(bone)
@@ -157,9 +157,9 @@ class _Reader:
         if 0 not in self.seen:
             self.fail(f"frame {self.number} has no line for the root", self.line)
         if self.frames == 1:
-            self.used = self.seen
-        if self.full and self.seen != self.used:
-            bone = self.skeleton.names[min(self.seen ^ self.used)]
+            self.expected_bones = self.seen
+        if self.full and self.seen != self.expected_bones:
+            bone = self.skeleton.names[min(self.seen ^ self.expected_bones)]
             self.fail(
                 f"not every frame up to {self.number} holds {shorten(bone)}, but the file says it is fully specified",
                 self.line,

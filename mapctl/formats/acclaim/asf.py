@@ -20,7 +20,7 @@ MAX_BONES = 1000
 """Most bones that are read; a body with fingers has about 60."""
 _SECTIONS = frozenset((":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin"))
 _IGNORED = frozenset(("id", "bodymass", "cofmass", "limits"))
-_ALLOWED = "name, direction, length, axis, dof, limits or end"
+_ALLOWED_KEYS = "name, direction, length, axis, dof, limits or end"
 _AXES = {"x": 0, "y": 1, "z": 2}
 _UNIT_ERROR = 0.01
 """How far a direction's length may be from one: files round to a few digits."""
@@ -160,7 +160,7 @@ class _Reader:
         axes = self._axis_order(told["axis"][1][-1], told["axis"][0]) if "axis" in told else (0, 1, 2)
         if "orientation" in told:
             line, words = told["orientation"]
-            root.axis = self._turn(self._numbers(words, line, 3), axes)
+            root.axis = self._fixed_axes_quat(self._numbers(words, line, 3), axes)
         if "position" not in told:
             return root, np.zeros(3)
         line, words = told["position"]
@@ -175,7 +175,7 @@ class _Reader:
             elif bone is None:
                 self.fail(f"expected begin, got {shorten(words[0])}", line)
             elif key == "end":
-                yield self._whole(bone, line)
+                yield self._check_complete(bone, line)
                 bone = None
             elif not (after_limits and _is_limit(words[0])):
                 if key in seen:
@@ -201,13 +201,13 @@ class _Reader:
         elif key == "axis":
             if len(words) != 5:
                 self.fail(f"expected three angles and an order as XYZ, got {len(words) - 1} words", line)
-            bone.axis = self._turn(self._numbers(words[:4], line, 3), self._axis_order(words[4], line))
+            bone.axis = self._fixed_axes_quat(self._numbers(words[:4], line, 3), self._axis_order(words[4], line))
         elif key == "dof":
             bone.channels = self._channels(words, line, allowed="r")
         elif key not in _IGNORED:
-            self.fail(f"expected {_ALLOWED}, got {shorten(words[0])}", line)
+            self.fail(f"expected {_ALLOWED_KEYS}, got {shorten(words[0])}", line)
 
-    def _whole(self, bone: _Bone, line: int) -> _Bone:
+    def _check_complete(self, bone: _Bone, line: int) -> _Bone:
         lacks = [
             key
             for key, value in (("name", bone.name or None), ("direction", bone.direction), ("length", bone.length))
@@ -275,7 +275,7 @@ class _Reader:
             self.fail(f"expected an axis order as XYZ, got {shorten(word)}", line)
         return tuple(_AXES[letter] for letter in word.lower())
 
-    def _turn(self, angles: Sequence[float], axes: tuple[int, ...]) -> np.ndarray:
+    def _fixed_axes_quat(self, angles: Sequence[float], axes: tuple[int, ...]) -> np.ndarray:
         """Quaternion of three turns about fixed axes: `angles` are about x, y and z, `axes` says which comes first."""
         radians = np.deg2rad(angles) if self.degrees else np.array(angles)
         return euler.to_quat_xyzw(radians[list(axes[::-1])], axes[::-1])

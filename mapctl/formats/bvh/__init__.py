@@ -23,12 +23,12 @@ from mapctl.formats.bvh import text as bvh_text
 from mapctl.formats.bvh.hierarchy import Hierarchy
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.formats.frame_rate import frame_rate
-from mapctl.formats.missing import Missing
-from mapctl.formats.units import metres_per_unit, reach
+from mapctl.formats.missing import MissingValues
+from mapctl.formats.units import longest_chain_length, metres_per_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
-STILL = 1e-6
+STILL_SHARE = 1e-6
 """A joint whose offset varies by less than this part of the body's reach stays still; files round to 1e-7."""
 
 
@@ -42,7 +42,7 @@ def load(path: str | PathLike[str]) -> Motion:
     return _read(bvh_text.read(path))[0]
 
 
-def load_lossy(path: str | PathLike[str]) -> tuple[Motion, Missing]:
+def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
     """Read a BVH file in which some values are NaN, and which they are; FileFormatError where all of them are.
 
     The place of a joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET.
@@ -50,21 +50,21 @@ def load_lossy(path: str | PathLike[str]) -> tuple[Motion, Missing]:
     return _read(bvh_text.read(path, lossy=True))
 
 
-def _read(text: bvh_text.BvhText) -> tuple[Motion, Missing]:
+def _read(text: bvh_text.BvhText) -> tuple[Motion, MissingValues]:
     tree, lost = text.hierarchy, np.isnan(text.values)
-    values = _completed(tree, text.values)
-    _, rest, moving = _settle(tree, values)
+    values = _fill_missing(tree, text.values)
+    _, rest, moving = _classify_translations(tree, values)
     scale = metres_per_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
     layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding, text.values)
-    return _motion(layout, values), _missing(tree, lost, moving)
+    return _build_motion(layout, values), _find_missing(tree, lost, moving)
 
 
-def _motion(layout: BvhLayout, values: np.ndarray) -> Motion:
+def _build_motion(layout: BvhLayout, values: np.ndarray) -> Motion:
     """Of channels (frames, channels) in the layout's order and unit."""
     tree, scale = layout.hierarchy, layout.metres_per_unit
-    travels, rest, moving = _settle(tree, values)
+    travels, rest, moving = _classify_translations(tree, values)
     return Motion(
-        skeleton=_skeleton(tree, rest * scale, scale),
+        skeleton=_build_skeleton(tree, rest * scale, scale),
         fps=layout.fps,
         root_position=torch.from_numpy(travels[0] * scale),
         local_quat_xyzw=_quaternions(tree, values),
@@ -73,18 +73,18 @@ def _motion(layout: BvhLayout, values: np.ndarray) -> Motion:
     )
 
 
-def _completed(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
+def _fill_missing(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
     """The channels with numbers in place of NaN."""
     if not np.isnan(values).any():
         return values
-    done = missing.held(values)
+    done = missing.hold_last(values)
     for joint, columns in enumerate(tree.position_columns()):
         own = list(columns.values())
-        done[:, own] = missing.bridged(values[:, own], np.array(tree.offsets[joint])[list(columns)])
+        done[:, own] = missing.interpolate_nan(values[:, own], np.array(tree.offsets[joint])[list(columns)])
     return done
 
 
-def _missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> Missing:
+def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> MissingValues:
     """By joint. Where all channels are lost, joints are that have none. One frame tells the place of a still joint."""
     whole = np.all(lost, axis=1)
     rotations = np.tile(whole[:, None], len(tree.names))
@@ -96,7 +96,7 @@ def _missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> Missin
         own = lost[:, list(columns.values())]
         if joint == 0 or joint in moving or own.all(axis=0).any():
             places[:, joint] |= own.any(axis=1)
-    return Missing(torch.from_numpy(rotations), torch.from_numpy(places))
+    return MissingValues(torch.from_numpy(rotations), torch.from_numpy(places))
 
 
 def unit_of(motion: Motion) -> float | None:
@@ -104,7 +104,7 @@ def unit_of(motion: Motion) -> float | None:
     return motion.source.metres_per_unit if isinstance(motion.source, BvhLayout) else None
 
 
-def in_unit(motion: Motion, metres_per_unit: float) -> Motion:
+def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
     """The motion as its BVH file says it if a unit of it is so many metres; other motions as they are."""
     if not isinstance(motion.source, BvhLayout) or motion.source.metres_per_unit == metres_per_unit:
         return motion
@@ -127,12 +127,12 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     RequestError where the motion holds a NaN or the file cannot be written; then nothing is written.
     """
     check_finite(motion, path)
-    layout = bvh_layout.of(motion, path)
+    layout = bvh_layout.choose_layout(motion, path)
     order = [motion.skeleton.index(name) for name in layout.hierarchy.names]
     quat_xyzw = as_array(motion.local_quat_xyzw)[:, order]
     translations = all_translations(motion)[:, order] / layout.metres_per_unit
-    tree = bvh_layout.fitted(layout, translations, quat_xyzw)
-    values = _with_kept(layout, tree, translations, quat_xyzw)
+    tree = bvh_layout.fit_hierarchy(layout, translations, quat_xyzw)
+    values = _keep_source_values(layout, tree, translations, quat_xyzw)
     text = bvh_text.compose(tree, layout.frame_time, values, decimals=layout.decimals)
     write_bytes(path, text.encode(layout.encoding))
 
@@ -147,7 +147,7 @@ def _translations(tree: Hierarchy, values: np.ndarray) -> dict[int, np.ndarray]:
     return travels
 
 
-def _settle(tree: Hierarchy, values: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray, list[int]]:
+def _classify_translations(tree: Hierarchy, values: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray, list[int]]:
     """Translations as of `_translations`, rest offsets (joints, 3) in the file's unit, and which joints travel within
     their parent.
 
@@ -156,7 +156,7 @@ def _settle(tree: Hierarchy, values: np.ndarray) -> tuple[dict[int, np.ndarray],
     travels, rest = _translations(tree, values), np.array(tree.offsets)
     for joint, track in travels.items():
         rest[joint] = track[0]
-    still, moving = STILL * reach(tree.parents, np.linalg.norm(rest, axis=1), {}), []
+    still, moving = STILL_SHARE * longest_chain_length(tree.parents, np.linalg.norm(rest, axis=1), {}), []
     for joint, track in travels.items():
         low, high, offset = track.min(0), track.max(0), np.array(tree.offsets[joint])
         if joint == 0:
@@ -171,7 +171,7 @@ def _settle(tree: Hierarchy, values: np.ndarray) -> tuple[dict[int, np.ndarray],
     return travels, rest, moving
 
 
-def _skeleton(tree: Hierarchy, offsets: np.ndarray, scale: float) -> Skeleton:
+def _build_skeleton(tree: Hierarchy, offsets: np.ndarray, scale: float) -> Skeleton:
     ends = {tree.names[j]: (x * scale, y * scale, z * scale) for j, (x, y, z) in tree.end_offsets.items()}
     return Skeleton(tree.names, tree.parents, torch.from_numpy(offsets), ends)
 
@@ -181,7 +181,7 @@ def _quaternions(tree: Hierarchy, values: np.ndarray) -> Float[Tensor, "frames j
     quat_xyzw = np.empty((len(values), len(tree.names), 4))
     for axes, joints, columns in tree.rotation_groups():
         quat_xyzw[:, joints] = euler.to_quat_xyzw(np.deg2rad(values[:, columns]), axes)
-    return rotations.sign_continuous(torch.from_numpy(quat_xyzw))
+    return rotations.make_sign_continuous(torch.from_numpy(quat_xyzw))
 
 
 def channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
@@ -194,7 +194,9 @@ def channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndar
     return values
 
 
-def _with_kept(layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+def _keep_source_values(
+    layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray
+) -> np.ndarray:
     """The motion block, with the numbers that were read where a joint still is as they say.
 
     They are read again to compare: a motion's tensors may have been written into.
@@ -202,7 +204,7 @@ def _with_kept(layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, qua
     values, own, old = channel_values(tree, translations, quat_xyzw), layout.values, layout.hierarchy
     if own is None or len(own) != len(values):
         return values
-    before = _motion(layout, _completed(old, own))
+    before = _build_motion(layout, _fill_missing(old, own))
     turns, places = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
     turned = (turns == quat_xyzw).all(-1) | (turns == -quat_xyzw).all(-1)
     there = np.all(np.isclose(places, translations, rtol=1e-12, atol=1e-12), axis=-1)
@@ -222,7 +224,7 @@ def _with_kept(layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, qua
             if same[joint] and turned[:, joint].any():
                 numbers = own[:, read[joint]]
                 kept = turned[:, joint] & np.isfinite(numbers).all(-1)
-                values[:, at] = euler.kept(values[:, at], numbers, kept, axes)
+                values[:, at] = euler.keep_source_angles(values[:, at], numbers, kept, axes)
     return values
 
 

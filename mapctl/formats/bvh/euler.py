@@ -44,7 +44,7 @@ def from_quat_xyzw(quat_xyzw: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     return np.unwrap(angles, axis=0)
 
 
-def holds(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: float = 2e-6) -> bool:
+def can_represent(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: float = 2e-6) -> bool:
     """Whether turns about `axes` can make these rotations (frames, joints, 4), to `tolerance` radians."""
     if len(axes) == 3:
         return True
@@ -53,7 +53,7 @@ def holds(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: float = 2e-6
     return bool((2 * nearest <= tolerance).all())
 
 
-def kept(path: np.ndarray, source: np.ndarray, same: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+def keep_source_angles(path: np.ndarray, source: np.ndarray, same: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """Degrees (frames, channels): the source's own in the frames that are the `same`, the path's in others.
 
     These go on from the source's angles before them, at the beginning to those after them, without a jump. Where they
@@ -64,15 +64,15 @@ def kept(path: np.ndarray, source: np.ndarray, same: np.ndarray, axes: Sequence[
     edges = np.flatnonzero(np.diff(~same, prepend=False, append=False))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         if 0 <= (at := start - 1 if start else stop) < len(path):
-            done[start:stop] = nearest_form(path[[at, *range(start, stop)]], source[at], axes)[1:]
+            done[start:stop] = nearest_equivalent(path[[at, *range(start, stop)]], source[at], axes)[1:]
     return done
 
 
-def nearest_form(path: np.ndarray, wanted: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+def nearest_equivalent(path: np.ndarray, wanted: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """A path of angles (frames, channels), or its equal of the other solution, by whole turns from where its first
     frame is nearest to the wanted angles (channels,); degrees.
     """
-    forms = [path, _twin(path, axes, half=180.0)] if len(axes) == 3 else [path]
+    forms = [path, _equivalent_angles(path, axes, half=180.0)] if len(axes) == 3 else [path]
     forms = [form + 360 * np.round((wanted - form[0]) / 360) for form in forms]
     away = [abs(form[0] - wanted).sum() for form in forms]
     return forms[-1] if away[-1] < away[0] - 1e-9 else forms[0]
@@ -105,24 +105,24 @@ def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     q_w, q_i, q_j, q_k = quat[..., W], quat[..., i], quat[..., j], sign * quat[..., k]
     real = (q_w, q_j) if proper else (q_w + q_j, q_w - q_j)
     imaginary = (q_i, q_k) if proper else (q_i + q_k, q_i - q_k)
-    half_sum, sum_length = _held_angle(imaginary[0], real[0])
-    half_difference, difference_length = _held_angle(imaginary[1], real[1])
+    half_sum, sum_length = _hold_argument(imaginary[0], real[0])
+    half_difference, difference_length = _hold_argument(imaginary[1], real[1])
     if proper:
         middle, turn = 2 * np.arctan2(difference_length, sum_length), 1
     else:
         middle, turn = 2 * np.arctan2(sum_length - difference_length, sum_length + difference_length), sign
     outer = half_sum + half_difference, turn * (half_sum - half_difference)
     angles = np.stack([outer[0], middle, outer[1]], axis=-1)
-    return _closest_path(angles, _twin(angles, axes, half=np.pi))
+    return _closest_path(angles, _equivalent_angles(angles, axes, half=np.pi))
 
 
-def _twin(angles: np.ndarray, axes: Sequence[int], *, half: float) -> np.ndarray:
+def _equivalent_angles(angles: np.ndarray, axes: Sequence[int], *, half: float) -> np.ndarray:
     """The other three angles (..., 3) of the same rotations, in the unit in which a half turn is `half`."""
     first, middle, last = np.moveaxis(angles, -1, 0)
     return np.stack([first + half, (0 if axes[0] == axes[2] else half) - middle, last + half], axis=-1)
 
 
-def _held_angle(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _hold_argument(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Argument and length of a number over frames; where it vanishes the argument keeps its last value."""
     length = np.hypot(imaginary, real)
     known = length > _GIMBAL

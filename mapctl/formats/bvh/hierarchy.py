@@ -10,7 +10,7 @@ from typing import NoReturn
 import numpy as np
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.text import NUMBER, finite_number, shorten, tell
+from mapctl.formats.text import NUMBER, finite_number, shorten, warn_once
 
 MAX_JOINTS = 1000
 """Most joints that are read; a body with fingers, face and props has about 200."""
@@ -22,7 +22,7 @@ AXES = {"X": 0, "Y": 1, "Z": 2}
 
 _WORD = re.compile(r"\s*+([{}]|[^\s{}]++)")
 _NAME = re.compile(r"\s*+([^\n{}]*+)")
-_NAMED = re.compile(r"^[ \t]*(?:ROOT|JOINT)[ \t]+([^\n{}]+)", re.IGNORECASE | re.MULTILINE)
+_JOINT_LINE = re.compile(r"^[ \t]*(?:ROOT|JOINT)[ \t]+([^\n{}]+)", re.IGNORECASE | re.MULTILINE)
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 
 Offset = tuple[float, float, float]
@@ -181,7 +181,7 @@ class _Reader:
             self.scanner.fail("expected ROOT before MOTION")
         if self.renamed:
             more = f" and {len(self.renamed) - 3} more" if len(self.renamed) > 3 else ""
-            tell(f"{self.scanner.path}: names must be unique, so it reads {', '.join(self.renamed[:3])}{more}")
+            warn_once(f"{self.scanner.path}: names must be unique, so it reads {', '.join(self.renamed[:3])}{more}")
         return Hierarchy(
             names=tuple(self.joints),
             parents=tuple(node.parent for node in self.nodes),
@@ -206,14 +206,14 @@ class _Reader:
         if len(self.joints) == MAX_JOINTS:
             self.scanner.fail(f"more than {MAX_JOINTS} joints, which is the most allowed")
         if name in self.joints:
-            name = self._own(name)
+            name = self._unique_name(name)
         self.joints[name] = len(self.joints)
         self.nodes.append(_Node(name, parent, self.scanner.line))
         self._open_brace(self.nodes[-1])
 
-    def _own(self, name: str) -> str:
+    def _unique_name(self, name: str) -> str:
         """A name for a joint whose own is taken: `Bip01_2` for the second Bip01, one that no joint of the file has."""
-        taken = {line.strip() for line in _NAMED.findall(self.scanner.text)} | set(self.joints)
+        taken = {line.strip() for line in _JOINT_LINE.findall(self.scanner.text)} | set(self.joints)
         own = next(own for number in count(2) if (own := f"{name}_{number}") not in taken)
         self.renamed.append(f"the joint {shorten(name)} of line {self.scanner.line} as {own!r}")
         return own

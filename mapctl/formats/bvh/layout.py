@@ -45,11 +45,11 @@ class BvhLayout:
         return 6 if self.metres_per_unit < 0.02 else 8
 
 
-def of(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
+def choose_layout(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
     """The layout to write a motion in; RequestError where BVH has no form for its names or frame rate."""
-    layout = _source(motion) or BvhLayout(_plain_hierarchy(motion), 0.01, motion.fps, "")
+    layout = _source_layout(motion) or BvhLayout(_default_hierarchy(motion), 0.01, motion.fps, "")
     if layout.fps != motion.fps or not layout.frame_time:
-        layout = replace(layout, fps=motion.fps, frame_time=_frame_time(motion.fps, path))
+        layout = replace(layout, fps=motion.fps, frame_time=_format_frame_time(motion.fps, path))
     _check_names(layout, path)
     ends = {
         joint: _in_unit(motion.skeleton.end_offsets[name], layout.metres_per_unit)
@@ -59,7 +59,7 @@ def of(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
     return replace(layout, hierarchy=replace(layout.hierarchy, end_offsets=ends))
 
 
-def _source(motion: Motion) -> BvhLayout | None:
+def _source_layout(motion: Motion) -> BvhLayout | None:
     """The layout the motion came in, if its skeleton still has the same joints."""
     if not isinstance(motion.source, BvhLayout):
         return None
@@ -67,7 +67,7 @@ def _source(motion: Motion) -> BvhLayout | None:
     return motion.source if (tree.names, tree.parents) == (skeleton.names, skeleton.parents) else None
 
 
-def fitted(layout: BvhLayout, translations: np.ndarray, quat_xyzw: np.ndarray) -> Hierarchy:
+def fit_hierarchy(layout: BvhLayout, translations: np.ndarray, quat_xyzw: np.ndarray) -> Hierarchy:
     """The layout's hierarchy for this motion, with channels added where a joint's own cannot hold it.
 
     `translations` (frames, joints, 3) in the file's unit, `quat_xyzw` (frames, joints, 4), joints in file
@@ -79,22 +79,22 @@ def fitted(layout: BvhLayout, translations: np.ndarray, quat_xyzw: np.ndarray) -
     travel = np.ptp(translations, axis=0) > still
     for joint, columns in enumerate(tree.position_columns()):
         lacks = any(travel[joint, axis] and axis not in columns for axis in range(3))
-        channels.append(_widened(tree.channels[joint], quat_xyzw[:, joint : joint + 1], add_positions=lacks))
+        channels.append(_widen_channels(tree.channels[joint], quat_xyzw[:, joint : joint + 1], add_positions=lacks))
         axes = range(3) if lacks else columns
         own, wanted = tree.offsets[joint], translations[0, joint]
         offsets.append(tuple(own[axis] if axis in axes else float(wanted[axis]) for axis in range(3)))
     return replace(tree, channels=tuple(channels), offsets=tuple(offsets))
 
 
-def _widened(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_positions: bool) -> tuple[str, ...]:
+def _widen_channels(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_positions: bool) -> tuple[str, ...]:
     turns = tuple(c for c in channels if c.endswith("rotation"))
-    rotations = turns if euler.holds(quat_xyzw, [AXES[c[0]] for c in turns]) else ROTATIONS
+    rotations = turns if euler.can_represent(quat_xyzw, [AXES[c[0]] for c in turns]) else ROTATIONS
     if not add_positions and rotations == turns:
         return channels
     return (POSITIONS if add_positions else tuple(c for c in channels if c not in turns)) + rotations
 
 
-def _plain_hierarchy(motion: Motion) -> Hierarchy:
+def _default_hierarchy(motion: Motion) -> Hierarchy:
     """Centimetres, root OFFSET 0, joints depth first as BVH nests them (the canonical order is not)."""
     skeleton = motion.skeleton
     order = _depth_first(skeleton)
@@ -118,7 +118,7 @@ def _in_unit(offset: Sequence[float], metres_per_unit: float) -> Offset:
     return x, y, z
 
 
-def _frame_time(fps: Fraction, path: str | PathLike[str]) -> str:
+def _format_frame_time(fps: Fraction, path: str | PathLike[str]) -> str:
     if not SHORTEST_FRAME <= 1 / fps <= LONGEST_FRAME:
         allowed = f"{1 / LONGEST_FRAME:g} to {1 / SHORTEST_FRAME:g}"
         raise RequestError(f"cannot write {path}: {float(fps):g} frames per second, allowed are {allowed}")

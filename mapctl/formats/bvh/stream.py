@@ -19,7 +19,7 @@ from mapctl.motion import Motion
 
 
 @contextmanager
-def bvh_stream(path: str | PathLike[str], frames: int) -> Iterator["BvhStream"]:
+def open_bvh_stream(path: str | PathLike[str], frames: int) -> Iterator["BvhStream"]:
     """Yield a stream that takes the pieces of a motion; the file appears whole when the block ends well.
 
     MapctlError if the pieces are not `frames` frames in all, RequestError if the place cannot be written.
@@ -50,15 +50,15 @@ class BvhStream:
     def append(self, piece: Motion) -> None:
         """Write the next frames; RequestError where they are not finite, MapctlError for another skeleton."""
         bvh.check_finite(piece, self.path)
-        layout = bvh_layout.of(piece, self.path)
+        layout = bvh_layout.choose_layout(piece, self.path)
         order = [piece.skeleton.index(name) for name in layout.hierarchy.names]
         quat_xyzw = bvh.as_array(piece.local_quat_xyzw)[:, order]
         translations = bvh.all_translations(piece)[:, order] / layout.metres_per_unit
         first = self._tree is None
-        tree = self._tree or bvh_layout.fitted(layout, translations, quat_xyzw)
+        tree = self._tree or bvh_layout.fit_hierarchy(layout, translations, quat_xyzw)
         if tree.names != layout.hierarchy.names:
             raise MapctlError(f"{self.path}: a piece has other joints than the first")
-        values = self._continued(tree, bvh.channel_values(tree, translations, quat_xyzw))
+        values = self._continue_angles(tree, bvh.channel_values(tree, translations, quat_xyzw))
         text = bvh_text.compose(tree, layout.frame_time, values, decimals=layout.decimals)
         head, frame_time, rows = text.partition(f"Frame Time: {layout.frame_time}\n")
         if first:
@@ -67,11 +67,11 @@ class BvhStream:
         self.file.write(rows)
         self._tree, self._last, self.written = tree, values[-1], self.written + len(values)
 
-    def _continued(self, tree: Hierarchy, values: np.ndarray) -> np.ndarray:
+    def _continue_angles(self, tree: Hierarchy, values: np.ndarray) -> np.ndarray:
         """The channels, with angles that go on from the last piece's as if converted with it."""
         if self._last is None:
             return values
         for axes, _, columns in tree.rotation_groups():
             for joint in np.reshape(columns, (-1, len(axes))):
-                values[:, joint] = euler.nearest_form(values[:, joint], self._last[joint], axes)
+                values[:, joint] = euler.nearest_equivalent(values[:, joint], self._last[joint], axes)
         return values

@@ -45,23 +45,23 @@ def read(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
     text, encoding = decode(path, read_bytes(path), "BVH text")
     scanner = Scanner(path, text)
     hierarchy = read_hierarchy(scanner)
-    frames, frames_line = _frame_count(scanner), scanner.line
-    frame_time = _frame_time(scanner)
+    frames, frames_line = _parse_frame_count(scanner), scanner.line
+    frame_time = _parse_frame_time(scanner)
     labels = hierarchy.labels()
-    values = _values(scanner, labels, frames=frames, frames_line=frames_line, lossy=lossy)
-    missing.check_any(path, np.isnan(values))
+    values = _parse_values(scanner, labels, frames=frames, frames_line=frames_line, lossy=lossy)
+    missing.check_any_known(path, np.isnan(values))
     check_extent(path, len(values), len(hierarchy.names))
     return BvhText(hierarchy, frame_time, values, encoding)
 
 
-def _frame_count(scanner: Scanner) -> int:
+def _parse_frame_count(scanner: Scanner) -> int:
     word = scanner.match(_FRAMES, "'Frames: COUNT'")
     if not re.fullmatch(r"[+-]?[0-9]{1,12}", word) or int(word) < 1:
         scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
     return int(word)
 
 
-def _frame_time(scanner: Scanner) -> str:
+def _parse_frame_time(scanner: Scanner) -> str:
     word = scanner.match(_FRAME_TIME, "'Frame Time: SECONDS'")
     seconds = finite_number(word)
     if seconds is None or len(word) > 60 or not SHORTEST_FRAME <= seconds <= LONGEST_FRAME:
@@ -70,26 +70,26 @@ def _frame_time(scanner: Scanner) -> str:
     return word
 
 
-def _values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
+def _parse_values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
     """The motion block as (frames, channels). Parsed in one go; only a fault is looked for by row."""
     expected = frames * len(labels)
     if expected == 0:
         scanner.fail("no joint has any CHANNELS, expected at least one")
     text = scanner.text[scanner.stop :]
     try:
-        values = np.fromstring(missing.plain(text) if lossy else text, sep=" ")
+        values = np.fromstring(missing.normalise_nan(text) if lossy else text, sep=" ")
     except ValueError:
         values = np.empty(0)
     # NaN compares as not small. `1.5.2` was parsed as two values, so words are counted too.
     sound = values.size == expected and bool(((np.abs(values) < LARGEST_VALUE) | (lossy & np.isnan(values))).all())
-    if sound and sum(len(row.split()) for _, row in _rows(scanner)) == expected:
+    if sound and sum(len(row.split()) for _, row in _iterate_rows(scanner)) == expected:
         return values.reshape(frames, len(labels))
-    raise _fault(scanner, labels, may_wrap=values.size == expected, lossy=lossy) or FileFormatError(
-        scanner.path, f"'Frames: {frames}' but {sum(1 for _ in _rows(scanner))} rows follow", frames_line
+    raise _find_fault(scanner, labels, may_wrap=values.size == expected, lossy=lossy) or FileFormatError(
+        scanner.path, f"'Frames: {frames}' but {sum(1 for _ in _iterate_rows(scanner))} rows follow", frames_line
     )
 
 
-def _rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
+def _iterate_rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
     """Line number and text of every row that is not blank."""
     text, start, line = scanner.text, scanner.stop, scanner.line_of(scanner.stop)
     while start < len(text):
@@ -101,16 +101,16 @@ def _rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
         start, line = stop + 1, line + 1
 
 
-def _fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, lossy: bool) -> FileFormatError | None:
+def _find_fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, lossy: bool) -> FileFormatError | None:
     """The first value that is none, or the first row of a wrong length (where rows may not be wrapped)."""
     read = 0
-    for line, row in _rows(scanner):
+    for line, row in _iterate_rows(scanner):
         words = _DATUM.findall(row)
         for place, word in enumerate(words, read):
             if finite_number(word) is None and not (lossy and missing.is_nan(word)):
                 frame, column = divmod(place, len(labels))
                 where = f"frame {frame}, column {column + 1} ({labels[column]})"
-                got = f"{shorten(word)}{missing.hint(word)}"
+                got = f"{shorten(word)}{missing.missing_hint(word)}"
                 return FileFormatError(scanner.path, f"{where}: expected {NUMBER}, got {got}", line)
         if len(words) != len(labels) and not may_wrap:
             count = f"frame {read // len(labels)} has {len(words)} values, expected {len(labels)}"

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.realism.classifier import ClassifierSettings, held_out_accuracy
-from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, sample_diversity
+from mapctl.metrics.realism.classifier import ClassifierSettings, compute_held_out_accuracy
+from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
-from mapctl.metrics.realism.gait import GaitSpread, gait_spread, spread_ratios
-from mapctl.metrics.realism.windows import WindowSettings, canonical_positions, clip_windows
+from mapctl.metrics.realism.gait import GaitSpread, measure_gait_spread, spread_ratios
+from mapctl.metrics.realism.windows import WindowSettings, canonical_positions, cut_windows
 from mapctl.motion import Motion
 from mapctl.runtime.progress import Progress
 
@@ -27,11 +27,11 @@ __all__ = [
     "WindowSettings",
     "average_pairwise_distance",
     "canonical_positions",
-    "clip_windows",
-    "gait_spread",
-    "realism",
-    "realism_of_windows",
-    "sample_diversity",
+    "cut_windows",
+    "measure_diversity",
+    "measure_gait_spread",
+    "measure_realism",
+    "measure_window_realism",
     "spread_ratios",
 ]
 
@@ -52,7 +52,7 @@ class RealismSettings:
             raise RequestError(f"dims must be at least 1, got {self.dims}")
 
     @property
-    def fewest_clips(self) -> int:
+    def min_clips(self) -> int:
         """Clips that each set must have, so that half of the mocap still has one for every fold."""
         return 2 * self.classifier.folds
 
@@ -75,7 +75,7 @@ class Realism:
     """How many windows the mocap clips gave."""
 
 
-def realism(
+def measure_realism(
     made: Sequence[Motion],
     mocap: Sequence[Motion],
     *,
@@ -91,11 +91,11 @@ def realism(
     than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
     """
     _check_counts(len(made), len(mocap), settings)
-    sets = [_windows_of(clips, name, settings.windows) for name, clips in (("made", made), ("mocap", mocap))]
-    return realism_of_windows(*sets, generator=generator, settings=settings, progress=progress)
+    sets = [_cut_clips(clips, name, settings.windows) for name, clips in (("made", made), ("mocap", mocap))]
+    return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
 
 
-def realism_of_windows(
+def measure_window_realism(
     made: Sequence[Tensor],
     mocap: Sequence[Tensor],
     *,
@@ -103,15 +103,15 @@ def realism_of_windows(
     settings: RealismSettings = RealismSettings(),
     progress: Progress | None = None,
 ) -> Realism:
-    """The same from the `clip_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    """The same from the `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
     _check_counts(len(made), len(mocap), settings)
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
     order = torch.randperm(len(mocap), generator=shuffled).tolist()
     halves = [mocap[i] for i in order[::2]], [mocap[i] for i in order[1::2]]
-    tick = _ticks(progress, 2 * settings.classifier.folds)
-    floor = held_out_accuracy(*halves, generator=shuffled, settings=settings.classifier, tick=tick)
-    accuracy = held_out_accuracy(made, mocap, generator=ours, settings=settings.classifier, tick=tick)
+    tick = _make_tick(progress, 2 * settings.classifier.folds)
+    floor = compute_held_out_accuracy(*halves, generator=shuffled, settings=settings.classifier, tick=tick)
+    accuracy = compute_held_out_accuracy(made, mocap, generator=ours, settings=settings.classifier, tick=tick)
     basis = Basis.of(torch.cat(list(mocap)), settings.dims)
     points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
     return Realism(
@@ -125,23 +125,23 @@ def realism_of_windows(
 
 
 def _check_counts(made: int, mocap: int, settings: RealismSettings) -> None:
-    if min(made, mocap) < settings.fewest_clips:
+    if min(made, mocap) < settings.min_clips:
         raise RequestError(
-            f"realism needs at least {settings.fewest_clips} clips of each, made and mocap; got {made} and {mocap}"
+            f"realism needs at least {settings.min_clips} clips of each, made and mocap; got {made} and {mocap}"
         )
 
 
-def _windows_of(clips: Sequence[Motion], name: str, settings: WindowSettings) -> list[Tensor]:
+def _cut_clips(clips: Sequence[Motion], name: str, settings: WindowSettings) -> list[Tensor]:
     windows = []
     for number, clip in enumerate(clips, start=1):
         try:
-            windows.append(clip_windows(canonical_positions(clip), settings))
+            windows.append(cut_windows(canonical_positions(clip), settings))
         except RequestError as error:
             raise RequestError(f"{name} clip {number} of {len(clips)}: {error}") from error
     return windows
 
 
-def _ticks(progress: Progress | None, total: int) -> Callable[[], None]:
+def _make_tick(progress: Progress | None, total: int) -> Callable[[], None]:
     done = iter(range(1, total + 1))
 
     def tick() -> None:

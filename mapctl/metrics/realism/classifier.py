@@ -39,7 +39,7 @@ class ClassifierSettings:
                 raise RequestError(f"{name} must be at least {least}, got {getattr(self, name)}")
 
 
-def held_out_accuracy(
+def compute_held_out_accuracy(
     first: Sequence[Float[Tensor, "_ frames channels"]],
     second: Sequence[Float[Tensor, "_ frames channels"]],
     *,
@@ -55,25 +55,25 @@ def held_out_accuracy(
     """
     if min(len(first), len(second)) < settings.folds:
         raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
-    sets = [_folded(clips, settings.folds, generator) for clips in (first, second)]
+    sets = [_split_folds(clips, settings.folds, generator) for clips in (first, second)]
     scores = []
     for fold in range(settings.folds):
         seen = [torch.cat([part for k, part in enumerate(parts) if k != fold]) for parts in sets]
-        with _private_torch(generator):
-            network = _trained(seen, settings)
+        with _isolate_torch(generator):
+            network = _train_network(seen, settings)
             scores.append(_balanced_accuracy(network, [parts[fold] for parts in sets]))
         tick()
     return sum(scores) / len(scores)
 
 
-def _folded(clips: Sequence[Tensor], folds: int, generator: torch.Generator) -> list[Tensor]:
+def _split_folds(clips: Sequence[Tensor], folds: int, generator: torch.Generator) -> list[Tensor]:
     """The windows of each fold's clips, dealt out in a drawn order."""
     order = torch.randperm(len(clips), generator=generator).tolist()
     return [torch.cat([clips[i] for i in order[fold::folds]]) for fold in range(folds)]
 
 
 @contextmanager
-def _private_torch(generator: torch.Generator) -> Iterator[None]:
+def _isolate_torch(generator: torch.Generator) -> Iterator[None]:
     """A global generator seeded from ours (weights and dropout draw from it) and one thread, both for the while."""
     threads = torch.get_num_threads()
     seed = int(torch.randint(2**62, (1,), generator=generator))
@@ -97,7 +97,7 @@ class _Standardise(nn.Module):
         return ((windows - self.mean) / self.std).transpose(1, 2)
 
 
-def _network(windows: Float[Tensor, "windows frames channels"], settings: ClassifierSettings) -> nn.Module:
+def _build_network(windows: Float[Tensor, "windows frames channels"], settings: ClassifierSettings) -> nn.Module:
     """Three convolutions over time, the mean over what is left of it, and one logit: positive for the first set."""
     layers: list[nn.Module] = [_Standardise(windows)]
     channels = windows.shape[-1]
@@ -108,8 +108,8 @@ def _network(windows: Float[Tensor, "windows frames channels"], settings: Classi
     return nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0))
 
 
-def _trained(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
-    network = _network(torch.cat(list(sets)), settings)
+def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
+    network = _build_network(torch.cat(list(sets)), settings)
     optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     half = settings.batch // 2
     target = torch.cat([torch.ones(half), torch.zeros(half)])

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.realism.windows import HIPS, canonical_positions, facing_angle, seen_from
+from mapctl.metrics.realism.windows import HIPS, canonical_positions, facing_angle, transform_to_ground_frame
 from mapctl.motion import Motion
 
 _CM = 100.0
@@ -23,24 +23,24 @@ class Diversity(NamedTuple):
     """Of the joints seen from each frame's own hips and facing: poses and their timing alone."""
 
 
-def sample_diversity(samples: Sequence[Motion]) -> Diversity:
+def measure_diversity(samples: Sequence[Motion]) -> Diversity:
     """Of several samples from one start (any known rig); RequestError for fewer than two, or other lengths."""
     lengths = sorted({sample.num_frames / sample.fps for sample in samples})
     if len(samples) < 2 or len(lengths) > 1:
         told = " and ".join(f"{float(length):.4g}" for length in lengths)
         raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {told} s")
-    return diversity_of_positions(torch.stack([canonical_positions(sample) for sample in samples]))
+    return measure_position_diversity(torch.stack([canonical_positions(sample) for sample in samples]))
 
 
-def diversity_of_positions(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
+def measure_position_diversity(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
     """The same from world positions of the canonical joints, metres."""
-    aligned = torch.stack([_root_aligned(sample) for sample in positions])
+    aligned = torch.stack([_align_to_root(sample) for sample in positions])
     return Diversity(average_pairwise_distance(positions) * _CM, average_pairwise_distance(aligned) * _CM)
 
 
-def from_own_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+def align_to_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
     """A clip as if it began at the origin and faced +Z: to compare clips that did not begin in one place."""
-    return seen_from(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
+    return transform_to_ground_frame(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
 
 
 def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
@@ -51,6 +51,6 @@ def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"
     return total / (samples * (samples - 1) * frames * joints)
 
 
-def _root_aligned(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
-    seen = seen_from(positions, positions[:, HIPS, ::2], facing_angle(positions))
+def _align_to_root(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+    seen = transform_to_ground_frame(positions, positions[:, HIPS, ::2], facing_angle(positions))
     return seen - seen[:, HIPS : HIPS + 1]

@@ -13,7 +13,7 @@ from mapctl.errors import RequestError
 from mapctl.joint_roles import find_feet, find_hips
 from mapctl.metrics import body
 from mapctl.motion import Motion
-from mapctl.numerics.gaussian import slow_part
+from mapctl.numerics.gaussian import low_pass
 from mapctl.rotations import unwrap_angle
 
 PIECE_SECONDS = 3.0
@@ -35,7 +35,7 @@ class GaitSpread(NamedTuple):
     """How many pieces can tell it."""
 
 
-def gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SECONDS) -> dict[str, GaitSpread]:
+def measure_gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SECONDS) -> dict[str, GaitSpread]:
     """Spread of step_length_cm, speed_m_s and turning_deg_s over consecutive pieces of the clips (any rig).
 
     Step length is the mean of a piece's distances over the ground from one foot's touch-down to the next of the other
@@ -45,8 +45,8 @@ def gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SECONDS) ->
     """
     if not motions or not 0 < seconds < float("inf"):
         raise RequestError(f"a gait needs clips and a length in seconds, got {len(motions)} and {seconds:g} s")
-    pieces = [_clip_gait(motion, seconds) for motion in motions]
-    return {name: _spread(torch.cat([clip[name] for clip in pieces])) for name in pieces[0]}
+    pieces = [_measure_clip_gait(motion, seconds) for motion in motions]
+    return {name: _summarise_pieces(torch.cat([clip[name] for clip in pieces])) for name in pieces[0]}
 
 
 def spread_ratios(made: Mapping[str, GaitSpread], data: Mapping[str, GaitSpread]) -> dict[str, float]:
@@ -54,14 +54,14 @@ def spread_ratios(made: Mapping[str, GaitSpread], data: Mapping[str, GaitSpread]
     return {name: spread.std / data[name].std if data[name].std else float("nan") for name, spread in made.items()}
 
 
-def _spread(values: Float[Tensor, "pieces"]) -> GaitSpread:
+def _summarise_pieces(values: Float[Tensor, "pieces"]) -> GaitSpread:
     told = values[~values.isnan()]
     if len(told) < 2:
         return GaitSpread(float(values.nanmean()), float("nan"), len(told))
     return GaitSpread(float(told.mean()), float(told.std()), len(told))
 
 
-def _clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor, "pieces"]]:
+def _measure_clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor, "pieces"]]:
     """By measure a value for each whole piece of a clip. Contacts and smoothing know the whole clip."""
     positions, fps = motion.joint_positions(), float(motion.fps)
     hips = positions[:, find_hips(motion.skeleton)]
@@ -69,7 +69,7 @@ def _clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor, "piece
     frames = max(2, round(seconds * fps))
     count = len(positions) // frames
     by_frame = {
-        "step_length_cm": 100 * step_lengths(toes[..., ::2], contacts.planted(toes, fps), fps),
+        "step_length_cm": 100 * step_lengths(toes[..., ::2], contacts.detect_contacts(toes, fps), fps),
         "turning_deg_s": torch.rad2deg(travel_turn_rate(hips[:, ::2], fps)),
     }
     speeds = [body.ground_speed(piece, fps) for piece in hips[: count * frames].split(frames)] if count else []
@@ -106,7 +106,7 @@ def travel_turn_rate(hips_xz: Float[Tensor, "frames 2"], fps: float) -> Float[Te
     if len(hips_xz) < 3:
         return rate
     velocity = hips_xz.diff(dim=0) * fps
-    slow = torch.stack([slow_part(axis, seconds=body.TURN_SECONDS, fps=fps) for axis in velocity.T], dim=-1)
+    slow = torch.stack([low_pass(axis, seconds=body.TURN_SECONDS, fps=fps) for axis in velocity.T], dim=-1)
     moving = slow.norm(dim=-1) > _MOVING
     turn = unwrap_angle(torch.atan2(slow[:, 0], slow[:, 1])).diff().abs() * fps
     rate[2:] = torch.where(moving[1:] & moving[:-1], turn, float("nan"))

@@ -43,7 +43,7 @@ def facing_angle(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "
     return body.facing(positions[:, left], positions[:, right])
 
 
-def seen_from(
+def transform_to_ground_frame(
     positions: Float[Tensor, "*batch frames joints 3"],
     ground_xz: Float[Tensor, "*batch #frames 2"],
     angle: Float[Tensor, "*batch #frames"],
@@ -54,7 +54,7 @@ def seen_from(
     return torch.stack([turned[..., 0], positions[..., 1], turned[..., 1]], dim=-1)
 
 
-def clip_windows(
+def cut_windows(
     positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings = WindowSettings()
 ) -> Float[Tensor, "windows frames channels"]:
     """Windows of one clip, float32: joint positions (m), then velocities (m/s) on the way to each frame.
@@ -68,6 +68,6 @@ def clip_windows(
     starts = torch.arange(0, len(positions) - settings.frames, settings.step)
     pieces = positions[starts[:, None] + torch.arange(needed)]
     first = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
-    seen = seen_from(pieces, first[0].unsqueeze(1), first[1].unsqueeze(1))
+    seen = transform_to_ground_frame(pieces, first[0].unsqueeze(1), first[1].unsqueeze(1))
     velocity = seen.diff(dim=1) * PRIOR_FPS
     return torch.cat([seen[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from mapctl.numerics.jit import compilers
-from priors.lstm_gmm.fast.layout import DRAWN, GIVEN, LIKELIEST
+from mapctl.numerics.jit import make_jit_decorators
+from priors.lstm_gmm.fast.layout import GIVEN, LIKELIEST, SAMPLED
 
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 _LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
@@ -21,8 +21,8 @@ _EXP_LOW, _EXP_HIGH = np.float32(-87.0), np.float32(88.0)
 _EXP = tuple(np.float32(1 / math.factorial(k)) for k in range(8))
 
 # Sums may be reordered and fused, which vectorises them.
-_entry, _inner = compilers("reassoc", "contract", "nsz")
-_, _ordered = compilers("contract")
+_entry, _inner = make_jit_decorators("reassoc", "contract", "nsz")
+_, _ordered = make_jit_decorators("contract")
 
 
 @_ordered
@@ -189,7 +189,7 @@ def lstm_cell_pullback(above, carry, d_cell, gates, before, tanh_cell, d_gates):
 
 
 @_inner
-def choose(settings, count, head, uniform, source):
+def choose_discrete(settings, count, head, uniform, source):
     """Component and contact bits of one particle from the head's weight and contact rows."""
     weights, bits = (head[settings.weight : settings.weight + count], head[settings.contact : settings.contact + 2])
     best = 0
@@ -230,7 +230,7 @@ def discrete_density(settings, count, head, component, contacts):
 
 
 @_inner
-def gaussian(settings, head, before, noise, after, mixing):
+def compose_gaussian(settings, head, before, noise, after, mixing):
     """The next frame's Gaussian values and their log density; the head's rows become sigma and slope.
 
     `mixing` is the component's (C, C) triangle; it leaves volumes, and so densities, as they are.
@@ -265,13 +265,15 @@ def compose(weights, biases, settings, tape, now, after, noise, choices, t, sour
     copy(logits, head, shared)
     for b in range(len(noise)):
         if source != GIVEN:
-            uniform = choices.uniform[b, t] if source == DRAWN else choices.uniform[0, 0]
-            k, left, right = choose(settings, count, head[b], uniform, source)
+            uniform = choices.uniform[b, t] if source == SAMPLED else choices.uniform[0, 0]
+            k, left, right = choose_discrete(settings, count, head[b], uniform, source)
             choices.component[b, t], choices.contacts[b, t, 0], choices.contacts[b, t, 1] = k, left, right
         k = choices.component[b, t]
         affine(weights.head[k, :shared], biases.head[k, :shared], hidden[b : b + 1], head[b : b + 1])
         discrete = discrete_density(settings, count, head[b], k, choices.contacts[b, t])
-        continuous = gaussian(settings, head[b], tape.frame[now, b], noise[b, t], following[b], settings.mixing[k])
+        continuous = compose_gaussian(
+            settings, head[b], tape.frame[now, b], noise[b, t], following[b], settings.mixing[k]
+        )
         density[b, t] = discrete + continuous
         for j in range(size):
             features[b, t, j] = following[b, j] * settings.std[j] + settings.mean[j]

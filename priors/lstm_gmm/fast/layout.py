@@ -15,7 +15,7 @@ from priors.lstm_gmm.network import LstmGmm
 
 Array = NDArray[np.float32]
 
-GIVEN, LIKELIEST, DRAWN = 0, 1, 2
+GIVEN, LIKELIEST, SAMPLED = 0, 1, 2
 """Where a frame's component and contact bits come from: the plan, the mixture's mode, or random numbers."""
 
 WIDTH_STEP, BATCH_STEP, ROW_STEP = 16, 4, 4
@@ -41,7 +41,7 @@ class Layers(NamedTuple):
     """(components, H, W): each component's rows of the output layer; all repeat weights and contacts."""
 
 
-class Settings(NamedTuple):
+class MixtureConstants(NamedTuple):
     """Numbers of the mixture's form, and where the rows of the head lie."""
 
     continuous: int
@@ -89,7 +89,7 @@ class Tape(NamedTuple):
     """(slots, batch, H): sigma; d log sigma / d its row; d density / d weight and contact rows."""
 
 
-class Choices(NamedTuple):
+class ChoiceBuffers(NamedTuple):
     """The discrete choices of a rollout, and the random numbers that make them where they are drawn."""
 
     component: NDArray[np.int64]
@@ -100,26 +100,26 @@ class Choices(NamedTuple):
     """(batch, frames, 3) in [0, 1): component, left bit, right bit; empty unless drawn."""
 
 
-def padded(size: int, step: int) -> int:
+def round_up_to(size: int, step: int) -> int:
     """The least multiple of `step` that holds `size`."""
     return -(-size // step) * step
 
 
-def padded_batch(batch: int) -> int:
+def pad_batch_size(batch: int) -> int:
     """Rows of a tape for this many particles; one particle has its own path through the kernels."""
-    return 1 if batch == 1 else padded(batch, BATCH_STEP)
+    return 1 if batch == 1 else round_up_to(batch, BATCH_STEP)
 
 
-def settings_of(model: LstmGmm) -> Settings:
+def pack_constants(model: LstmGmm) -> MixtureConstants:
     """The mixture's numbers, and the rows of the head."""
     config, size = model.config, model.layout.continuous
-    rows, features = padded(size, ROW_STEP), padded(model.layout.size, WIDTH_STEP)
+    rows, features = round_up_to(size, ROW_STEP), round_up_to(model.layout.size, WIDTH_STEP)
     mean, std = np.zeros(features, np.float32), np.ones(features, np.float32)
-    mean[: model.layout.size], std[: model.layout.size] = _numpy(model.mean), _numpy(model.std)
+    mean[: model.layout.size], std[: model.layout.size] = _to_numpy(model.mean), _to_numpy(model.std)
     low, high = np.float32(config.min_log_sigma), np.float32(config.max_log_sigma)
     alone = torch.eye(size).repeat(config.components, 1, 1)
-    mixing = np.ascontiguousarray(_numpy(alone if model.mixing is None else model.mixing))
-    return Settings(
+    mixing = np.ascontiguousarray(_to_numpy(alone if model.mixing is None else model.mixing))
+    return MixtureConstants(
         size,
         rows,
         2 * rows,
@@ -134,37 +134,37 @@ def settings_of(model: LstmGmm) -> Settings:
     )
 
 
-def pack(model: LstmGmm) -> tuple[Layers, Layers]:
+def pack_weights(model: LstmGmm) -> tuple[Layers, Layers]:
     """Padded float32 copies of the weights and of the biases."""
-    width, lstm = padded(model.config.width, WIDTH_STEP), model.lstm
-    features = padded(model.layout.size, WIDTH_STEP)
+    width, lstm = round_up_to(model.config.width, WIDTH_STEP), model.lstm
+    features = round_up_to(model.layout.size, WIDTH_STEP)
     gates = [[lstm.get_parameter(f"weight_{kind}_l{layer}") for kind in ("ih", "hh")] for layer in range(2)]
     offsets = [lstm.get_parameter(f"bias_ih_l{k}") + lstm.get_parameter(f"bias_hh_l{k}") for k in range(2)]
     weights = Layers(
-        fc1=_block(_numpy(model.fc1.weight), width, features),
-        fc2=_block(_numpy(model.fc2.weight), width, width),
+        fc1=_pad_matrix(_to_numpy(model.fc1.weight), width, features),
+        fc2=_pad_matrix(_to_numpy(model.fc2.weight), width, width),
         lstm=np.stack(
-            [np.concatenate([_gate_blocks(_numpy(m), width, width) for m in pair], axis=1) for pair in gates]
+            [np.concatenate([_pack_gates(_to_numpy(m), width, width) for m in pair], axis=1) for pair in gates]
         ),
-        fc3=_block(_numpy(model.fc3.weight), width, width),
-        head=_head_blocks(model, _numpy(model.out.weight), width),
+        fc3=_pad_matrix(_to_numpy(model.fc3.weight), width, width),
+        head=_pack_head(model, _to_numpy(model.out.weight), width),
     )
     biases = Layers(
-        fc1=_block(_column(model.fc1.bias), width, 1)[:, 0].copy(),
-        fc2=_block(_column(model.fc2.bias), width, 1)[:, 0].copy(),
-        lstm=np.stack([_gate_blocks(_column(offset), width, 1)[:, 0] for offset in offsets]),
-        fc3=_block(_column(model.fc3.bias), width, 1)[:, 0].copy(),
-        head=_head_blocks(model, _column(model.out.bias), 1)[..., 0].copy(),
+        fc1=_pad_matrix(_to_column(model.fc1.bias), width, 1)[:, 0].copy(),
+        fc2=_pad_matrix(_to_column(model.fc2.bias), width, 1)[:, 0].copy(),
+        lstm=np.stack([_pack_gates(_to_column(offset), width, 1)[:, 0] for offset in offsets]),
+        fc3=_pad_matrix(_to_column(model.fc3.bias), width, 1)[:, 0].copy(),
+        head=_pack_head(model, _to_column(model.out.bias), 1)[..., 0].copy(),
     )
     return weights, biases
 
 
-def transpose(weights: Layers) -> Layers:
+def transpose_layers(weights: Layers) -> Layers:
     """Copies with the last two axes exchanged, for pullbacks of several particles at once."""
     return Layers(*(np.ascontiguousarray(weight.swapaxes(-1, -2)) for weight in weights))
 
 
-def new_tape(weights: Layers, *, slots: int, batch: int) -> Tape:
+def allocate_tape(weights: Layers, *, slots: int, batch: int) -> Tape:
     """An empty tape; only what no kernel writes before it is read is zeroed."""
     width, features, rows = len(weights.fc2), weights.fc1.shape[1], weights.head.shape[1]
 
@@ -183,37 +183,37 @@ def new_tape(weights: Layers, *, slots: int, batch: int) -> Tape:
     )
 
 
-def _numpy(tensor: Tensor) -> Array:
+def _to_numpy(tensor: Tensor) -> Array:
     return tensor.detach().to("cpu", torch.float32).numpy()
 
 
-def _column(bias: Tensor) -> Array:
-    return _numpy(bias)[:, None]
+def _to_column(bias: Tensor) -> Array:
+    return _to_numpy(bias)[:, None]
 
 
-def _block(matrix: Array, rows: int, columns: int) -> Array:
+def _pad_matrix(matrix: Array, rows: int, columns: int) -> Array:
     return np.pad(matrix, ((0, rows - matrix.shape[0]), (0, columns - matrix.shape[1])))
 
 
-def _gate_blocks(matrix: Array, width: int, columns: int) -> Array:
-    return np.concatenate([_block(gate, width, columns) for gate in np.split(matrix, 4)])
+def _pack_gates(matrix: Array, width: int, columns: int) -> Array:
+    return np.concatenate([_pad_matrix(gate, width, columns) for gate in np.split(matrix, 4)])
 
 
-def _head_blocks(model: LstmGmm, matrix: Array, columns: int) -> Array:
+def _pack_head(model: LstmGmm, matrix: Array, columns: int) -> Array:
     """(components, H, columns) of the output layer's rows: weights, means, log sigmas, contacts."""
     count, size = model.config.components, model.layout.continuous
     weight, mean, log_sigma, contact = np.split(matrix, np.cumsum([count, count * size, count * size]))
-    rows = padded(size, ROW_STEP)
-    height = padded(2 * rows + count + 2, WIDTH_STEP)
+    rows = round_up_to(size, ROW_STEP)
+    height = round_up_to(2 * rows + count + 2, WIDTH_STEP)
     heads = [
         np.concatenate(
             [
-                _block(m, rows, columns),
-                _block(s, rows, columns),
-                _block(weight, count, columns),
-                _block(contact, 2, columns),
+                _pad_matrix(m, rows, columns),
+                _pad_matrix(s, rows, columns),
+                _pad_matrix(weight, count, columns),
+                _pad_matrix(contact, 2, columns),
             ]
         )
         for m, s in zip(np.split(mean, count), np.split(log_sigma, count), strict=True)
     ]
-    return np.stack([_block(head, height, columns) for head in heads])
+    return np.stack([_pad_matrix(head, height, columns) for head in heads])

@@ -14,19 +14,19 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mapctl.protocols import Plan
+from mapctl.protocols import DiscreteChoices
 from priors.lstm_gmm.fast import layout
-from priors.lstm_gmm.fast.layout import Array, Choices, Tape
+from priors.lstm_gmm.fast.layout import Array, ChoiceBuffers, Tape
 from priors.lstm_gmm.network import LstmGmm, LstmState
 
 
 @dataclass(frozen=True, eq=False)
-class _Run:
+class _KernelPass:
     """What one pass of the kernels leaves behind; rows beyond the batch are padding."""
 
     tape: Tape
     noise: Array
-    choices: Choices
+    choices: ChoiceBuffers
     features: Array
     density: Array
 
@@ -44,26 +44,26 @@ class FastRollout:
         from priors.lstm_gmm.fast import kernels
 
         self._config, self._layout, self._kernels = model.config, model.layout, kernels
-        self._settings = layout.settings_of(model)
-        self._weights, self._biases = layout.pack(model)
-        self._transposed = layout.transpose(self._weights)
-        self._no_bias = np.zeros(2 * len(self._weights.fc2) + self._weights.fc1.shape[1], np.float32)
+        self._settings = layout.pack_constants(model)
+        self._weights, self._biases = layout.pack_weights(model)
+        self._transposed = layout.transpose_layers(self._weights)
+        self._zero_bias = np.zeros(2 * len(self._weights.fc2) + self._weights.fc1.shape[1], np.float32)
 
-    def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> Plan:
+    def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
         return self.plan_and_rollout(state, noise)[0]
 
     def plan_and_rollout(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
-    ) -> tuple[Plan, Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+    ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """`plan` and the `rollout` under it in one pass, without gradient: what scoring particles needs."""
         batch, frames, _ = noise.shape
-        run = self._run(state, noise, _blank(batch, frames), layout.LIKELIEST, slots=2)
-        plan = Plan(_tensor(run.choices.component, batch), _tensor(run.choices.contacts, batch))
-        return plan, _tensor(run.features, batch).to(noise.dtype), _tensor(run.density, batch).to(noise.dtype)
+        run = self._run(state, noise, _allocate_choices(batch, frames), layout.LIKELIEST, slots=2)
+        plan = DiscreteChoices(_to_tensor(run.choices.component, batch), _to_tensor(run.choices.contacts, batch))
+        return plan, _to_tensor(run.features, batch).to(noise.dtype), _to_tensor(run.density, batch).to(noise.dtype)
 
     def rollout(
-        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: Plan
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """Features x = mu_k + sigma_k noise under the plan, and each frame's log density under component k.
 
@@ -82,12 +82,12 @@ class FastRollout:
         """Frames drawn one after the other (section 4.1.4): the model's in distribution, not in numbers."""
         batch, size = len(state.previous), self._layout.continuous
         noise = temperature * torch.randn(batch, frames, size, generator=generator)
-        choices = _blank(batch, frames, torch.rand(batch, frames, 3, generator=generator))
-        run = self._run(state, noise, choices, layout.DRAWN, slots=2)
-        features = _tensor(run.features, batch).to(state.previous.dtype)
+        choices = _allocate_choices(batch, frames, torch.rand(batch, frames, 3, generator=generator))
+        run = self._run(state, noise, choices, layout.SAMPLED, slots=2)
+        features = _to_tensor(run.features, batch).to(state.previous.dtype)
         return features, self._state_after(run, features[:, -1])
 
-    def _check(self, plan: Plan, noise: Tensor) -> None:
+    def _check(self, plan: DiscreteChoices, noise: Tensor) -> None:
         if plan.component.shape != noise.shape[:2] or plan.contacts.shape != (*noise.shape[:2], 2):
             raise ValueError(
                 f"the plan is for {tuple(plan.component.shape)} particles and frames, "
@@ -96,22 +96,22 @@ class FastRollout:
         if plan.component.amin() < 0 or plan.component.amax() >= self._config.components:
             raise ValueError(f"the plan names a component outside 0 to {self._config.components - 1}")
 
-    def _run(self, state: LstmState, noise: Tensor, choices: Choices, source: int, *, slots: int) -> _Run:
+    def _run(self, state: LstmState, noise: Tensor, choices: ChoiceBuffers, source: int, *, slots: int) -> _KernelPass:
         batch, frames, continuous = noise.shape
         if continuous != self._layout.continuous:
             raise ValueError(f"noise has {continuous} values a frame, the network {self._layout.continuous}")
-        rows, width = layout.padded_batch(batch), self._config.width
-        tape = layout.new_tape(self._weights, slots=slots, batch=rows)
+        rows, width = layout.pad_batch_size(batch), self._config.width
+        tape = layout.allocate_tape(self._weights, slots=slots, batch=rows)
         settings, size, lanes = self._settings, self._layout.size, len(self._weights.fc2)
-        tape.frame[0, :batch, :size] = (_array(state.previous) - settings.mean[:size]) / settings.std[:size]
+        tape.frame[0, :batch, :size] = (_to_array(state.previous) - settings.mean[:size]) / settings.std[:size]
         tape.lstm_input[0, :, :, lanes:] = 0
-        tape.lstm_input[0, :, :batch, lanes : lanes + width] = _array(state.hidden)
+        tape.lstm_input[0, :, :batch, lanes : lanes + width] = _to_array(state.hidden)
         tape.cell[0] = 0
-        tape.cell[0, :, :batch, :width] = _array(state.cell)
-        run = _Run(
+        tape.cell[0, :, :batch, :width] = _to_array(state.cell)
+        run = _KernelPass(
             tape,
-            _rows(_array(noise), rows),
-            Choices(*(_rows(part, rows) for part in choices)),
+            _pad_rows(_to_array(noise), rows),
+            ChoiceBuffers(*(_pad_rows(part, rows) for part in choices)),
             np.empty((rows, frames, size), np.float32),
             np.empty((rows, frames), np.float32),
         )
@@ -120,14 +120,14 @@ class FastRollout:
         )
         return run
 
-    def _state_after(self, run: _Run, previous: Float[Tensor, "batch size"]) -> LstmState:
+    def _state_after(self, run: _KernelPass, previous: Float[Tensor, "batch size"]) -> LstmState:
         slot, batch, width = run.noise.shape[1] % len(run.tape.frame), len(previous), self._config.width
         lanes = len(self._weights.fc2)
         hidden = run.tape.lstm_input[slot, :, :batch, lanes : lanes + width]
         cell = run.tape.cell[slot, :, :batch, :width]
         return LstmState(previous, *(torch.from_numpy(part.copy()).to(previous.dtype) for part in (hidden, cell)))
 
-    def _pullback(self, run: _Run, d_features: Tensor, d_density: Tensor) -> tuple[Array, Array, Array, Array]:
+    def _pullback(self, run: _KernelPass, d_features: Tensor, d_density: Tensor) -> tuple[Array, Array, Array, Array]:
         """Gradients on the noise, the previous frame (physical units), h and C."""
         batch, rows, lanes = len(d_features), len(run.noise), len(self._weights.fc2)
         width, size = self._config.width, self._layout.size
@@ -136,13 +136,13 @@ class FastRollout:
         self._kernels.backward(
             self._weights,
             self._transposed,
-            self._no_bias,
+            self._zero_bias,
             self._settings,
             run.tape,
             run.noise,
             run.choices.component,
-            _rows(_array(d_features), rows),
-            _rows(_array(d_density), rows),
+            _pad_rows(_to_array(d_features), rows),
+            _pad_rows(_to_array(d_density), rows),
             d_noise,
             d_frame,
             d_input,
@@ -154,14 +154,22 @@ class FastRollout:
 
 class _Rollout(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, noise: Tensor, previous: Tensor, hidden: Tensor, cell: Tensor, plan: Plan, fast: FastRollout):
+    def forward(
+        ctx: Any,
+        noise: Tensor,
+        previous: Tensor,
+        hidden: Tensor,
+        cell: Tensor,
+        plan: DiscreteChoices,
+        fast: FastRollout,
+    ):
         batch, frames, _ = noise.shape
-        choices = Choices(plan.component.numpy(), plan.contacts.numpy(), _NO_UNIFORM)
+        choices = ChoiceBuffers(plan.component.numpy(), plan.contacts.numpy(), _NO_UNIFORM)
         # Only a pullback needs every frame's activations; else they would but push the weights out of cache.
         slots = frames + 1 if any(ctx.needs_input_grad) else 2
         run = fast._run(LstmState(previous, hidden, cell), noise, choices, layout.GIVEN, slots=slots)
         ctx.run, ctx.fast, ctx.types = run, fast, (noise.dtype, previous.dtype, hidden.dtype, cell.dtype)
-        return _tensor(run.features, batch).to(noise.dtype), _tensor(run.density, batch).to(noise.dtype)
+        return _to_tensor(run.features, batch).to(noise.dtype), _to_tensor(run.density, batch).to(noise.dtype)
 
     @staticmethod
     @once_differentiable
@@ -174,21 +182,21 @@ class _Rollout(torch.autograd.Function):
 _NO_UNIFORM = np.zeros((1, 1, 3), np.float32)
 
 
-def _blank(batch: int, frames: int, uniform: Tensor | None = None) -> Choices:
+def _allocate_choices(batch: int, frames: int, uniform: Tensor | None = None) -> ChoiceBuffers:
     drawn = _NO_UNIFORM if uniform is None else uniform.numpy()
-    return Choices(np.zeros((batch, frames), np.int64), np.zeros((batch, frames, 2), np.bool_), drawn)
+    return ChoiceBuffers(np.zeros((batch, frames), np.int64), np.zeros((batch, frames, 2), np.bool_), drawn)
 
 
-def _array(tensor: Tensor) -> Array:
+def _to_array(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.detach().to(torch.float32).numpy())
 
 
-def _rows(array: np.ndarray, rows: int) -> np.ndarray:
+def _pad_rows(array: np.ndarray, rows: int) -> np.ndarray:
     """Contiguous, with rows of zeros up to `rows`."""
     if len(array) == rows:
         return np.ascontiguousarray(array)
     return np.concatenate([array, np.zeros((rows - len(array), *array.shape[1:]), array.dtype)])
 
 
-def _tensor(array: np.ndarray, batch: int) -> Tensor:
+def _to_tensor(array: np.ndarray, batch: int) -> Tensor:
     return torch.from_numpy(array[:batch])

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, Place, local_rotations, root_places
+from mapctl.features import LAYOUT, GroundPose, decode_local_rotations, integrate_root
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 
@@ -73,13 +73,13 @@ LIMBS = tuple(
 """Joints that are lost together."""
 
 
-def clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
+def make_clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
     """The features as a perfect capture, from the origin."""
     batch, frames = features.shape[:2]
-    origin = Place(features.new_zeros(batch, 2), features.new_zeros(batch))
-    ground, heading = root_places(features, origin)
+    origin = GroundPose(features.new_zeros(batch, 2), features.new_zeros(batch))
+    ground, heading = integrate_root(features, origin)
     height = LAYOUT.pick(features, "root_height")
-    quats = local_rotations(features, heading)
+    quats = decode_local_rotations(features, heading)
     return Capture(
         torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
         quats[..., 0, :],
@@ -91,15 +91,15 @@ def clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
     )
 
 
-def corrupted(clean: Capture, settings: CorruptionSettings, generator: torch.Generator) -> Capture:
+def corrupt(clean: Capture, settings: CorruptionSettings, generator: torch.Generator) -> Capture:
     """A spoilt copy; what is masked keeps its values, which nobody should look at."""
-    draw = _Draw(generator)
+    draw = _CorruptionSampler(generator)
     batch, frames = clean.root.shape[:2]
-    sigma, sigma_root = _sigmas(batch, settings, draw)
-    angles, spiky = _angles(batch, frames, sigma, settings, draw)
+    sigma, sigma_root = _sample_sigmas(batch, settings, draw)
+    angles, spiky = _sample_angles(batch, frames, sigma, settings, draw)
     quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
     quats = rotations.multiply(quats, rotations.from_rotation_vector(angles))
-    lost, nothing = _losses(batch, frames, settings, draw)
+    lost, nothing = _sample_missing(batch, frames, settings, draw)
     found = spiky & (draw.uniform(batch, frames, _JOINTS) < settings.found)
     error = torch.exp(settings.told * draw.normal(batch, _JOINTS + 1))
     return Capture(
@@ -113,7 +113,7 @@ def corrupted(clean: Capture, settings: CorruptionSettings, generator: torch.Gen
     )
 
 
-_MOST_TURNED = 0.6  # radians of noise; more is no noise but another motion
+_MAX_NOISE_RAD = 0.6  # radians of noise; more is no noise but another motion
 
 
 def _bone_lengths() -> Float[Tensor, " joints"]:
@@ -124,7 +124,7 @@ def _bone_lengths() -> Float[Tensor, " joints"]:
     )
 
 
-class _Draw:
+class _CorruptionSampler:
     """Random numbers of one generator."""
 
     def __init__(self, generator: torch.Generator):
@@ -144,19 +144,19 @@ class _Draw:
         return (self.uniform(len(bound)) * bound).long().minimum(bound - 1)
 
 
-def _sigmas(batch: int, settings: CorruptionSettings, draw: _Draw) -> tuple[Tensor, Tensor]:
+def _sample_sigmas(batch: int, settings: CorruptionSettings, draw: _CorruptionSampler) -> tuple[Tensor, Tensor]:
     """By joint, radians (batch, joints), and of the hips' place, metres (batch,)."""
     angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, batch, 1)) * (draw.uniform(batch, 1) > settings.clean)
     uneven = torch.where(draw.uniform(batch, 1) < 0.5, settings.uneven, 0.0) * draw.normal(batch, _JOINTS)
     root = draw.log_uniform(*settings.root_cm, batch) / 100 * (draw.uniform(batch) > settings.clean)
     place = draw.log_uniform(*settings.marker_cm, batch, 1) / 100
-    of_places = (place / _bone_lengths()).clamp(max=_MOST_TURNED)
+    of_places = (place / _bone_lengths()).clamp(max=_MAX_NOISE_RAD)
     marked = draw.uniform(batch, 1) < settings.markers
     return torch.where(marked, of_places, angle * torch.exp(uneven)), torch.where(marked[:, 0], place[:, 0], root)
 
 
-def _angles(
-    batch: int, frames: int, sigma: Tensor, settings: CorruptionSettings, draw: _Draw
+def _sample_angles(
+    batch: int, frames: int, sigma: Tensor, settings: CorruptionSettings, draw: _CorruptionSampler
 ) -> tuple[Float[Tensor, "batch frames joints 3"], Tensor]:
     """Rotation vectors to add, and which joints a spike has hit (batch, frames, joints).
 
@@ -164,7 +164,7 @@ def _angles(
     """
     noise = draw.normal(batch, frames, _JOINTS, 3)
     stays = torch.where(draw.uniform(batch) < settings.correlated, 0.8 * draw.uniform(batch), 0.0)
-    noise = _lasting(noise, stays) * sigma[:, None, :, None]
+    noise = _correlate_in_time(noise, stays) * sigma[:, None, :, None]
     share = settings.spikes * draw.uniform(batch) * (draw.uniform(batch) < 0.5)
     hit = draw.uniform(batch, frames, _JOINTS, 3) < share[:, None, None, None]
     low, high = settings.spike_deg
@@ -176,7 +176,7 @@ def _angles(
     return torch.einsum("btjk,bjkc->btjc", noise, axes), hit.any(dim=-1)
 
 
-def _lasting(noise: Float[Tensor, "batch frames joints 3"], stays: Float[Tensor, " batch"]) -> Tensor:
+def _correlate_in_time(noise: Float[Tensor, "batch frames joints 3"], stays: Float[Tensor, " batch"]) -> Tensor:
     """Noise of the same spread, of which the share `stays` comes from the frame before."""
     if not stays.any():
         return noise
@@ -187,7 +187,9 @@ def _lasting(noise: Float[Tensor, "batch frames joints 3"], stays: Float[Tensor,
     return torch.stack(out, dim=1)
 
 
-def _losses(batch: int, frames: int, settings: CorruptionSettings, draw: _Draw) -> tuple[Tensor, Tensor]:
+def _sample_missing(
+    batch: int, frames: int, settings: CorruptionSettings, draw: _CorruptionSampler
+) -> tuple[Tensor, Tensor]:
     """Which joints are lost (batch, frames, joints), and in which frames all are (batch, frames)."""
     share = settings.dropout * draw.uniform(batch, 1, 1) * (draw.uniform(batch, 1, 1) < 0.25)
     lost = draw.uniform(batch, frames, _JOINTS) < share
@@ -195,12 +197,12 @@ def _losses(batch: int, frames: int, settings: CorruptionSettings, draw: _Draw) 
     for row, joints in enumerate(LIMBS):
         limbs[row, list(joints)] = True
     limb = limbs[draw.below(torch.full((batch,), len(LIMBS)))]
-    during = _stretch(batch, frames, 10, frames, draw) & (draw.uniform(batch, 1) < settings.limb)
-    nothing = _stretch(batch, frames, 3, frames // 3, draw) & (draw.uniform(batch, 1) < settings.gap)
+    during = _sample_interval(batch, frames, 10, frames, draw) & (draw.uniform(batch, 1) < settings.limb)
+    nothing = _sample_interval(batch, frames, 3, frames // 3, draw) & (draw.uniform(batch, 1) < settings.gap)
     return lost | (limb[:, None] & during[..., None]), nothing
 
 
-def _stretch(batch: int, frames: int, shortest: int, longest: int, draw: _Draw) -> Tensor:
+def _sample_interval(batch: int, frames: int, shortest: int, longest: int, draw: _CorruptionSampler) -> Tensor:
     """One run of true frames in each window (batch, frames), never all of them."""
     shortest, longest = min(shortest, frames - 1), min(longest, frames - 1)
     length = shortest + draw.below(torch.full((batch,), longest - shortest + 1))

@@ -39,24 +39,24 @@ class GapSettings:
     dropout: float = 0.2
     """Share of windows with lost joints that drop them frame by frame, half of them at most."""
 
-    def mean_length(self, progress: float) -> float:
+    def interpolate_mean_length(self, progress: float) -> float:
         """Of a gap, frames, `progress` of the way through training."""
         return self.shortest + (self.longest - self.shortest) * min(1.0, progress / self.grown)
 
 
-def known_places(
+def sample_observation_mask(
     present: Bool[Tensor, "batch frames"], settings: GapSettings, *, progress: float, generator: torch.Generator
 ) -> Bool[Tensor, "batch frames joints"]:
     """Which places of each window stay known; in every window some frame is known whole or in part."""
-    draw = _Draw(generator, *present.shape)
-    length = settings.mean_length(progress)
+    draw = _GapSampler(generator, *present.shape)
+    length = settings.interpolate_mean_length(progress)
     kind = draw.uniform()
-    frames = _gaps(draw, length, settings)
-    partial = _partly(draw, settings) & (draw.uniform() < settings.partial)[:, None, None]
+    frames = _sample_gaps(draw, length, settings)
+    partial = _sample_partial(draw, settings) & (draw.uniform() < settings.partial)[:, None, None]
     gaps = frames[..., None] | partial
-    keys = _keys(draw, length)[..., None].expand_as(gaps)
+    keys = _sample_keyframes(draw, length)[..., None].expand_as(gaps)
     known = torch.where((kind < settings.keys)[:, None, None], keys, gaps)
-    known = torch.where((kind > 1 - settings.joints)[:, None, None], _without_joints(draw, settings), known)
+    known = torch.where((kind > 1 - settings.joints)[:, None, None], _sample_missing_joints(draw, settings), known)
     known = known & present[..., None]
     # A window without anything known would teach the mean motion.
     lost = ~known.any(dim=2).any(dim=1)
@@ -64,7 +64,7 @@ def known_places(
     return known | (lost[:, None] & first)[..., None]
 
 
-class _Draw:
+class _GapSampler:
     """Random numbers of one generator, for a batch of windows."""
 
     def __init__(self, generator: torch.Generator, batch: int, frames: int):
@@ -79,47 +79,47 @@ class _Draw:
         """(batch,)."""
         return torch.randn(self.batch, generator=self.generator)
 
-    def stretch(self, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
+    def sample_interval(self, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
         """One run of so many frames, that may reach beyond the window's ends."""
         start = self.uniform() * (self.frames + 8 - length).clamp_min(1) - 4
         return (self.frame >= start[:, None]) & (self.frame < (start + length)[:, None])
 
 
-def _gaps(draw: _Draw, length: float, settings: GapSettings) -> Bool[Tensor, "batch frames"]:
+def _sample_gaps(draw: _GapSampler, length: float, settings: GapSettings) -> Bool[Tensor, "batch frames"]:
     """True where a frame is known."""
     known = torch.ones(draw.batch, draw.frames, dtype=torch.bool)
     count = (1 + draw.uniform() * settings.several).floor()
     for number in range(settings.several):
         size = (length + settings.spread * draw.normal()).clamp(2, draw.frames - 10)
-        known &= ~(draw.stretch(size / count.sqrt()) & (number < count)[:, None])
+        known &= ~(draw.sample_interval(size / count.sqrt()) & (number < count)[:, None])
     return known
 
 
-def _keys(draw: _Draw, length: float) -> Bool[Tensor, "batch frames"]:
+def _sample_keyframes(draw: _GapSampler, length: float) -> Bool[Tensor, "batch frames"]:
     """Single frames, on average `length` apart, in half of the windows with the frame after it: a pose and its pace."""
     known = draw.uniform(draw.frames) < 1 / (2 + draw.uniform(1) * (2 * length))
     after = torch.cat([torch.zeros(draw.batch, 1, dtype=torch.bool), known[:, :-1]], dim=1)
     return known | (after & (draw.uniform(1) < 0.5))
 
 
-def _partly(draw: _Draw, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
+def _sample_partial(draw: _GapSampler, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """Some joints, or all but some, known for a stretch."""
-    some = _some_joints(draw)
+    some = _sample_joints(draw)
     other = draw.uniform(1) < 0.25
-    stretch = draw.stretch(1 + draw.uniform() ** 2 * draw.frames)
+    stretch = draw.sample_interval(1 + draw.uniform() ** 2 * draw.frames)
     return stretch[..., None] & torch.where(other, ~some, some)[:, None]
 
 
-def _without_joints(draw: _Draw, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
+def _sample_missing_joints(draw: _GapSampler, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """All known but 1 to 3 joints, or a limb, throughout or for a stretch; or any joint now and then."""
-    lost = _some_joints(draw)[:, None].expand(-1, draw.frames, -1)
-    during = draw.stretch(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
+    lost = _sample_joints(draw)[:, None].expand(-1, draw.frames, -1)
+    during = draw.sample_interval(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     lost = torch.where((draw.uniform() < settings.dropout)[:, None, None], dropped, lost & during[..., None])
     return ~lost
 
 
-def _some_joints(draw: _Draw) -> Bool[Tensor, "batch joints"]:
+def _sample_joints(draw: _GapSampler) -> Bool[Tensor, "batch joints"]:
     """1 to 3 joints at random, or a limb."""
     limbs = torch.zeros(len(LIMBS), _JOINTS, dtype=torch.bool)
     for row, joints in enumerate(LIMBS):

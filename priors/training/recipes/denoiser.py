@@ -14,10 +14,10 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
 from mapctl.recording import Cleaned
 from mapctl.skeleton import CANONICAL
-from priors.config import check_least
+from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
-from priors.training.augmentation.corruption import CorruptionSettings, clean_capture, corrupted
-from priors.training.corpus import Corpus, folder_of_clips, window_starts
+from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
+from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
 from priors.training.trainer import Trainer
 
 _TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
@@ -56,7 +56,7 @@ class DenoiserSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        check_least(self, 1, "steps", "batch")
+        require_at_least(self, 1, "steps", "batch")
         if self.window < 16:
             raise RequestError(f"window must be at least 16 frames, got {self.window}")
 
@@ -66,7 +66,7 @@ class DenoiserTrainer(Trainer[DenoiserNetwork]):
 
     def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
         """RequestError where no clip is as long as a window."""
-        self.settings, self.windows = settings, Windows(corpus, settings)
+        self.settings, self.windows = settings, FeatureWindows(corpus, settings)
         super().__init__(
             lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16),
             steps=settings.steps,
@@ -76,26 +76,26 @@ class DenoiserTrainer(Trainer[DenoiserNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Of a batch drawn anew."""
-        return losses(self.network, self.windows.draw(self.generator), self.settings, self.generator)
+        return compute_denoiser_losses(self.network, self.windows.draw(self.generator), self.settings, self.generator)
 
 
-class Windows:
+class FeatureWindows:
     """Windows of clean motion, as they are drawn for training."""
 
     def __init__(self, corpus: Corpus, settings: DenoiserSettings):
         """RequestError where no clip is as long as a window."""
         self.corpus, self.settings = corpus, settings
-        starts = window_starts(corpus.lengths, settings.window)
-        folder = folder_of_clips(corpus).repeat_interleave(torch.tensor(corpus.lengths))
+        starts = find_window_starts(corpus.lengths, settings.window)
+        folder = number_clip_folders(corpus).repeat_interleave(torch.tensor(corpus.lengths))
         # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
         self.groups = [starts[folder[starts] == number] for number in folder.unique()]
         self.groups = [group for group in self.groups if len(group)]
-        self.chances = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - settings.evenness)
+        self.probabilities = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - settings.evenness)
 
     def draw(self, generator: torch.Generator) -> Float[Tensor, "batch window size"]:
         """Half of them mirrored, of performers a little larger or smaller, on rigs calibrated a little differently."""
         settings = self.settings
-        groups = torch.multinomial(self.chances, settings.batch, replacement=True, generator=generator)
+        groups = torch.multinomial(self.probabilities, settings.batch, replacement=True, generator=generator)
         shares = torch.rand(settings.batch, generator=generator)
         picked = torch.stack(
             [
@@ -109,11 +109,13 @@ class Windows:
         size = torch.exp(settings.corruption.size * torch.randn(settings.batch, 1, 1, generator=generator))
         for block in ("root_displacement_heading", "root_height"):
             windows[..., LAYOUT.slices[block]] *= size
-        windows[..., LAYOUT.slices["joint_rotations"]] = _calibrated(windows, settings.calibration_deg, generator)
+        windows[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(
+            windows, settings.calibration_deg, generator
+        )
         return windows
 
 
-def _calibrated(
+def _perturb_joint_frames(
     windows: Float[Tensor, "batch window size"], spread_deg: float, generator: torch.Generator
 ) -> Float[Tensor, "batch window width"]:
     """Joint rotations (rotation vectors, flat) with every joint's frame turned by a constant; below it nothing turns.
@@ -131,18 +133,18 @@ def _calibrated(
     return rotations.to_rotation_vector(quats).flatten(-2)
 
 
-def losses(
+def compute_denoiser_losses(
     network: DenoiserNetwork, windows: Tensor, settings: DenoiserSettings, generator: torch.Generator
 ) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of."""
-    clean = clean_capture(windows)
-    cleaned = network(corrupted(clean, settings.corruption, generator))
+    clean = make_clean_capture(windows)
+    cleaned = network(corrupt(clean, settings.corruption, generator))
     angles = torch.cat([clean.tilt, clean.joints.flatten(2)], dim=-1)
     bits = LAYOUT.pick(windows, "contacts")
-    wanted = joint_positions(Cleaned(clean.root, clean.heading, angles, bits))
-    got = joint_positions(cleaned)
-    place = 100 * _length(got - wanted).mean()
-    slip = 100 * _length(torch.diff(got - wanted, dim=1))
+    wanted = compute_joint_positions(Cleaned(clean.root, clean.heading, angles, bits))
+    got = compute_joint_positions(cleaned)
+    place = 100 * _smooth_norm(got - wanted).mean()
+    slip = 100 * _smooth_norm(torch.diff(got - wanted, dim=1))
     planted = bits[:, 1:] * bits[:, :-1]
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
     turned = (cleaned.angles - angles).abs().mean()
@@ -163,7 +165,7 @@ def losses(
     }
 
 
-def joint_positions(cleaned: Cleaned) -> Float[Tensor, "batch frames joints 3"]:
+def compute_joint_positions(cleaned: Cleaned) -> Float[Tensor, "batch frames joints 3"]:
     """In the world on canonical bones, metres."""
     tilt, others = cleaned.angles[..., :2], cleaned.angles[..., 2:].unflatten(-1, (-1, 3))
     hips = torch.stack([tilt[..., 0], torch.zeros_like(cleaned.heading), tilt[..., 1]], dim=-1)
@@ -178,16 +180,18 @@ def validate(network: DenoiserNetwork, corpus: Corpus, settings: DenoiserSetting
     """The errors on 6 batches of unseen windows, spoilt in the same way each time."""
     generator = torch.Generator().manual_seed(0)
     # What is held out may have no clip as long as a window; that must not end a run after an hour.
-    drawn = Windows(corpus, replace(settings, window=min(settings.window, max(corpus.lengths))))
+    drawn = FeatureWindows(corpus, replace(settings, window=min(settings.window, max(corpus.lengths))))
     rows = []
     with torch.no_grad():
         for _ in range(6):
             windows = drawn.draw(generator)
-            rows.append([float(value) for value in losses(network, windows, settings, generator).values()])
+            rows.append(
+                [float(value) for value in compute_denoiser_losses(network, windows, settings, generator).values()]
+            )
     names = ("loss", "error_cm", "feet_cm_frame", "angles_deg", "contacts_nats")
     return dict(zip(names, torch.tensor(rows).mean(dim=0).tolist(), strict=True))
 
 
-def _length(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def _smooth_norm(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """With a gradient at zero."""
     return torch.sqrt(vector.square().sum(dim=-1) + 1e-8)

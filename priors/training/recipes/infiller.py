@@ -10,17 +10,17 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
-from priors.config import check_least
+from priors.config import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
-from priors.training.augmentation.gap_masks import GapSettings, known_places
+from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
 from priors.training.corpus import Corpus
 from priors.training.trainer import Trainer
 from priors.training.windows import PositionWindows, Window
 
 TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
-_EVEN_OFF = 0.5  # cm that the guess may be off by before a window's weight falls
-_MOST_OFF = 4.0  # cm beyond which it falls no more
-_LEAST_SPREAD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
+_ERROR_OFFSET_CM = 0.5  # cm that the guess may be off by before a window's weight falls
+_MAX_ERROR_CM = 4.0  # cm beyond which it falls no more
+_MIN_STD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class InfillerSettings:
     """Of weights, windows and gaps."""
 
     def __post_init__(self):
-        check_least(self, 1, "steps", "batch")
+        require_at_least(self, 1, "steps", "batch")
         if self.window < 32:
             raise RequestError(f"window must be at least 32 frames, got {self.window}")
 
@@ -70,16 +70,18 @@ class InfillerTrainer(Trainer[InfillerNetwork]):
         )
         mean, std = self.windows.moments()
         self.network.mean.copy_(mean)
-        self.network.std.copy_(std.clamp_min(_LEAST_SPREAD))
+        self.network.std.copy_(std.clamp_min(_MIN_STD))
 
     def losses(self) -> dict[str, Tensor]:
         """Of a batch drawn anew."""
         window, progress = self.windows.draw(self.settings.batch, self.generator), self.step / self.settings.steps
-        known = known_places(window.present, self.settings.gaps, progress=progress, generator=self.generator)
-        return losses(self.network, window, known, self.settings)
+        known = sample_observation_mask(window.present, self.settings.gaps, progress=progress, generator=self.generator)
+        return compute_infiller_losses(self.network, window, known, self.settings)
 
 
-def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: InfillerSettings) -> dict[str, Tensor]:
+def compute_infiller_losses(
+    network: InfillerNetwork, window: Window, known: Tensor, settings: InfillerSettings
+) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
     L1 over the whole motion (section 3.3), window by window divided by the number of coordinates that had to be made:
@@ -91,9 +93,9 @@ def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: In
     wanted = image.from_world(window.places)
     proposed = network(image)
     lacking = window.present[..., None] & ~known
-    made = lacking if network.keeps else window.present[..., None].expand_as(known)
+    made = lacking if network.keeps_observed else window.present[..., None].expand_as(known)
     wrong = 100 * (proposed.places - wanted)
-    weight = _weights(image.places, wanted, lacking) / (3 * made.sum(dim=(1, 2)).clamp_min(1))
+    weight = _weigh_windows(image.places, wanted, lacking) / (3 * made.sum(dim=(1, 2)).clamp_min(1))
     place = (weight * (wrong.abs().sum(-1) * made).sum(dim=(1, 2))).mean()
     pairs = window.present[:, 1:] & window.present[:, :-1]
     slip = torch.diff(wrong, dim=1) * pairs[..., None, None]
@@ -115,15 +117,15 @@ def losses(network: InfillerNetwork, window: Window, known: Tensor, settings: In
     }
 
 
-def _weights(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
+def _weigh_windows(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
     """Of windows: the less, the more the guess is off (mean over coordinates, cm); 1 at 2 cm."""
     off = (100 * (guess - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
-    return (2 + _EVEN_OFF) / (off.clamp(max=_MOST_OFF) + _EVEN_OFF)
+    return (2 + _ERROR_OFFSET_CM) / (off.clamp(max=_MAX_ERROR_CM) + _ERROR_OFFSET_CM)
 
 
-VALIDATED = (15, 30, 60)
+VALIDATED_GAPS = (15, 30, 60)
 """Gaps that are validated, frames, where a window has room for them."""
-_ROOM = 8  # frames of a window that a gap must leave
+_MARGIN_FRAMES = 8  # frames of a window that a gap must leave
 
 
 @torch.no_grad()
@@ -131,7 +133,7 @@ def validate(network: InfillerNetwork, corpus: Corpus, settings: InfillerSetting
     """Root-aligned joint error over a gap in the middle of unseen windows, cm, beside that of the guess."""
     windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
     row = {}
-    for gap in [gap for gap in VALIDATED if gap + _ROOM <= settings.window]:
+    for gap in [gap for gap in VALIDATED_GAPS if gap + _MARGIN_FRAMES <= settings.window]:
         window = windows.draw(192, torch.Generator().manual_seed(gap))
         middle = (settings.window - gap) // 2
         known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()

@@ -15,11 +15,11 @@ from torch import Tensor
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, mirror_features
 from mapctl.problem import density_selection
-from priors.config import check_least
+from priors.config import require_at_least
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
-from priors.training.corpus import Corpus, window_starts
-from priors.training.moment_matching import MatchingSettings, mismatch
+from priors.training.corpus import Corpus, find_window_starts
+from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class TrainingSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        check_least(self, 1, "steps", "batch", "window")
+        require_at_least(self, 1, "steps", "batch", "window")
         for name, known in (("optimiser", ("adam", "rmsprop")), ("schedule", ("cosine", "epochs"))):
             if getattr(self, name) not in known:
                 raise RequestError(f"{name} must be {' or '.join(known)}, got {getattr(self, name)!r}")
@@ -85,7 +85,7 @@ PAPER = (
 """The variant as the paper prints it (30,000 iterations)."""
 
 
-def statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
+def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of features and their mirror image; floors keep held joints from exploding.
 
     Rotations are held to at least 0.01 rad (0.6 degrees), displacements to 1 mm; contact bits map to -1 and 1.
@@ -100,7 +100,7 @@ def statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
     return mean, torch.maximum(std, floor)
 
 
-class Trainer:
+class DensityTrainer:
     """Model, optimiser and generator, one step at a time."""
 
     def __init__(
@@ -116,7 +116,7 @@ class Trainer:
         """`labels` of the corpus' clips, the network's own; `init` holds weights and statistics to begin with."""
         self.settings, self.device, self.step = settings, device, 0
         self.generator = torch.Generator().manual_seed(settings.seed)
-        mean, std = statistics(corpus.features)
+        mean, std = compute_feature_statistics(corpus.features)
         with torch.random.fork_rng(devices=[]):  # torch draws weights from its global generator, which is the caller's
             torch.default_generator.manual_seed(settings.seed)
             self.model = LstmGmm(config, mean=mean, std=std).to(device)
@@ -124,18 +124,18 @@ class Trainer:
             self.model.load_state_dict(dict(init))
         self.features, self.labels = corpus.features, labels or Labels.none(len(corpus.lengths))
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
-        self.starts = window_starts(corpus.lengths, settings.window + 1)
-        self.optimiser = self._optimiser()
+        self.starts = find_window_starts(corpus.lengths, settings.window + 1)
+        self.optimiser = self._make_optimiser()
 
     def train_step(self) -> float:
         """One optimiser step; returns the loss in nats a frame. MapctlError, and no step, where that is no number."""
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate()
-        windows, condition = self._windows()
+        windows, condition = self._sample_windows()
         loss = -self._log_prob(windows, condition).mean()
         if not torch.isfinite(loss):
-            raise _diverged(self.step + 1, f"the loss is {loss.item()} nats")
+            raise _make_divergence_error(self.step + 1, f"the loss is {loss.item()} nats")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         if settings.optimiser == "rmsprop":
@@ -144,7 +144,7 @@ class Trainer:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.gradient_clip)
         matching = settings.matching
         if self.step >= matching.begin * settings.steps and self.step % matching.every == 0:
-            self._match(windows)
+            self._add_moment_gradient(windows)
         self.optimiser.step()
         self.step += 1
         return loss.item()
@@ -161,7 +161,7 @@ class Trainer:
     def check_finite(self) -> None:
         """MapctlError unless every weight is a number."""
         if not all(bool(torch.isfinite(values).all()) for values in self.model.parameters()):
-            raise _diverged(self.step, "its weights are not finite")
+            raise _make_divergence_error(self.step, "its weights are not finite")
 
     def state(self) -> dict:
         """Everything a bit-exact continuation needs; tensors and plain numbers only."""
@@ -180,16 +180,16 @@ class Trainer:
         self.generator.set_state(state["generator"])
         self.step = state["step"]
 
-    def _optimiser(self) -> torch.optim.Optimizer:
+    def _make_optimiser(self) -> torch.optim.Optimizer:
         settings, parameters = self.settings, self.model.parameters()
         if settings.optimiser == "rmsprop":
             return torch.optim.RMSprop(parameters, lr=settings.learning_rate, alpha=0.9)
         return torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay)
 
-    def _match(self, windows: Tensor) -> None:
+    def _add_moment_gradient(self, windows: Tensor) -> None:
         """Add the gradient of the free runs' mismatch, clipped on its own: neither loss drowns the other."""
         parameters = [p for p in self.model.parameters() if p.requires_grad]
-        loss = mismatch(self.model, windows, self.settings.matching, self.generator)
+        loss = free_run_moment_loss(self.model, windows, self.settings.matching, self.generator)
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         found = [(p, g) for p, g in zip(parameters, gradients, strict=True) if g is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for _, g in found]))
@@ -199,7 +199,7 @@ class Trainer:
             share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
             parameter.grad = share * gradient if parameter.grad is None else parameter.grad + share * gradient
 
-    def _windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
+    def _sample_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
         """Windows of clips and the labels that are told of them."""
         settings = self.settings
         picked = torch.randint(len(self.starts), (settings.batch,), generator=self.generator)
@@ -217,14 +217,14 @@ class Trainer:
         if not self.labels.names:
             return labels
         groups = self.labels.groups
-        told = torch.rand(len(labels), len(groups), generator=self.generator) < _TOLD_GROUP
+        told = torch.rand(len(labels), len(groups), generator=self.generator) < _KEEP_GROUP_PROBABILITY
         told &= torch.rand(len(labels), 1, generator=self.generator) >= self.settings.untold
         return labels * (told.to(labels.dtype) @ groups)
 
     def _log_prob(self, windows: Tensor, told: Tensor) -> Tensor:
         """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
         model, size = self.model, self.model.layout.continuous
-        inputs, level = self._noisy(model.normalise(windows[:, :-1]), size)
+        inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.initial_state(windows[:, 0])
         condition = torch.cat([level / NOISE_UNIT, told], -1) if model.config.knows_noise else told
         with torch.autocast(self.device, torch.bfloat16, enabled=self.settings.bfloat16):
@@ -232,7 +232,7 @@ class Trainer:
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
         return mixture.log_prob(target, model.whitening)
 
-    def _noisy(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
+    def _add_noise(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
         """Inputs with noise and flipped bits, and each window's level of noise."""
         settings, shape = self.settings, inputs.shape
         share = torch.rand(shape[0], 1, 1, generator=self.generator)
@@ -247,14 +247,14 @@ class Trainer:
         return noisy, level[:, 0].to(inputs.device)
 
 
-_TOLD_GROUP = 0.7
+_KEEP_GROUP_PROBABILITY = 0.7
 
 
-def _diverged(step: int, how: str) -> MapctlError:
+def _make_divergence_error(step: int, how: str) -> MapctlError:
     return MapctlError(f"training diverged at step {step}: {how}; the last checkpoint, if there is one, is kept")
 
 
-def validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:
+def compute_validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:
     """Mean negative log density a frame over the first frames of every clip, clean inputs, from an empty memory."""
     total, count = 0.0, 0
     with torch.no_grad():
@@ -265,16 +265,20 @@ def validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:
     return total / count
 
 
-def window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, float]:
+def compute_window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, float]:
     """Log density a frame, physical units, of motion as wrong as a proposal is: mean over windows, and the value that
     98 % of them reach. By it a density's trust is told (see mapctl.problem.density_selection); clips begin with an
     empty memory.
     """
-    blurred, found = model.cpu().blurred(density_selection.spread()), []
+    blurred, found = model.cpu().with_observation_noise(density_selection.proposal_sigma()), []
     with torch.no_grad():
         for clip in (clip for corpus in corpora for clip in corpus.clips() if len(clip) > 1):
             nats = blurred.log_prob(clip[None, 1:], blurred.initial_state(clip[:1]))[0]
-            parts = density_selection.physical_nats(nats, blurred.std).split(density_selection.WINDOW)
-            found += [part.mean() for part in parts if len(part) == density_selection.WINDOW or len(parts) == 1]
+            parts = density_selection.to_physical_log_density(nats, blurred.std).split(
+                density_selection.SELECTION_WINDOW
+            )
+            found += [
+                part.mean() for part in parts if len(part) == density_selection.SELECTION_WINDOW or len(parts) == 1
+            ]
     values = torch.stack(found)
     return {"mean": float(values.mean()), "p2": float(values.quantile(0.02))}

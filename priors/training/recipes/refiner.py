@@ -10,18 +10,18 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, Place, mirror_features, root_places
-from priors.config import check_least
-from priors.refiner.end_effectors import end_effectors
+from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features
+from priors.config import require_at_least
+from priors.refiner.end_effectors import compute_end_effectors
 from priors.refiner.network import RefinerConfig, RefinerNetwork
 from priors.training import run_files
-from priors.training.adversarial import Critic, History
-from priors.training.corpus import Corpus, window_starts
-from priors.training.moment_matching import MatchingSettings, compare
+from priors.training.adversarial import Critic, HistoryBuffer
+from priors.training.corpus import Corpus, find_window_starts
+from priors.training.moment_matching import MatchingSettings, moment_loss
 
-MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)
+REFINER_MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)
 """That a refiner is held to, as pieces of a window show them."""
-_SHORTEST = 8  # frames of a window that moments can be had of
+_MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,15 @@ class AdversarialSettings:
     """Of weights, windows and noise."""
 
     def __post_init__(self):
-        check_least(self, 1, "rounds", "batch", "refiner_updates", "critic_updates", "most_updates")
+        require_at_least(self, 1, "rounds", "batch", "refiner_updates", "critic_updates", "most_updates")
         if self.window < (least := 2 * self.critic_around + 2):
             raise RequestError(f"window must be at least {least}, got {self.window}: the critic needs them to see one")
         if self.history < self.batch or self.batch < 2:
             raise RequestError(f"the history must hold a batch of 2 or more, got {self.history} for {self.batch}")
-        if self.moments > 0 and self.window < _SHORTEST:
-            raise RequestError(f"window must be at least {_SHORTEST} for moments to be compared, got {self.window}")
+        if self.moments > 0 and self.window < _MIN_MOMENT_FRAMES:
+            raise RequestError(
+                f"window must be at least {_MIN_MOMENT_FRAMES} for moments to be compared, got {self.window}"
+            )
         if not 0 <= self.average < 1:
             raise RequestError(f"average must lie in [0, 1), got {self.average:g}")
         if self.optimiser not in ("adam", "rmsprop"):
@@ -116,7 +118,7 @@ PAPER = (
 
 
 @dataclass
-class Losses:
+class RoundLosses:
     """Of one round."""
 
     refiner: float
@@ -142,7 +144,7 @@ class AdversarialTrainer:
         self.settings, self.round, self.updates = settings, 0, settings.refiner_updates
         self.generator = torch.Generator().manual_seed(settings.seed)
         self.corpus, self.raw = corpus, raw
-        statistics = _statistics(corpus, config, settings.window)
+        statistics = _compute_statistics(corpus, config, settings.window)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(settings.seed)
             self.refiner = RefinerNetwork(config, **statistics)
@@ -154,17 +156,17 @@ class AdversarialTrainer:
                 slow=settings.critic_slow,
                 **reach,
             )
-        self.averaged = deepcopy(self.refiner).requires_grad_(False)
+        self.averaged_refiner = deepcopy(self.refiner).requires_grad_(False)
         self.given = settings.window + self.refiner.before + config.lookahead
-        self.captured = window_starts(corpus.lengths, settings.window)
-        self.sampled = window_starts(raw.lengths, self.given)
+        self.captured = find_window_starts(corpus.lengths, settings.window)
+        self.sampled = find_window_starts(raw.lengths, self.given)
         self.optimisers = [
-            self._optimiser(self.refiner, settings.refiner_rate),
-            self._optimiser(self.critic, settings.critic_rate),
+            self._make_optimiser(self.refiner, settings.refiner_rate),
+            self._make_optimiser(self.critic, settings.critic_rate),
         ]
         with torch.no_grad():
-            first = [self.refiner(self._raw())[0] for _ in range(-(-settings.history // settings.batch))]
-        self.history = History(torch.cat(first)[: settings.history])
+            first = [self.refiner(self._sample_raw_windows())[0] for _ in range(-(-settings.history // settings.batch))]
+        self.history = HistoryBuffer(torch.cat(first)[: settings.history])
 
     def warm_up(self) -> None:
         """Before the rounds: the critic alone, then both."""
@@ -174,7 +176,7 @@ class AdversarialTrainer:
             self._refine()
             self._criticise()
 
-    def train_round(self) -> Losses:
+    def train_round(self) -> RoundLosses:
         """Updates of the refiner, then of the critic, and the balance of section 4.2.2."""
         if self.round == 0:
             self.warm_up()
@@ -187,7 +189,7 @@ class AdversarialTrainer:
         elif critic > settings.weak:
             self.updates = max(1, updates // 2)
         self.round += 1
-        return Losses(refiner, critic, told, updates)
+        return RoundLosses(refiner, critic, told, updates)
 
     def state(self) -> dict[str, Tensor]:
         """Everything a bit-exact continuation needs, flat."""
@@ -196,50 +198,50 @@ class AdversarialTrainer:
             "history": self.history.windows,
             "counts": torch.tensor([self.round, self.updates]),
         }
-        tensors |= {f"averaged.{name}": value for name, value in self.averaged.state_dict().items()}
+        tensors |= {f"averaged.{name}": value for name, value in self.averaged_refiner.state_dict().items()}
         for kind, model, optimiser in self._sides():
             tensors |= {f"{kind}.{name}": value for name, value in model.state_dict().items()}
-            tensors |= run_files.optimiser_tensors(optimiser, f"{kind}-optimiser")
+            tensors |= run_files.flatten_optimiser(optimiser, f"{kind}-optimiser")
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Continue from what `state` gave; KeyError or RuntimeError where it is not whole."""
         self.generator.set_state(tensors["generator"])
-        self.history = History(tensors["history"])
+        self.history = HistoryBuffer(tensors["history"])
         self.round, self.updates = tensors["counts"].tolist()
-        self.averaged.load_state_dict(_below("averaged.", tensors))
+        self.averaged_refiner.load_state_dict(_strip_prefix("averaged.", tensors))
         for kind, model, optimiser in self._sides():
-            model.load_state_dict(_below(f"{kind}.", tensors))
-            optimiser.load_state_dict(run_files.optimiser_state(optimiser, f"{kind}-optimiser", tensors))
+            model.load_state_dict(_strip_prefix(f"{kind}.", tensors))
+            optimiser.load_state_dict(run_files.unflatten_optimiser(optimiser, f"{kind}-optimiser", tensors))
 
     def _sides(self) -> list[tuple[str, nn.Module, torch.optim.Optimizer]]:
         return [("refiner", self.refiner, self.optimisers[0]), ("critic", self.critic, self.optimisers[1])]
 
     def _refine(self) -> float:
         """One update of the refiner (Eq. 13), and of its running mean."""
-        raw = self._raw()
-        with self._precision():
+        raw = self._sample_raw_windows()
+        with self._autocast():
             refined, _ = self.refiner(raw)
             odds = self.critic(refined.float())
         refined = refined.float()
         loss = cross_entropy(odds.float(), torch.ones(odds.shape))
-        total = loss + self.settings.root * _root_distance(raw[:, self.refiner.before :], refined)
+        total = loss + self.settings.root * _compute_root_error(raw[:, self.refiner.before :], refined)
         if self.settings.moments > 0:
-            captured = self._windows(self.corpus, self.captured, self.settings.window)
-            total = total + self.settings.moments * compare(refined, captured, MOMENTS)
+            captured = self._sample_windows(self.corpus, self.captured, self.settings.window)
+            total = total + self.settings.moments * moment_loss(refined, captured, REFINER_MOMENTS)
         self._step(self.optimisers[0], self.refiner, total)
         with torch.no_grad():
-            for mean, latest in zip(self.averaged.parameters(), self.refiner.parameters(), strict=True):
+            for mean, latest in zip(self.averaged_refiner.parameters(), self.refiner.parameters(), strict=True):
                 mean.lerp_(latest, 1 - self.settings.average)
         return loss.item()
 
     def _criticise(self) -> tuple[float, float]:
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
-        with torch.no_grad(), self._precision():
-            fresh, _ = self.refiner(self._raw())
+        with torch.no_grad(), self._autocast():
+            fresh, _ = self.refiner(self._sample_raw_windows())
         made = self.history.mix(fresh.float(), self.generator)
-        both = torch.cat([self._windows(self.corpus, self.captured, self.settings.window), made])
-        with self._precision():
+        both = torch.cat([self._sample_windows(self.corpus, self.captured, self.settings.window), made])
+        with self._autocast():
             odds = self.critic(both).float()
         truth = torch.cat([torch.ones(len(odds) - len(made)), torch.zeros(len(made))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
@@ -253,48 +255,48 @@ class AdversarialTrainer:
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
         optimiser.step()
 
-    def _precision(self) -> torch.autocast:
+    def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self.settings.bfloat16)
 
-    def _raw(self) -> Float[Tensor, "batch given size"]:
-        return self._windows(self.raw, self.sampled, self.given)
+    def _sample_raw_windows(self) -> Float[Tensor, "batch given size"]:
+        return self._sample_windows(self.raw, self.sampled, self.given)
 
-    def _windows(self, corpus: Corpus, starts: Tensor, length: int) -> Tensor:
+    def _sample_windows(self, corpus: Corpus, starts: Tensor, length: int) -> Tensor:
         picked = torch.randint(len(starts), (self.settings.batch,), generator=self.generator)
         windows = corpus.features[starts[picked, None] + torch.arange(length)]
         mirrored = torch.rand(len(windows), 1, 1, generator=self.generator) < 0.5
         return torch.where(mirrored, mirror_features(windows), windows)
 
-    def _optimiser(self, model: nn.Module, rate: float) -> torch.optim.Optimizer:
+    def _make_optimiser(self, model: nn.Module, rate: float) -> torch.optim.Optimizer:
         if self.settings.optimiser == "rmsprop":
             return torch.optim.RMSprop(model.parameters(), lr=rate, alpha=0.9)
         return torch.optim.Adam(model.parameters(), lr=rate, betas=(0.5, 0.9))
 
 
-def _root_distance(before: Tensor, after: Tensor) -> Tensor:
+def _compute_root_error(before: Tensor, after: Tensor) -> Tensor:
     """Mean squared distance of the roots' ways and heights (Eq. 13), m^2; `before` may go on longer."""
     before = before[:, : after.shape[1]]
-    origin = Place(before.new_zeros(len(before), 2), before.new_zeros(len(before)))
-    ground = root_places(before, origin)[0] - root_places(after, origin)[0]
+    origin = GroundPose(before.new_zeros(len(before), 2), before.new_zeros(len(before)))
+    ground = integrate_root(before, origin)[0] - integrate_root(after, origin)[0]
     height = LAYOUT.pick(before, "root_height") - LAYOUT.pick(after, "root_height")
     return (ground.square().sum(-1) + height[..., 0].square()).mean()
 
 
-def _statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str, Tensor]:
+def _compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str, Tensor]:
     """Mean and spread of features and end effectors over captured clips, with floors that keep held joints in hand."""
     features = corpus.features
     mean, std = features.mean(0), features.std(0).clamp(min=0.002)
     bits = LAYOUT.slices["contacts"]
     mean[bits], std[bits] = 0.5, 0.5
-    starts = window_starts(corpus.lengths, window)[:: max(1, window)]
+    starts = find_window_starts(corpus.lengths, window)[:: max(1, window)]
     reach = torch.cat(
         [
-            end_effectors(features[rows[:, None] + torch.arange(window)], config.joints).flatten(0, 1)
+            compute_end_effectors(features[rows[:, None] + torch.arange(window)], config.joints).flatten(0, 1)
             for rows in starts.split(512)
         ]
     )
     return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}
 
 
-def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def _strip_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
