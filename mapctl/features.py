@@ -7,7 +7,6 @@ vectors about the canonical T-pose stand in for the paper's Euler angles, whose 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
 from hashlib import sha256
 
@@ -18,7 +17,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.errors import MapctlError
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
+from mapctl.skeleton import CANONICAL, mirror_name
 
 PRIOR_FPS = 30
 """Frames per second of every prior: steps and turns a frame mean nothing at another rate, so results are resampled."""
@@ -97,7 +96,7 @@ class GroundPose:
 
 
 def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], GroundPose]:
-    """Features of a canonical motion (float64) and the place from which `decode` leads back to it.
+    """Features of a canonical motion (float64) and the ground pose from which `pose.decode` leads back to it.
 
     The first frame has no past: it repeats the second frame's displacement, and the place returned lies that much
     before it. Raises MapctlError for other skeletons or fewer than two frames.
@@ -135,28 +134,6 @@ def integrate_root(
 def ground_speed(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch"]:
     """Speed of the root over the ground in each frame, m/s."""
     return LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * PRIOR_FPS
-
-
-def decode_local_rotations(
-    features: Float[Tensor, "*batch frames size"], heading: Float[Tensor, "*batch frames"]
-) -> Float[Tensor, "*batch frames joints 4"]:
-    """Local rotations (xyzw) of all joints; the hips' is its heading times its tilt."""
-    tilt_xz = LAYOUT.pick(features, "root_tilt")
-    tilt = torch.stack([tilt_xz[..., 0], torch.zeros_like(heading), tilt_xz[..., 1]], dim=-1)
-    vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))
-    quats = rotations.from_rotation_vector(torch.cat([tilt.unsqueeze(-2), vectors], dim=-2))
-    hips = rotations.multiply(rotations.about_y(heading), quats[..., 0, :])
-    return torch.cat([hips.unsqueeze(-2), quats[..., 1:, :]], dim=-2)
-
-
-def decode(features: Float[Tensor, "frames size"], start: GroundPose, *, skeleton: Skeleton = CANONICAL) -> Motion:
-    """The canonical motion at PRIOR_FPS that the features describe from `start`; inverse of `encode` at that rate."""
-    features = features.detach().double()
-    ground, heading = integrate_root(features, GroundPose(start.position_xz.double(), start.heading.double()))
-    height = LAYOUT.pick(features, "root_height")
-    root = torch.cat([ground[:, :1], height, ground[:, 1:]], dim=-1)
-    quats = rotations.make_sign_continuous(decode_local_rotations(features, heading))
-    return Motion(skeleton, Fraction(PRIOR_FPS), root, quats)
 
 
 def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl.inbetweening import PositionImage, ProposedPositions
-from mapctl.recording import Capture, Cleaned
+from mapctl.recording import Capture, CaptureProposal
 
 State = TypeVar("State")
 
@@ -74,7 +74,7 @@ class Inbetweener(Protocol):
 class Denoiser(Protocol):
     """Proposes the motion behind a capture."""
 
-    def clean(self, capture: Capture) -> Cleaned:
+    def clean(self, capture: Capture) -> CaptureProposal:
         """The proposal, of the capture's frames."""
         ...
 

@@ -14,7 +14,6 @@ from mapctl.terms import (
     LatentPrior,
     Likelihood,
     MotionTracking,
-    Observation,
     Path,
     RootVelocity,
     StepLength,
@@ -32,18 +31,7 @@ _IN_SPACE = curves.from_points(torch.stack([0.1 * torch.sin(_RISING), 0.1 + 0.2 
 
 _VELOCITIES = torch.stack([torch.linspace(0, 0.4, FRAMES), torch.linspace(0, 1.2, FRAMES)], -1).double()
 
-_SEEN = encode(walk(30, cadence=1.2, seed=5))[0][4 : 4 + FRAMES]
 _MASK = torch.arange(FRAMES)[:, None] % (2 + torch.arange(21)) != 1
-_OBSERVED = Observation(
-    torch.tensor([[0.1, 0.9, 0.2]]).double() + 0.04 * torch.arange(FRAMES).double()[:, None],
-    0.2 + 0.3 * torch.arange(FRAMES).double(),
-    _SEEN[:, 4:66],
-    _MASK[:, 3],
-    _MASK,
-    0.02,
-    torch.linspace(0.05, 0.2, 21),
-    outlier=1.5,
-)
 
 TERMS: dict[str, Term] = {
     "likelihood": Likelihood(temperature=2.0),
@@ -54,7 +42,6 @@ TERMS: dict[str, Term] = {
     "footing": FootContact(),
     "steps": StepLength(0.6),
     "support": Support(rest_height=0.08),
-    "observation": _OBSERVED,
     "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
     "seam": Jerk(sigma=300.0),
     "closeness": MotionTracking(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_heading=0.3),

@@ -196,17 +196,9 @@ def walking_trial(frames: int) -> Trial:
     motion = walk(frames + 2)
     vectors, start = encode(motion)
     ground, heading = integrate_root(vectors[:2], start)
-    nothing = torch.zeros(1, frames, 1).double()
     bits = torch.zeros(1, frames, 2, dtype=torch.bool)
-    return Trial(
-        vectors[None, 2:],
-        GroundPose(ground[-1], heading[-1]),
-        nothing,
-        nothing[..., 0],
-        bits,
-        motion.joint_positions()[:2],
-        contacts_before=bits[0, 0],
-    )
+    place = GroundPose(ground[-1], heading[-1])
+    return Trial(vectors[None, 2:], place, contacts=bits, before=motion.joint_positions()[:2])
 
 
 def noise(batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Float[Tensor, "b f c"]:

@@ -17,11 +17,12 @@ from mapctl.features import LAYOUT, PRIOR_FPS, ground_speed
 from mapctl.metrics import measure
 from mapctl.metrics.states import summarise_states
 from mapctl.problem.context import WindowContext
+from mapctl.problem.feature_states import FeatureStateSolver
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.problem.warm_start import BestOfSamples, SwarmProposal
-from mapctl.problem.window_solvers import FeatureStateSolver, LatentNoiseSolver
+from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.terms import LatentPrior, Likelihood

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves import Curve
-from mapctl.features import LAYOUT, GroundPose, decode, ground_speed, integrate_root
+from mapctl.features import LAYOUT, GroundPose, ground_speed, integrate_root
 from mapctl.numerics import gaussian
+from mapctl.pose import decode
 from mapctl.problem.context import WindowContext
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
@@ -63,7 +64,8 @@ def select_initial_state(
     with torch.no_grad():
         features, _ = prior.rollout(state, noise, prior.plan(state, noise))
     places = GroundPose(_first_point(curve).expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs))
-    context = WindowContext(prior, state, places, torch.zeros(0, skeleton.num_joints, 3), ahead, skeleton, fps)
+    before, planted = torch.zeros(0, skeleton.num_joints, 3), LAYOUT.pick(state.previous, "contacts") > 0.5
+    context = WindowContext(prior, state, places, before, ahead, skeleton, fps, planted, first_frame=1)
     flat = noise[:, :ahead].flatten(1)
     with torch.no_grad():
         energy = Objective(LatentNoise.from_unknowns(context, flat).build, terms_of(1, ahead)).energy(flat) / ahead
@@ -103,7 +105,7 @@ def start_from_state(state: Any, place: GroundPose, skeleton: Skeleton) -> Motio
         LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
     )
     joints = decode(first, before, skeleton=skeleton).joint_positions().to(first.dtype)
-    return MotionStart(CommittedFrames(state, place, first, joints, first.new_zeros(0, LAYOUT.continuous)), before)
+    return MotionStart(CommittedFrames(state, place, first, joints), before)
 
 
 def _first_point(curve: Curve) -> Float[Tensor, "2"]:

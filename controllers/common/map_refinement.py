@@ -15,21 +15,23 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.contacts import debounced
-from mapctl.features import GroundPose, decode, integrate_root
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import last_observed, next_observed
+from mapctl.pose import BodyPose, decode
 from mapctl.problem import density_selection
-from mapctl.problem.density_selection import DensityChoice, DensityInterval
+from mapctl.problem.density_selection import DensityEnsemble, DensityInterval
 from mapctl.problem.ledger import Ledger
-from mapctl.problem.objective import Objective
-from mapctl.problem.pose_offsets import Guide, PoseOffsets
+from mapctl.problem.pose_offsets import PoseOffsetSolver
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
+from mapctl.problem.solution import Outcome, WindowRecord
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
-from mapctl.solver.budget import Budget, Meter
-from mapctl.solver.lbfgs import LbfgsSettings, minimise
-from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Likelihood, Term
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
 from mapctl.terms.foot_contact import TOES
 
 _DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the travel of planted toes is averaged
@@ -104,106 +106,72 @@ def refine(
 
     In each window that density counts under which the proposal is likeliest, and less where it is out of its depth.
     """
-    guide = guide_of(proposal, debounced(contacts > 0))
+    stands = debounced(contacts > 0)
+    pose = BodyPose.of_motion(proposal)
+    start = _extrapolate_backward(pose)
     sigma = _compute_proposal_sigma(capture, settings)
-    footing = replace(settings.footing, rest_height=estimate_rest_height(proposal, guide.contacts))
+    ensemble = DensityEnsemble([one.with_observation_noise(density_selection.proposal_sigma()) for one in densities])
+    solver = RecedingHorizonSolver(
+        ensemble,
+        HorizonSettings(settings.frames, settings.ahead, settings.past, beyond_end=False),
+        proposal.skeleton,
+        method=PoseOffsetSolver(
+            pose, stands, sigma, settings.smooth, settings.temperature, settings.lbfgs, settings.budget
+        ),
+    )
+    # The densities' states are those that make the first window's proposal likely.
+    first = slice(0, min(settings.frames, proposal.num_frames))
+    states = ensemble.infer_state(pose.slice(0, first.stop).features(start, stands[first]))
+    before = torch.zeros(0, proposal.num_joints, 3)
+    done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before)
+    terms_of = _lay_terms(settings, estimate_rest_height(proposal, stands), capture, targets)
+    done, outcome = solver.solve(done, terms_of, proposal.num_frames, generator=torch.Generator())
+    if outcome is Outcome.INTERRUPTED:
+        raise KeyboardInterrupt
+    motion = decode(done.features, start, skeleton=proposal.skeleton)
+    evaluations = sum(window.evaluations for window in done.windows)
+    return RefinedMotion(motion, stands, done.ledger, evaluations, _list_density_intervals(done.windows))
+
+
+def _lay_terms(
+    settings: RefinementSettings, rest_height: float, capture: Capture, targets: EffectorTargets | None
+) -> TermsOf:
+    """Terms by window."""
+    footing = replace(settings.footing, rest_height=rest_height)
     clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
-    judges = [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
-    place = _extrapolate_backward(guide)
-    done = _WindowStart(place, torch.zeros(0, proposal.num_joints, 3), torch.zeros(2, dtype=torch.bool), ())
-    frames, pieces, spent, ledger, first = proposal.num_frames, [], 0, Ledger(), 0
-    stretches: list[DensityInterval] = []
-    while first < frames:
-        stop = min(frames, first + settings.frames)
-        count = stop - first if stop == frames else settings.frames - settings.ahead
-        poses = PoseOffsets(
-            guide.slice(first, stop),
-            sigma[first:stop],
-            done.place,
-            done.before,
-            done.contacts,
-            proposal.skeleton,
-            smooth=settings.smooth,
-        )
+
+    def terms_of(first: int, frames: int) -> list[Term]:
+        part = slice(first, first + frames)
         terms: list[Term] = [LatentPrior(1.0), footing]
-        if judges:
-            poses, done, choice = _select_density(poses, done, judges)
-            terms.append(Likelihood(settings.temperature / choice.weight))
-            stretches.append(DensityInterval(first, first + count, choice.density.name, choice.nats, choice.weight))
         if settings.clearance is not None:
-            terms.append(replace(settings.clearance, rest_height=footing.rest_height, share=clearing[first:stop]))
+            terms.append(replace(settings.clearance, rest_height=rest_height, share=clearing[part]))
         if settings.jerk is not None:
             terms.append(settings.jerk)
         if targets is not None:
-            terms.append(Keyframe(targets.places[first:stop], targets.wanted[first:stop]))
-        features, used, entries, done = _refine_window(poses, terms, count, settings, done, judges)
-        pieces.append(features)
-        spent, first, ledger = spent + used, first + count, ledger.join(entries)
-    motion = decode(torch.cat(pieces), place, skeleton=proposal.skeleton)
-    return RefinedMotion(motion, guide.contacts, ledger, spent, tuple(stretches))
+            terms.append(Keyframe(targets.places[part], targets.wanted[part]))
+        return terms
+
+    return terms_of
 
 
-@dataclass(frozen=True, eq=False)
-class _WindowStart:
-    """What a window goes on from."""
-
-    place: GroundPose
-    before: Tensor
-    contacts: Tensor
-    states: Sequence[Any]
-
-
-def _refine_window(
-    poses: PoseOffsets,
-    terms: Sequence[Term],
-    count: int,
-    settings: RefinementSettings,
-    before: _WindowStart,
-    judges: Sequence[Any],
-) -> tuple[Tensor, int, Ledger, _WindowStart]:
-    """The first `count` frames of one window; one without a finite solution is left as it was proposed."""
-    objective, meter = Objective(poses.build, terms), Meter(settings.budget)
-    start = torch.zeros(1, poses.sigma.numel())
-    found = minimise(objective.energy_and_gradient, start, settings=settings.lbfgs, meter=meter)
-    with torch.no_grad():
-        trial = poses.build(found.x if bool(torch.isfinite(found.energy).all()) else start)
-        features = trial.features[:, :count]
-        ground, heading = integrate_root(features[0], poses.place)
-        joints = torch.cat([poses.before, trial.joints_world[0, :count]])[-settings.past :]
-        states = [judge.advance(state, features) for judge, state in zip(judges, before.states, strict=True)]
-    done = _WindowStart(GroundPose(ground[-1], heading[-1]), joints, poses.guide.contacts[count - 1], states)
-    return features[0], meter.evaluations, objective.build_ledger(trial).slice(count), done
+def _list_density_intervals(windows: Sequence[WindowRecord]) -> tuple[DensityInterval, ...]:
+    """Which density was used where, if there were any."""
+    found, first = [], 0
+    for window in windows:
+        if (choice := window.choice) is not None:
+            stop = first + window.frames
+            found.append(DensityInterval(first, stop, choice.density.name, choice.nats, choice.weight))
+        first += window.frames
+    return tuple(found)
 
 
-def _select_density(
-    poses: PoseOffsets, done: _WindowStart, judges: Sequence[Any]
-) -> tuple[PoseOffsets, _WindowStart, DensityChoice]:
-    """The window scored by the density under which its guide is likeliest; the first window's states are looked for."""
-    with torch.no_grad():
-        features = poses.build(torch.zeros(1, poses.sigma.numel())).features[0]
-    if not done.states:
-        done = replace(done, states=[judge.infer_state(features) for judge in judges])
-    choice = density_selection.select_density(judges, features, done.states)
-    state = done.states[judges.index(choice.density)]
-    return replace(poses, density=choice.density, state=state), done, choice
-
-
-def _extrapolate_backward(guide: Guide) -> GroundPose:
-    """The place from which the first frame's step and turn are as the second's: nobody begins by standing still."""
-    place = GroundPose(guide.root[0, ::2], guide.heading[0])
-    if len(guide.root) == 1:
-        return place
-    turn = guide.heading[1] - guide.heading[0]
-    step = rotations.rotate_ground(guide.root[1, ::2] - guide.root[0, ::2], -guide.heading[0])
-    return place.before(step, turn)
-
-
-def guide_of(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Guide:
-    """A canonical motion as a guide, single precision."""
-    heading, tilt = rotations.split_heading(motion.local_quat_xyzw[:, 0])
-    joints = rotations.to_rotation_vector(motion.local_quat_xyzw[:, 1:]).flatten(1)
-    angles = torch.cat([rotations.to_rotation_vector(tilt)[:, ::2], joints], dim=-1)
-    return Guide(motion.root_position.float(), rotations.unwrap_angle(heading).float(), angles.float(), contacts)
+def _extrapolate_backward(pose: BodyPose) -> GroundPose:
+    """The ground pose from which the first frame's step and turn are the second's: nobody begins by standing still."""
+    ground, heading = pose.root_position[:, ::2], pose.heading
+    here = GroundPose(ground[0], heading[0])
+    if len(heading) == 1:
+        return here
+    return here.before(rotations.rotate_ground(ground[1] - ground[0], -heading[0]), heading[1] - heading[0])
 
 
 def anchor_to_contacts(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Motion:
@@ -233,7 +201,7 @@ def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> 
 
 
 def _compute_proposal_sigma(capture: Capture, settings: RefinementSettings) -> Float[Tensor, "frames width"]:
-    """Sigma of root, heading and angles by frame (see `Guide.packed`)."""
+    """Sigma of root, heading and angles by frame (see `BodyPose.pack`)."""
     unseen = math.radians(settings.unobserved_sigma_deg) * _ramp_from_observed(
         capture.seen[0], settings.uncertainty_ramp
     )

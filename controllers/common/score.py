@@ -13,6 +13,7 @@ from mapctl.motion import Motion
 from mapctl.problem import density_selection
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
+from mapctl.problem.receding_horizon import replay
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Clearance, Jerk, Likelihood, Support, Term
@@ -36,9 +37,9 @@ def score(
     place = GroundPose(ground[_PRECEDING_FRAMES - 1].float(), heading[_PRECEDING_FRAMES - 1].float())
     shown = features[None, _PRECEDING_FRAMES:]
     judge = density.with_observation_noise(density_selection.proposal_sigma())
-    state = judge.advance(judge.infer_state(features), features[None, :_PRECEDING_FRAMES])
+    state = replay(judge, features[:_PRECEDING_FRAMES], judge.infer_state(features))
     with torch.no_grad():
-        nats = judge.log_prob(shown, state)
+        log_density = judge.log_prob(shown, state)
     height = estimate_rest_height(canonical, bits)
     terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, rest_height=height)]
     terms.append(replace(settings.clearance or Clearance(), rest_height=height))
@@ -48,12 +49,11 @@ def score(
     trial = Trial(
         shown,
         place,
-        torch.zeros_like(shown),
-        nats,
-        contacts[None, _PRECEDING_FRAMES:],
-        canonical.joint_positions()[:_PRECEDING_FRAMES].float(),
-        canonical.skeleton,
-        PRIOR_FPS,
-        contacts[_PRECEDING_FRAMES - 1],
+        contacts=contacts[None, _PRECEDING_FRAMES:],
+        log_density=log_density,
+        before=canonical.joint_positions()[:_PRECEDING_FRAMES].float(),
+        contacts_before=contacts[_PRECEDING_FRAMES - 1],
+        skeleton=canonical.skeleton,
+        first_frame=_PRECEDING_FRAMES,
     )
     return Objective(lambda unknowns: trial, terms).build_ledger(trial)

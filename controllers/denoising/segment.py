@@ -191,9 +191,9 @@ class SegmentDenoiser:
         scale = leg_length(CANONICAL) / leg_length(self.rigmap.skeleton)
         asked = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
         cleaned = self.denoiser.clean(asked)
-        quats = rotations.make_sign_continuous(cleaned.local_quat_xyzw[0].double())
-        motion = Motion(self.rigmap.skeleton, self.shown.fps, cleaned.root[0].double() / scale, quats)
-        return motion, cleaned.contacts[0]
+        quats = rotations.make_sign_continuous(cleaned.pose.local_quat_xyzw[0].double())
+        motion = Motion(self.rigmap.skeleton, self.shown.fps, cleaned.pose.root_position[0].double() / scale, quats)
+        return motion, cleaned.contact_logits[0]
 
     def _redetect_spikes(self, proposal: Motion) -> Capture:
         """Spikes told anew by what is left beside the proposal: fast motion that passed for one is seen again."""

@@ -13,9 +13,10 @@ from controllers.common.character import Character
 from controllers.common.feasibility import check_path, check_tracking
 from controllers.common.initial_state import select_initial_state
 from mapctl.curves import Curve
-from mapctl.features import PRIOR_FPS, decode
+from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import PathRequest, SpeedProfile
 from mapctl.motion import Motion
+from mapctl.pose import decode
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
 from mapctl.problem.solution import Solution, Status
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver

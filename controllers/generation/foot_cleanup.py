@@ -16,7 +16,6 @@ from controllers.common.character import Character
 from mapctl.contacts import MIN_CONTACT_FRAMES, debounced
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.window_solvers import GuidedNoiseSolver
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -64,7 +63,7 @@ def clean_up_feet(
     """
     settings = settings or FootCleanupSettings()
     still = torch.zeros(0, skeleton.num_joints, 3)
-    done = CommittedFrames(state, GroundPose.origin(), state.previous.float(), still, torch.zeros(0, LAYOUT.continuous))
+    done = CommittedFrames(state, GroundPose.origin(), state.previous.float(), still)
     waiting, left = torch.zeros(0, LAYOUT.size), frames
     for piece in pieces:
         waiting = torch.cat([waiting, piece.float()])
@@ -106,13 +105,9 @@ def _clean_up_window(
 def _discard_history(done: CommittedFrames) -> CommittedFrames:
     """Without all that no later window looks at, and moved to the origin, where single precision is finest."""
     here = done.place.position_xz
-    joints = done.joints_world - torch.stack([here[0], here.new_zeros(()), here[1]])
     return replace(
-        done,
-        features=done.features[-MIN_CONTACT_FRAMES:],
-        ledger=Ledger(),
-        windows=(),
-        joints_world=joints,
+        done.discard_history(MIN_CONTACT_FRAMES),
+        joints_world=done.joints_world - torch.stack([here[0], here.new_zeros(()), here[1]]),
         place=GroundPose(torch.zeros_like(here), done.place.heading),
     )
 

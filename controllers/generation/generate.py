@@ -16,8 +16,10 @@ from controllers.common.character import Character
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.features import PRIOR_FPS, GroundPose, decode, encode, integrate_root
+from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.motion import Motion
+from mapctl.pose import decode
+from mapctl.problem.receding_horizon import replay
 from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
@@ -124,7 +126,7 @@ def initialise_generation(
         features, place = encode(canonical.resample(PRIOR_FPS))
         ground, heading = integrate_root(features, place)
         seen = features.float()
-        state = prior.advance(prior.initial_state(seen[:1]), seen[1:].unsqueeze(0))
+        state = replay(prior, seen[1:], prior.initial_state(seen[:1]))
         return prior, state, GroundPose(ground[-1], heading[-1])
     count = len(prior.starts.speed)
     if settings.start is not None and not 0 <= settings.start < count:

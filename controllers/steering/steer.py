@@ -18,9 +18,10 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, decode, ground_speed
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
 from mapctl.motion import Motion
+from mapctl.pose import decode
 from mapctl.problem.context import WindowContext
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
@@ -213,7 +214,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         note,
     )
     owed = torch.cat([state.past_targets, torch.tensor([wish.velocity for wish in own])])[-_PAST_TARGET_FRAMES:]
-    kept = replace(done, features=new, ledger=Ledger(), windows=())
+    kept = done.discard_history(len(new))
     following = replace(state, committed=kept, wish=own[-1], past_targets=owed, frames=state.frames + len(new))
     return following, frames
 
@@ -278,13 +279,13 @@ class _RelaxedFootingFirst:
         self,
         context: WindowContext,
         terms: Sequence[Term],
-        tail: Tensor,
+        warm_start: Tensor,
         generator: torch.Generator,
         *,
         seconds: float = math.inf,
     ) -> SolvedWindow:
-        first = self.relaxed_method(context, self.relaxed_terms, tail, generator, seconds=seconds / 2)
-        second = self.half(context, terms, first.carry, generator, seconds=seconds / 2)
+        first = self.relaxed_method(context, self.relaxed_terms, warm_start, generator, seconds=seconds / 2)
+        second = self.half(context, terms, first.warm_start, generator, seconds=seconds / 2)
         return replace(second, evaluations=first.evaluations + second.evaluations)
 
 

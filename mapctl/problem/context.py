@@ -1,12 +1,15 @@
-"""What is known before a window."""
+"""What is known before a window: what a parametrisation of its frames builds trials from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
+from mapctl.errors import MapctlError
+from mapctl.features import PRIOR_FPS, GroundPose
+from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.trial import Trial
@@ -14,29 +17,56 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class WindowContext:
-    """What is known before the window."""
+    """Everything before a window that its frames depend on."""
 
-    density: Density
-    """The prior."""
+    density: Density | DensityEnsemble
+    """The prior, or several."""
     state: Any
-    """Its state after the committed frames; batch of one, or one for each candidate."""
+    """The prior's state after the committed frames: batch of one, or one row for each candidate."""
     place: GroundPose
-    """Of the last committed frame."""
+    """Ground pose of the last committed frame."""
     before: Float[Tensor, "past joints 3"]
     """World joint positions of the last committed frames, metres."""
     frames: int
-    """Of the window."""
+    """Number of frames in the window."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
     fps: float = PRIOR_FPS
     """Frames per second."""
+    contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
+    """Left and right toe planted in the last committed frame; unbatched or one row for each candidate."""
+    first_frame: int = 0
+    """Frame of the whole motion that the window begins at, counted from 0."""
 
-    def trial(self, features: Tensor, noise: Tensor, density: Tensor, contacts: Tensor) -> Trial:
-        """A trial in this context."""
-        planted = LAYOUT.pick(self.state.previous, "contacts") > 0.5
-        return Trial(features, self.place, noise, density, contacts, self.before, self.skeleton, self.fps, planted)
+    @property
+    def prior(self) -> Density:
+        """The one density; MapctlError where there are several or none."""
+        if isinstance(self.density, DensityEnsemble):
+            raise MapctlError("a rollout needs one density")
+        return self.density
 
+    def expand_state(self, batch: int) -> Any:
+        """The state for a batch of candidates."""
+        return self.state if self.state.batch == batch else self.state.repeat(batch)
 
-def _expand_state(state: Any, batch: int) -> Any:
-    """The state for a batch of candidates."""
-    return state if state.batch == batch else state.repeat(batch)
+    def build_trial(
+        self,
+        features: Float[Tensor, "batch frames size"],
+        contacts: Bool[Tensor, "batch frames 2"],
+        *,
+        noise: Tensor | None,
+        log_density: Tensor | None,
+    ) -> Trial:
+        """The trial of candidate features in this context."""
+        return Trial(
+            features,
+            self.place,
+            contacts=contacts,
+            noise=noise,
+            log_density=log_density,
+            before=self.before,
+            contacts_before=self.contacts_before,
+            skeleton=self.skeleton,
+            fps=self.fps,
+            first_frame=self.first_frame,
+        )

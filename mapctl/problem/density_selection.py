@@ -58,6 +58,28 @@ class DensityInterval:
     """Share that its log density counted with; below 1 it was out of its depth."""
 
 
+@dataclass(frozen=True, eq=False)
+class DensityEnsemble:
+    """Densities of which every window uses the likeliest; their states are a tuple, one for each, and none may be
+    given."""
+
+    densities: Sequence[Any]
+    """The densities, their log densities comparable (see `select_density`)."""
+
+    def infer_state(self, features: Float[Tensor, "frames size"]) -> tuple[Any, ...]:
+        """Each density's state before a motion's first frames."""
+        return tuple(density.infer_state(features) for density in self.densities)
+
+    def advance(self, state: Sequence[Any], committed: Float[Tensor, "batch frames size"]) -> tuple[Any, ...]:
+        """Each density's state after the committed frames."""
+        return tuple(one.advance(before, committed) for one, before in zip(self.densities, state, strict=True))
+
+    def select(self, features: Float[Tensor, "frames size"], state: Sequence[Any]) -> tuple["DensityChoice", Any]:
+        """The density under which the frames are likeliest, and its state."""
+        choice = select_density(self.densities, features, state)
+        return choice, state[list(self.densities).index(choice.density)]
+
+
 def select_density(
     densities: Sequence[Any], features: Float[Tensor, "frames size"], states: Sequence[Any]
 ) -> DensityChoice:

@@ -1,10 +1,4 @@
-"""The two kinds of unknowns of a window. Only here are unknowns scaled; everything else is physical.
-
-`LatentNoise`: the noise of a rollout, x = mu_k + sigma_k d, with components and contact bits fixed by a plan.
-`FeatureStates`: the features themselves in normalised units, scored with teacher forcing (Eq. 14-15), and the noise on
-the network's input (Eq. 16). Section 11 of the design found the first to converge several times faster; the ablation
-reruns the comparison.
-"""
+"""Unknowns that are the noise of a rollout: x = mu_k + sigma_k d, with components and contact bits fixed by a plan."""
 
 from dataclasses import dataclass
 
@@ -12,17 +6,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.context import WindowContext, _expand_state
+from mapctl.problem.context import WindowContext
 from mapctl.protocols import DiscreteChoices
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
 class LatentNoise:
-    """Unknowns are the numbers d of a rollout, one batch row a candidate."""
+    """Unknowns are the standard normal numbers d of a rollout, one batch row a candidate."""
 
     context: WindowContext
-    """Before the window."""
+    """What is known before the window."""
     plan: DiscreteChoices
     """Components and contact bits of each frame."""
 
@@ -30,7 +24,18 @@ class LatentNoise:
     def from_unknowns(context: WindowContext, unknowns: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """With the likeliest plan along the rollout of the given unknowns."""
         noise = unknowns.detach().unflatten(-1, (context.frames, LAYOUT.continuous))
-        return LatentNoise(context, context.density.plan(_expand_state(context.state, len(noise)), noise))
+        return LatentNoise(context, context.prior.plan(context.expand_state(len(noise)), noise))
+
+    @staticmethod
+    def extend(warm_start: Float[Tensor, "ahead width"], frames: int) -> Float[Tensor, "1 unknowns"]:
+        """The last window's noise, and zero noise (the prior's own continuation) beyond it."""
+        noise = warm_start.new_zeros(frames, LAYOUT.continuous)
+        noise[: len(warm_start)] = warm_start[:frames]
+        return noise.flatten().unsqueeze(0)
+
+    def initial(self, warm_start: Float[Tensor, "ahead width"]) -> Float[Tensor, "1 unknowns"]:
+        """See `extend`."""
+        return LatentNoise.extend(warm_start, self.context.frames)
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
         """Roll the density out."""
@@ -38,5 +43,9 @@ class LatentNoise:
         noise = unknowns.unflatten(-1, (context.frames, LAYOUT.continuous))
         batch = len(noise)
         plan = DiscreteChoices(self.plan.component.expand(batch, -1), self.plan.contacts.expand(batch, -1, -1))
-        features, density = context.density.rollout(_expand_state(context.state, batch), noise, plan)
-        return context.trial(features, noise, density, plan.contacts)
+        features, log_density = context.prior.rollout(context.expand_state(batch), noise, plan)
+        return context.build_trial(features, plan.contacts, noise=noise, log_density=log_density)
+
+    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
+        """The noise by frame."""
+        return unknowns[0].unflatten(-1, (self.context.frames, LAYOUT.continuous))

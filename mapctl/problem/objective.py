@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.problem.ledger import Ledger, LedgerEntry
+from mapctl.solver.gradient import differentiate
 from mapctl.terms.base import Term
 from mapctl.terms.trial import Trial
 
@@ -42,12 +43,10 @@ class Objective:
 
         RequestError that names the term where one is not finite though the motion is: then the term is at fault.
         """
-        unknowns = unknowns.detach().requires_grad_(True)
-        energy = self.energy(unknowns)
-        (gradient,) = torch.autograd.grad(energy.sum(), unknowns)
-        if not bool(torch.isfinite(energy.detach().sum() + gradient.sum())):
-            self._raise_for_bad_term(unknowns)
-        return energy.detach(), gradient
+        energy, gradient = differentiate(self.energy)(unknowns)
+        if not bool(torch.isfinite(energy.sum() + gradient.sum())):
+            self._raise_for_bad_term(unknowns.detach().requires_grad_(True))
+        return energy, gradient
 
     def _raise_for_bad_term(self, unknowns: Tensor) -> None:
         """Find the term that is not finite, one after the other; says nothing where the motion is none either."""
@@ -94,7 +93,8 @@ def _build_entry(term: Term, trial: Trial) -> LedgerEntry:
 
 
 def _is_plausible(trial: Trial) -> bool:
-    return all(bool((values.detach().abs() < _PLAUSIBLE_LIMIT).all()) for values in (trial.features, trial.noise))
+    made = [trial.features] if trial.noise is None else [trial.features, trial.noise]
+    return all(bool((values.detach().abs() < _PLAUSIBLE_LIMIT).all()) for values in made)
 
 
 def _check_finite(term: Term, what: str, values: Tensor) -> None:

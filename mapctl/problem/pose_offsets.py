@@ -1,98 +1,114 @@
-"""Unknowns about a given motion: how far each frame's pose and place are from it, in sigmas, smooth in time.
+"""Unknowns about a proposed motion: how far each frame's pose and place are from it, in sigmas, smooth in time.
 
-x = guide + sigma * (K z): the posterior of a model that proposes whole motions, as a rollout's x = mu + sigma d is that
-of a density. K smooths white z to unit variance, so that a correction of one frame moves its neighbours along. Places
-are in the world, not steps from frame to frame: terms that hold the motion where it was seen are then well conditioned.
+x = proposal + sigma * (K z): the posterior of a model that proposes whole motions, as a rollout's x = mu + sigma d is
+that of a density, so that the standard normal prior of z is the observation term of denoising (Wang et al. 2019, Eq.
+25) in coordinates that converge. K smooths white z to unit variance, so that a correction of one frame moves its
+neighbours along. Positions are in the world, not steps from frame to frame: terms that hold the motion where it was
+observed are then well conditioned.
 """
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.numerics import gaussian
-from mapctl.skeleton import Skeleton
+from mapctl.pose import BodyPose
+from mapctl.problem.context import WindowContext
+from mapctl.problem.density_selection import DensityEnsemble
+from mapctl.problem.window_solvers import SolvedWindow, minimise_window
+from mapctl.solver.budget import Budget, Meter
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.terms.base import Term
+from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
-class Guide:
-    """A motion in the world: what the unknowns are about."""
-
-    root: Float[Tensor, "frames 3"]
-    """Of the hips, metres."""
-    heading: Float[Tensor, " frames"]
-    """Radians, not wrapped."""
-    angles: Float[Tensor, "frames angles"]
-    """The hips' tilt (2) and the rotation vectors of all other joints, radians."""
-    contacts: Bool[Tensor, "frames 2"]
-    """Left and right toe planted."""
-
-    def slice(self, start: int, stop: int) -> "Guide":
-        """Frames start to stop."""
-        part = slice(start, stop)
-        return Guide(self.root[part], self.heading[part], self.angles[part], self.contacts[part])
-
-    def packed(self) -> Float[Tensor, "frames width"]:
-        """Root, heading and angles side by side."""
-        return torch.cat([self.root, self.heading[:, None], self.angles], dim=-1)
-
-
-@dataclass(frozen=True, eq=False)
 class PoseOffsets:
-    """Builds trials from unknowns about a guide."""
+    """Unknowns are offsets about a proposal's root, heading and angles, one batch row a candidate."""
 
-    guide: Guide
-    """Of the window."""
+    context: WindowContext
+    """What is known before the window; its density, if it is one, scores the motion with teacher forcing (Eq. 15)."""
+    proposal: BodyPose
+    """The window's frames, unbatched."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted in them."""
     sigma: Float[Tensor, "frames width"]
-    """Of root, heading and angles (see `Guide.packed`): metres and radians."""
-    place: GroundPose
-    """Of the frame before the window."""
-    before: Float[Tensor, "past joints 3"]
-    """World joint positions of the last frames before it, metres."""
-    contacts_before: Bool[Tensor, "2"]
-    """Of the frame before it."""
-    skeleton: Skeleton
-    """Bones of the performer."""
+    """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
     smooth: float = 2.0
     """Sigma of the smoothing, frames."""
-    density: Any = None
-    """A density that scores the motion with teacher forcing (Eq. 15), or None."""
-    state: Any = None
-    """Its state before the window."""
 
     @cached_property
     def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
         weight = gaussian.pairwise_weights(len(self.sigma), self.smooth, self.sigma.dtype)
         return weight / weight.square().sum(dim=-1, keepdim=True).sqrt()
 
-    def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
-        """The guide, changed."""
-        white = unknowns.unflatten(-1, tuple(self.sigma.shape))
-        packed = self.guide.packed() + self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
-        features = self._encode_features(packed)
-        density = features.new_zeros(features.shape[:2])
-        if self.density is not None:
-            density = self.density.log_prob(features, self.state)
-        bits = self.guide.contacts.expand(len(white), -1, -1)
-        return Trial(
-            features, self.place, white, density, bits, self.before, self.skeleton, PRIOR_FPS, self.contacts_before
-        )
+    def initial(self, warm_start: Float[Tensor, "ahead width"]) -> Float[Tensor, "1 unknowns"]:
+        """The proposal itself, whatever the last window found: that has moved what these offsets are smoothed with."""
+        return torch.zeros(1, self.sigma.numel())
 
-    def _encode_features(self, packed: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames size"]:
-        """Steps and turns from places and headings."""
-        batch = len(packed)
-        ground, heading = packed[..., [0, 2]], packed[..., 3]
-        ground = torch.cat([self.place.position_xz.expand(batch, 1, 2), ground], dim=1)
-        heading = torch.cat([self.place.heading.expand(batch, 1), heading], dim=1)
-        step = rotations.rotate_ground(torch.diff(ground, dim=1), -heading[:, :-1])
-        turn = torch.diff(heading, dim=1)[..., None]
-        bits = self.guide.contacts.expand(batch, -1, -1).to(packed)
-        features = torch.cat([step, turn, packed[..., 1:2], packed[..., 4:], bits], dim=-1)
-        assert features.shape[-1] == LAYOUT.size
-        return features
+    def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
+        """The proposal, changed."""
+        white = unknowns.unflatten(-1, tuple(self.sigma.shape))
+        offset = self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
+        pose = BodyPose.unpack(self.proposal.pack() + offset)
+        features = pose.features(self.context.place, self.contacts)
+        log_density = None
+        if not isinstance(self.context.density, DensityEnsemble):
+            log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
+        contacts = self.contacts.expand(len(white), -1, -1)
+        return self.context.build_trial(features, contacts, noise=white, log_density=log_density)
+
+    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
+        """The offsets by frame, in sigmas."""
+        return unknowns[0].unflatten(-1, tuple(self.sigma.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOffsetSolver:
+    """L-BFGS over the offsets of a proposed motion, window by window.
+
+    Of the densities that the context holds, the one under which a window's proposal is likeliest scores it, and counts
+    less where the proposal is out of its depth.
+    """
+
+    proposal: BodyPose
+    """The whole motion, unbatched."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted in it."""
+    sigma: Float[Tensor, "frames width"]
+    """Standard deviations of root, heading and angles by frame (see `BodyPose.pack`): metres and radians."""
+    smooth: float = 2.0
+    """Sigma of the smoothing, frames."""
+    temperature: float = 1.0
+    """Temperature of a density's likelihood."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
+    """L-BFGS of one window."""
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=20))
+    """Budget of one window."""
+
+    def __call__(
+        self,
+        context: WindowContext,
+        terms: Sequence[Term],
+        warm_start: Tensor,
+        generator: torch.Generator,
+        *,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:
+        """Solve one window; it stays as it was proposed where nothing finite was found."""
+        first, stop = context.first_frame, context.first_frame + context.frames
+        proposal, contacts = self.proposal.slice(first, stop), self.contacts[first:stop]
+        choice = None
+        if isinstance(context.density, DensityEnsemble) and context.density.densities:
+            choice, state = context.density.select(proposal.features(context.place, contacts), context.state)
+            context = replace(context, density=choice.density, state=state)
+            terms = (*terms, Likelihood(self.temperature / choice.weight))
+        offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop], smooth=self.smooth)
+        meter = Meter(self.budget.within(seconds))
+        return replace(minimise_window(offsets, terms, offsets.initial(warm_start), self.lbfgs, meter), choice=choice)

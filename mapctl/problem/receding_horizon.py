@@ -1,24 +1,25 @@
-"""Sliding windows: solve one, commit its first frames, advance the prior, go on (rnn paper, section 5.2).
-
-The only place that advances a prior's state during a solve.
+"""The receding horizon: solve a window, commit its first frames, advance the prior, go on (Wang et al. 2019, section
+5.2). Following, steering, foot clean-up, denoising and in-betweening all solve their windows here, and nothing else
+advances a prior's state during a solve.
 """
 
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import PRIOR_FPS, GroundPose, integrate_root
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.problem.context import WindowContext
+from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, WindowRecord
-from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
+from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term
@@ -37,10 +38,20 @@ class HorizonSettings:
     """Frames of it that the next window solves again."""
     past: int = 40
     """Committed frames that terms may look back on."""
+    beyond_end: bool = True
+    """Whether windows look their full length ahead, so that the last frames are solved with a future too; if not, they
+    end with the motion, as where it is known from the beginning."""
 
     def __post_init__(self):
         if not 0 <= self.overlap < self.frames or self.past < 1:
             raise RequestError(f"windows need frames > overlap >= 0 and past >= 1, got {self}")
+
+    def lay_window(self, done: int, frames: int) -> tuple[int, int]:
+        """Length of the window after `done` of `frames` frames, and how many of its frames are committed."""
+        left = frames - done
+        if self.beyond_end:
+            return self.frames, min(self.frames - self.overlap, left)
+        return min(self.frames, left), left if left <= self.frames else self.frames - self.overlap
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +61,35 @@ class CommittedFrames:
     state: Any
     """The density's state after it, batch of one."""
     place: GroundPose
-    """Of its last frame."""
+    """Ground pose of its last frame."""
     features: Float[Tensor, "frames size"]
-    """Of every committed frame, the first being the start."""
+    """Features of every committed frame; the first may be a start that was not solved."""
     joints_world: Float[Tensor, "past joints 3"]
     """World joint positions of its last frames, metres."""
-    warm_start: Float[Tensor, "ahead width"]
-    """What the last window found for the frames beyond: where the next one starts (see the method's `carry`)."""
+    warm_start: Float[Tensor, "ahead width"] = field(default_factory=lambda: torch.zeros(0, LAYOUT.continuous))
+    """What the last window found for the frames beyond: where the next one starts (see `Parametrisation`)."""
     ledger: Ledger = field(default_factory=Ledger)
-    """Of the solved frames."""
+    """Energy and residual of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
     """Cost of each window."""
     forecast: Float[Tensor, "ahead joints 3"] | None = None
     """World joint positions of the frames that the last window found beyond, metres."""
+    discarded: int = 0
+    """Frames of the motion before the first of `features`, which nothing looks back on any more."""
+
+    def discard_history(self, keep: int) -> "CommittedFrames":
+        """With the features of the last frames only, and neither ledger nor records."""
+        gone = max(0, len(self.features) - keep)
+        return replace(
+            self, features=self.features[gone:], ledger=Ledger(), windows=(), discarded=self.discarded + gone
+        )
+
+    @property
+    def contacts(self) -> Bool[Tensor, "2"]:
+        """Left and right toe planted in the last frame; neither before the first."""
+        if not len(self.features):
+            return torch.zeros(2, dtype=torch.bool)
+        return LAYOUT.pick(self.features[-1], "contacts") > 0.5
 
     def finite(self, count: int) -> bool:
         """Whether the last `count` frames and their energies are numbers."""
@@ -74,8 +101,8 @@ class CommittedFrames:
 class RecedingHorizonSolver:
     """What stays the same from window to window."""
 
-    density: Density
-    """The prior."""
+    density: Density | DensityEnsemble
+    """The prior, or several of which the window solver picks."""
     settings: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths and budgets."""
     skeleton: Skeleton = CANONICAL
@@ -98,16 +125,15 @@ class RecedingHorizonSolver:
         """Extend `committed` to `frames` frames; stops early, with all that is committed, at the deadline or Ctrl-C.
 
         `deadline` is a time.monotonic() value in seconds; the window it falls into is committed as far as it was
-        improved by then. Windows always look their full length ahead, so the last frames are solved with a future too.
-        KeyboardInterrupt goes on where nothing has been solved yet.
+        improved by then. KeyboardInterrupt goes on where nothing has been solved yet.
         """
         begun = len(committed.features)
         try:
             while (done := len(committed.features)) < frames:
                 if (left := _seconds_until(deadline)) <= 0:
                     return committed, Outcome.BUDGET
-                count = min(self.settings.frames - self.settings.overlap, frames - done)
-                following = self._solve_next(committed, terms_of(done, self.settings.frames), count, generator, left)
+                length, count = self.settings.lay_window(done, frames)
+                following = self._solve_next(committed, terms_of(done, length), length, count, generator, left)
                 if not following.windows[-1].evaluations and _seconds_until(deadline) <= 0:
                     return committed, Outcome.BUDGET
                 if not following.finite(count):
@@ -121,18 +147,42 @@ class RecedingHorizonSolver:
             return committed, Outcome.INTERRUPTED
         return committed, Outcome.DONE
 
+    def solve_window(
+        self,
+        committed: CommittedFrames,
+        terms: Sequence[Term],
+        frames: int,
+        *,
+        generator: torch.Generator,
+        seconds: float = math.inf,
+    ) -> SolvedWindow:
+        """Solve one window of so many frames after the committed ones, and commit nothing."""
+        context = WindowContext(
+            self.density,
+            committed.state,
+            committed.place,
+            committed.joints_world,
+            frames,
+            self.skeleton,
+            self.fps,
+            contacts_before=committed.contacts,
+            first_frame=committed.discarded + len(committed.features),
+        )
+        return self.method(context, terms, committed.warm_start, generator, seconds=seconds)
+
     def _solve_next(
-        self, done: CommittedFrames, terms: Sequence[Term], count: int, generator: torch.Generator, seconds: float
+        self,
+        done: CommittedFrames,
+        terms: Sequence[Term],
+        length: int,
+        count: int,
+        generator: torch.Generator,
+        seconds: float,
     ) -> CommittedFrames:
         began = time.perf_counter()
-        context = WindowContext(
-            self.density, done.state, done.place, done.joints_world, self.settings.frames, self.skeleton, self.fps
-        )
-        window = self.method(context, terms, done.warm_start, generator, seconds=seconds)
+        window = self.solve_window(done, terms, length, generator=generator, seconds=seconds)
         features = window.trial.features[0, :count]
         ground, heading = integrate_root(features, done.place)
-        joints = torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :]
-        state = self.density.advance(done.state, features.unsqueeze(0))
         record = WindowRecord(
             count,
             time.perf_counter() - began,
@@ -140,17 +190,26 @@ class RecedingHorizonSolver:
             window.start_energy,
             window.energy,
             window.stop_reason,
+            window.choice,
         )
         return CommittedFrames(
-            state=state,
+            state=self.density.advance(done.state, features.unsqueeze(0)),
             place=GroundPose(ground[-1], heading[-1]),
             features=torch.cat([done.features, features]),
-            joints_world=joints,
-            warm_start=window.carry[count:],
+            joints_world=torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :],
+            warm_start=window.warm_start[count:],
             ledger=done.ledger.join(window.ledger.slice(count)),
             windows=(*done.windows, record),
             forecast=window.trial.joints_world[0, count:],
+            discarded=done.discarded,
         )
+
+
+def replay(density: Density, features: Float[Tensor, "frames size"], state: Any = None, *, since: int = 0) -> Any:
+    """The density's state after known frames: from its state before the frame `since`, or where there is none from one
+    before the first that makes them likely (Wang et al. 2019, Eq. 26).
+    """
+    return density.advance(density.infer_state(features) if state is None else state, features[None, since:])
 
 
 def _seconds_until(deadline: float | None) -> float:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.motion import Motion
+from mapctl.problem.density_selection import DensityChoice
 from mapctl.problem.ledger import Ledger
 
 
@@ -62,6 +63,8 @@ class WindowRecord:
     """Nats after it."""
     outcome: str
     """Why L-BFGS stopped."""
+    choice: DensityChoice | None = None
+    """Which of several densities scored it, where there were several to choose from."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,21 @@
-"""How one window is solved: over the latents of a rollout (the default), or over the states themselves."""
+"""How one window is solved: a start, a parametrisation of its frames, and L-BFGS over the unknowns."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT
 from mapctl.problem.context import WindowContext
-from mapctl.problem.feature_states import FeatureStates
+from mapctl.problem.density_selection import DensityChoice
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
+from mapctl.problem.parametrisation import Parametrisation
 from mapctl.problem.warm_start import WarmStartProposal, keep_warm_start
-from mapctl.protocols import DiscreteChoices
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
 from mapctl.terms.base import Term
@@ -28,19 +27,21 @@ class SolvedWindow:
     """The best that was found for one window."""
 
     trial: Trial
-    """Batch of one, detached."""
-    carry: Float[Tensor, "frames width"]
-    """By frame, what the next window may start from."""
+    """The motion: batch of one, detached."""
+    warm_start: Float[Tensor, "frames width"]
+    """By frame, what the next window may start from (see `Parametrisation.warm_start`)."""
     ledger: Ledger
-    """By term and frame."""
+    """Energy and residual by term and frame."""
     evaluations: int
-    """Spent in all, proposals included."""
+    """Evaluations spent in all, proposals included."""
     start_energy: float
-    """Nats at the first point of L-BFGS."""
+    """Energy at the first point of L-BFGS, nats."""
     energy: float
-    """Nats at the end."""
+    """Energy at the end, nats."""
     stop_reason: str
     """Why L-BFGS stopped."""
+    choice: DensityChoice | None = None
+    """Which of several densities scored the window, where there were several to choose from."""
 
 
 @runtime_checkable
@@ -51,12 +52,14 @@ class SingleWindowSolver(Protocol):
         self,
         context: WindowContext,
         terms: Sequence[Term],
-        tail: Float[Tensor, "frames width"],
+        warm_start: Float[Tensor, "ahead width"],
         generator: torch.Generator,
         *,
         seconds: float = math.inf,
     ) -> SolvedWindow:
-        """`tail` is the end of the last window's `carry`, empty at the start; `seconds` are left."""
+        """Solve it; `warm_start` is what the last window found for its first frames, empty at the start, and `seconds`
+        are left.
+        """
         ...
 
 
@@ -74,9 +77,9 @@ class LatentNoiseSolver:
     """Nats a frame below which no further round is begun: a new round forgets L-BFGS's curvature, which pays only where
     the last one is stuck. Windows are worth the effort, since one that lags behind leaves a debt to all after it."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=36))
-    """Of one round."""
+    """L-BFGS of one round."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=120))
-    """Of one window."""
+    """Budget of one window."""
     proposal: WarmStartProposal = keep_warm_start
     """Where the first round starts."""
 
@@ -84,32 +87,31 @@ class LatentNoiseSolver:
         self,
         context: WindowContext,
         terms: Sequence[Term],
-        tail: Tensor,
+        warm_start: Tensor,
         generator: torch.Generator,
         *,
         seconds: float = math.inf,
     ) -> SolvedWindow:
-        """See Method; the carry is the noise."""
+        """Solve one window."""
         meter = Meter(self.budget.within(seconds))
-        unknowns = self.proposal(context, terms, _extend_warm_start(tail, context.frames), meter, generator)
-        best = self._run_round(context, terms, unknowns, meter)
-        start_energy = float(best[1].start_energy[0])
+        start = self.proposal(context, terms, LatentNoise.extend(warm_start, context.frames), meter, generator)
+        unknowns, best = self._run_round(context, terms, start, meter)
+        start_energy = float(best.start_energy[0])
         for _ in range(self.rounds - 1):
-            if meter.exhausted or not best[1].energy[0] > self.energy_threshold * context.frames:
+            if meter.exhausted or not best.energy[0] > self.energy_threshold * context.frames:
                 break
-            again = self._run_round(context, terms, best[1].x, meter)
-            if not again[1].energy[0] < best[1].energy[0]:
+            replanned, again = self._run_round(context, terms, best.x, meter)
+            if not again.energy[0] < best.energy[0]:
                 break
-            best = again
-        objective, result = best
-        carry = result.x[0].unflatten(-1, (context.frames, LAYOUT.continuous))
-        return _build_solved_window(objective, result, carry, meter, start_energy)
+            unknowns, best = replanned, again
+        return replace(_build_solved_window(unknowns, terms, best, meter), start_energy=start_energy)
 
     def _run_round(
-        self, context: WindowContext, terms: Sequence[Term], unknowns: Tensor, meter: Meter
-    ) -> tuple[Objective, LbfgsResult]:
-        objective = Objective(LatentNoise.from_unknowns(context, unknowns).build, terms)
-        return objective, minimise(objective.energy_and_gradient, unknowns, settings=self.lbfgs, meter=meter)
+        self, context: WindowContext, terms: Sequence[Term], start: Tensor, meter: Meter
+    ) -> tuple[LatentNoise, LbfgsResult]:
+        unknowns = LatentNoise.from_unknowns(context, start)
+        objective = Objective(unknowns.build, terms)
+        return unknowns, minimise(objective.energy_and_gradient, start, settings=self.lbfgs, meter=meter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,101 +124,54 @@ class GuidedNoiseSolver:
     guide: Float[Tensor, "frames size"]
     """Features of the window's frames, physical units."""
     share: float = 0.5
-    """Of the guide's noise that the search starts with: 1 starts at the guide itself, 0 at the prior's mean."""
+    """Share of the guide's noise that the search starts with: 1 starts at the guide itself, 0 at the prior's mean."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=24))
-    """Of one window."""
+    """L-BFGS of one window."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=60))
-    """Of one window."""
+    """Budget of one window."""
 
     def __call__(
         self,
         context: WindowContext,
         terms: Sequence[Term],
-        tail: Tensor,
+        warm_start: Tensor,
         generator: torch.Generator,
         *,
         seconds: float = math.inf,
     ) -> SolvedWindow:
-        """See Method; the carry is the noise, where the next window starts instead of the guide."""
+        """Solve one window; where the last one overlaps it, its noise is the start instead of the guide's."""
         meter = Meter(self.budget.within(seconds))
-        plan, noise = context.density.latents(self.guide.unsqueeze(0), context.state)
+        plan, noise = context.prior.latents(self.guide.unsqueeze(0), context.state)
         start = self.share * noise[0]
-        start[: len(tail)] = tail[: len(start)]
-        unknowns = start.flatten().unsqueeze(0)
-        objective = Objective(LatentNoise(context, plan).build, terms)
-        result = minimise(objective.energy_and_gradient, unknowns, settings=self.lbfgs, meter=meter)
-        carry = result.x[0].unflatten(-1, (context.frames, LAYOUT.continuous))
-        return _build_solved_window(objective, result, carry, meter, float(result.start_energy[0]))
+        start[: len(warm_start)] = warm_start[: len(start)]
+        return minimise_window(LatentNoise(context, plan), terms, start.flatten().unsqueeze(0), self.lbfgs, meter)
 
 
-@dataclass(frozen=True, eq=False)
-class FeatureStateSolver:
-    """L-BFGS over the states and the network's input noise, with teacher forcing (Eq. 14-19).
-
-    The terms should hold a likelihood. Starts from the last window's states and the prior's plain continuation of them.
-    """
-
-    scale: Float[Tensor, " continuous"]
-    """The prior's standard deviations: one unit of each unknown."""
-    centre: Float[Tensor, " continuous"]
-    """The prior's means."""
-    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=150))
-    """Of one window."""
-    budget: Budget = field(default_factory=lambda: Budget(evaluations=160))
-    """Of one window."""
-
-    def __call__(
-        self,
-        context: WindowContext,
-        terms: Sequence[Term],
-        tail: Tensor,
-        generator: torch.Generator,
-        *,
-        seconds: float = math.inf,
-    ) -> SolvedWindow:
-        """See Method; the carry is the features."""
-        meter = Meter(self.budget.within(seconds))
-        features, plan = _continue_features(context, tail)
-        states = FeatureStates(context, self.scale, self.centre, plan.contacts)
-        objective = Objective(states.build, terms)
-        result = minimise(
-            objective.energy_and_gradient, states.from_features(features), settings=self.lbfgs, meter=meter
-        )
-        carry = states.build(result.x).features[0].detach()
-        return _build_solved_window(objective, result, carry, meter, float(result.start_energy[0]))
+def minimise_window(
+    unknowns: Parametrisation,
+    terms: Sequence[Term],
+    start: Float[Tensor, "1 unknowns"],
+    lbfgs: LbfgsSettings,
+    meter: Meter,
+) -> SolvedWindow:
+    """Minimise the terms over a window's unknowns; the start itself where nothing finite was found."""
+    result = minimise(Objective(unknowns.build, terms).energy_and_gradient, start, settings=lbfgs, meter=meter)
+    if not bool(torch.isfinite(result.energy).all()):
+        result = replace(result, x=start)
+    return _build_solved_window(unknowns, terms, result, meter)
 
 
 def _build_solved_window(
-    objective: Objective, result: LbfgsResult, carry: Tensor, meter: Meter, start_energy: float
+    unknowns: Parametrisation, terms: Sequence[Term], result: LbfgsResult, meter: Meter
 ) -> SolvedWindow:
     with torch.no_grad():
-        trial = objective.build(result.x)
+        trial = unknowns.build(result.x)
     return SolvedWindow(
         trial,
-        carry,
-        objective.build_ledger(trial),
+        unknowns.warm_start(result.x),
+        Objective(unknowns.build, terms).build_ledger(trial),
         meter.evaluations,
-        start_energy,
+        float(result.start_energy[0]),
         float(result.energy[0]),
         result.status[0].value,
     )
-
-
-def _extend_warm_start(tail: Tensor, frames: int) -> Float[Tensor, "1 unknowns"]:
-    """The last solution's tail, and zero noise (the prior's own continuation) beyond it."""
-    noise = tail.new_zeros(frames, LAYOUT.continuous)
-    noise[: len(tail)] = tail[:frames]
-    return noise.flatten().unsqueeze(0)
-
-
-def _continue_features(context: WindowContext, tail: Tensor) -> tuple[Float[Tensor, "1 frames size"], DiscreteChoices]:
-    """The tail's features and the prior's zero-noise rollout after them, and their contact bits."""
-    known = tail[: context.frames].unsqueeze(0)
-    state = context.density.advance(context.state, known) if len(tail) else context.state
-    noise = tail.new_zeros(1, context.frames - known.shape[1], LAYOUT.continuous)
-    plan = context.density.plan(state, noise)
-    with torch.no_grad():
-        beyond, _ = context.density.rollout(state, noise, plan)
-    features = torch.cat([known, beyond], dim=1) if len(tail) else beyond
-    bits = LAYOUT.pick(features, "contacts") > 0.5
-    return features, DiscreteChoices(torch.zeros(bits.shape[:2], dtype=torch.long), bits)

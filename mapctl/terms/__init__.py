@@ -8,7 +8,6 @@ from mapctl.terms.keyframe import Keyframe
 from mapctl.terms.latent_prior import LatentPrior
 from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.motion_tracking import MotionTracking
-from mapctl.terms.observation import Observation
 from mapctl.terms.path import Path
 from mapctl.terms.root_velocity import RootVelocity
 from mapctl.terms.step_length import StepLength
@@ -23,7 +22,6 @@ ALL = (
     MotionTracking,
     StepLength,
     RootVelocity,
-    Observation,
     Keyframe,
     Clearance,
     Support,
@@ -38,7 +36,6 @@ __all__ = [
     "LatentPrior",
     "Likelihood",
     "MotionTracking",
-    "Observation",
     "Path",
     "RootVelocity",
     "StepLength",

@@ -19,8 +19,8 @@ class LatentPrior:
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Half the squared numbers of each frame over sigma squared."""
-        return 0.5 * (trial.noise / self.sigma).square().sum(-1)
+        return 0.5 * (trial.require_noise() / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Root mean square of a frame's numbers."""
-        return trial.noise.square().mean(-1).sqrt()
+        return trial.require_noise().square().mean(-1).sqrt()

@@ -19,8 +19,8 @@ class Likelihood:
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Nats; may be negative, since densities may pass 1."""
-        return -trial.log_density / self.temperature
+        return -trial.require_log_density() / self.temperature
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """The same, without the temperature."""
-        return -trial.log_density
+        return -trial.require_log_density()

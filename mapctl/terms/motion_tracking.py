@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import LAYOUT, GroundPose, integrate_root
+from mapctl.features import LAYOUT, integrate_root
 from mapctl.terms.trial import Trial
 
 
@@ -64,11 +64,7 @@ class MotionTracking:
     def _target_from_hips(self, trial: Trial) -> Float[Tensor, "1 frames joints 3"]:
         key = id(trial.skeleton)
         if key not in self._target_cache:
-            origin = GroundPose.origin(self.target.dtype)
-            still = trial.features.new_zeros(0, trial.skeleton.num_joints, 3).to(self.target.dtype)
-            target = self.target.unsqueeze(0)
-            bits = LAYOUT.pick(target, "contacts") > 0.5
-            other = Trial(target, origin, target, target[..., 0], bits, still, trial.skeleton, trial.fps)
+            other = Trial.of_features(self.target.unsqueeze(0), skeleton=trial.skeleton)
             self._target_cache[key] = _hips_relative_positions(other)
         return self._target_cache[key]
 

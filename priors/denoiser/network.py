@@ -5,7 +5,7 @@ then makes exact. Dilated residual convolutions over time, on what was seen, a s
 seen, and the noise's sigmas. Where noise is nil what was seen is returned: the change fades with the sigma.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,8 @@ from torch.nn.functional import gelu
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.numerics import gaussian
-from mapctl.recording import Capture, Cleaned, fill_missing
+from mapctl.pose import BodyPose
+from mapctl.recording import Capture, CaptureProposal, fill_missing
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
@@ -64,7 +65,7 @@ class DenoiserNetwork(nn.Module):
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
-    def forward(self, capture: Capture) -> Cleaned:
+    def forward(self, capture: Capture) -> CaptureProposal:
         """The proposal; frames that were not seen at all included."""
         view = _CaptureView(capture)
         inputs = view.inputs().transpose(1, 2)
@@ -146,7 +147,7 @@ class _CaptureView:
             dim=-1,
         )
 
-    def changed(self, change: Float[Tensor, "batch frames outputs"]) -> Cleaned:
+    def changed(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
         """What was seen, smoothed and changed as far as it is in doubt."""
         angles, turn, off, contacts = change.split([_ANGLE_CHANNELS, 1, 3, 2], dim=-1)
         angles = self.angles + self.angle_noise_share * (
@@ -157,7 +158,8 @@ class _CaptureView:
         )
         off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + _POSITION_UNIT * off)
         root = self.slow_root + _rotate_about_y(off, self.slow_heading)
-        return Cleaned(root, self.slow_heading + turn[..., 0], angles, contacts)
+        packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
+        return CaptureProposal(BodyPose.unpack(packed), contacts)
 
 
 def _difference_frames(values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
@@ -188,7 +190,7 @@ class ConvDenoiser:
     card: checkpoints.Card
     """What they are."""
 
-    def clean(self, capture: Capture) -> Cleaned:
+    def clean(self, capture: Capture) -> CaptureProposal:
         """The proposal for a capture of any length, piece by piece, each with a margin that it shares."""
         pieces = []
         for start in range(0, capture.frames, _CHUNK_FRAMES):
@@ -196,11 +198,11 @@ class ConvDenoiser:
             with torch.no_grad():
                 cleaned = self.network(capture.slice(first, stop))
             kept = slice(start - first, start - first + _CHUNK_FRAMES)
-            parts = cleaned.root, cleaned.heading, cleaned.angles, cleaned.contacts
-            pieces.append([value[:, kept] for value in parts])
-        root, heading, angles, contacts = (torch.cat(values, dim=1) for values in zip(*pieces, strict=True))
+            pieces.append([value[:, kept] for value in (cleaned.pose.pack(), cleaned.contact_logits)])
+        packed, contacts = (torch.cat(values, dim=1) for values in zip(*pieces, strict=True))
+        pose = BodyPose.unpack(packed)
         # Each piece counts whole turns from its own beginning.
-        return Cleaned(root, rotations.unwrap_angle(heading), angles, contacts)
+        return CaptureProposal(replace(pose, heading=rotations.unwrap_angle(pose.heading)), contacts)
 
 
 def load(name: str) -> ConvDenoiser:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.solver.budget import Budget, Meter
+from mapctl.solver.gradient import differentiate
 from mapctl.solver.lbfgs import LbfgsSettings, minimise
 from priors.lstm_gmm.network import LstmGmm, LstmState
 
@@ -55,14 +56,8 @@ def infer_lstm_state(
         nats = model.log_prob(wanted.expand(len(unknowns), -1, -1), state_of(unknowns)).sum(-1)
         return 0.5 * unknowns.square().sum(-1) - nats
 
-    def energy_and_gradient(unknowns: Tensor) -> tuple[Tensor, Tensor]:
-        unknowns = unknowns.detach().requires_grad_(True)
-        found = energy(unknowns)
-        (gradient,) = torch.autograd.grad(found.sum(), unknowns)
-        return found.detach(), gradient
-
     with torch.no_grad():
         begun = ((memory - centre[:, None]) / spread[:, None]).transpose(0, 1).flatten(1)
         start = begun[energy(begun).argmin()][None]
-    found = minimise(energy_and_gradient, start, settings=settings.lbfgs, meter=Meter(settings.budget))
+    found = minimise(differentiate(energy), start, settings=settings.lbfgs, meter=Meter(settings.budget))
     return state_of(found.x)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
+from mapctl.features import PRIOR_FPS
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 
@@ -22,11 +22,7 @@ def compute_end_effectors(
     """For each frame but the first: positions (m) seen from the hips' ground point and heading, then velocities (m/s)
     over the ground on the way to it, in the same heading frame, so that a foot that stands has none.
     """
-    batch = len(features)
-    origin = GroundPose(features.new_zeros(batch, 2), features.new_zeros(batch))
-    continuous, bits = features[..., : LAYOUT.continuous], LAYOUT.pick(features, "contacts") > 0.5
-    past = features.new_zeros(0, CANONICAL.num_joints, 3)
-    trial = Trial(features, origin, continuous, features[..., 0], bits, past)
+    trial = Trial.of_features(features)
     world = trial.joints_world[..., [CANONICAL.index(name) for name in joints], :]
     velocity = torch.diff(world, dim=1) * PRIOR_FPS
     ground = trial.root_xz_world[:, 1:, None]

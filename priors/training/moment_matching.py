@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose, ground_speed
+from mapctl.features import LAYOUT, ground_speed
 from mapctl.joint_roles import find_feet
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.terms.trial import Trial
@@ -117,10 +117,8 @@ class _Moments:
 
     @staticmethod
     def of(features: Float[Tensor, "batch frames size"]) -> "_Moments":
-        batch = len(features)
-        origin = GroundPose(features.new_zeros(batch, 2), features.new_zeros(batch))
-        continuous, bits = features[..., : LAYOUT.continuous], LAYOUT.pick(features, "contacts") > 0.5
-        trial = Trial(features, origin, continuous, features[..., 0], bits, features.new_zeros(0, 21, 3))
+        trial = Trial.of_features(features)
+        continuous, bits = features[..., : LAYOUT.continuous], trial.contacts
         joints = trial.joints_world
         toes = joints[:, :, list(find_feet(CANONICAL))]
         steps = torch.diff(toes[..., ::2], dim=1).square().sum(-1) * trial.fps**2

@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.features import GroundPose, decode
+from mapctl.features import GroundPose
 from mapctl.metrics import measure
 from mapctl.metrics.realism import RealismSettings, canonical_positions, cut_windows
 from mapctl.metrics.realism.classifier import compute_held_out_accuracy
+from mapctl.pose import decode
 from priors import checkpoints
 from priors.refiner.network import LstmRefiner, RefinerNetwork
 from priors.training.corpus import Corpus, Split

@@ -9,9 +9,10 @@ from pathlib import Path
 import torch
 
 from mapctl.errors import RequestError
-from mapctl.features import GroundPose, decode
+from mapctl.features import GroundPose
 from mapctl.metrics import compute_reference
 from mapctl.metrics.states import summarise_states
+from mapctl.pose import decode
 from priors import checkpoints
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels

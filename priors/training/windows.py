@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mapctl import kinematics, rotations
-from mapctl.features import LAYOUT, GroundPose, decode_local_rotations, integrate_root
+from mapctl import rotations
+from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
+from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus, number_clip_folders
 
@@ -59,8 +60,9 @@ class PositionWindows:
         self.ground = torch.cat([ground for ground, _ in roots])
         self.heading = torch.cat([heading for _, heading in roots])
         self.contacts = LAYOUT.pick(corpus.features, "contacts")
-        self.local = torch.cat([compute_local_positions(part) for part in corpus.features.split(_CHUNK_FRAMES)])
-        self.quats = torch.cat([heading_free_rotations(part) for part in corpus.features.split(_CHUNK_FRAMES)])
+        poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
+        self.local = torch.cat([pose.joints_world() for pose in poses])
+        self.quats = torch.cat([pose.local_quat_xyzw for pose in poses])
         folder = number_clip_folders(corpus)
         share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, self.lengths.float())
         self.probabilities = self.lengths / share[folder] ** evenness
@@ -100,18 +102,3 @@ class PositionWindows:
         quats = torch.where(mirrored[:, None, None, None], over, quats)
         quats[:, :, 0] = rotations.multiply(rotations.about_y(heading), quats[:, :, 0])
         return Window(places, quats, heading, contacts, present)
-
-
-def compute_local_positions(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 3"]:
-    """Joint positions on canonical bones over the hips' ground point, seen along their heading, metres."""
-    tilt, joints = LAYOUT.pick(features, "root_tilt"), LAYOUT.pick(features, "joint_rotations")
-    hips = torch.stack([tilt[:, 0], torch.zeros_like(tilt[:, 0]), tilt[:, 1]], dim=-1)
-    turns = rotations.rotation_vector_to_matrix(torch.cat([hips[:, None], joints.unflatten(-1, (-1, 3))], dim=1))
-    height = LAYOUT.pick(features, "root_height")
-    up = torch.stack([torch.zeros_like(height), height, torch.zeros_like(height)], dim=-1)
-    return kinematics.positions_from_matrices(CANONICAL, turns) + up
-
-
-def heading_free_rotations(features: Float[Tensor, "frames size"]) -> Float[Tensor, "frames joints 4"]:
-    """Local rotations (xyzw), the hips' without their heading."""
-    return decode_local_rotations(features, torch.zeros(len(features)))

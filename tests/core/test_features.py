@@ -9,8 +9,9 @@ from helpers import finite_difference, generator, moved, random_motion, turn_bet
 
 from mapctl import features, rotations
 from mapctl.errors import MapctlError
-from mapctl.features import LAYOUT, GroundPose, decode, encode, integrate_root, mirror_features
+from mapctl.features import LAYOUT, GroundPose, encode, integrate_root, mirror_features
 from mapctl.motion import Motion
+from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
 
 MOTIONS = {"walk": walk(40, turn_rate=1.0), "anything": random_motion(CANONICAL, 30)}

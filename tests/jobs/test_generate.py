@@ -18,8 +18,9 @@ from controllers.generation.generate import (
 )
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose, decode, encode
+from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.kinematics import heading
+from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
 
 DENSITY = tiny_density()

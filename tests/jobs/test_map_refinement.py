@@ -5,19 +5,21 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import apart_deg
 from helpers import finite_difference, generator, tiny_density, walk
 
 from controllers.common import map_refinement
-from controllers.common.map_refinement import RefinementSettings, estimate_rest_height, guide_of, refine
+from controllers.common.map_refinement import RefinementSettings, estimate_rest_height, refine
 from mapctl import rotations
 from mapctl.contacts import debounced
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
-from mapctl.problem import density_selection
+from mapctl.pose import BodyPose
+from mapctl.problem import density_selection, window_solvers
+from mapctl.problem.context import WindowContext
+from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.objective import Objective
-from mapctl.problem.pose_offsets import Guide, PoseOffsets
+from mapctl.problem.pose_offsets import PoseOffsets
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.solver.budget import Budget
@@ -54,23 +56,17 @@ def speeds(motion):
     return torch.diff(toes, dim=0).norm(dim=-1) * PRIOR_FPS
 
 
-def poses_of(motion, contacts, dtype=torch.float32, sigma=0.05):
-    guide = guide_of(motion, contacts)
-    guide = Guide(guide.root.to(dtype), guide.heading.to(dtype), guide.angles.to(dtype), guide.contacts)
-    width = guide.packed().shape[1]
-    return PoseOffsets(
-        guide,
-        torch.full((len(guide.root), width), sigma, dtype=dtype),
-        GroundPose(guide.root[0, ::2], guide.heading[0]),
-        torch.zeros(0, CANONICAL.num_joints, 3, dtype=dtype),
-        torch.zeros(2, dtype=torch.bool),
-        CANONICAL,
-    )
+def offsets_of(motion, contacts, dtype=torch.float32, sigma=0.05):
+    pose = BodyPose.unpack(BodyPose.of_motion(motion).pack().to(dtype))
+    start = GroundPose(pose.root_position[0, ::2], pose.heading[0])
+    before = torch.zeros(0, CANONICAL.num_joints, 3, dtype=dtype)
+    context = WindowContext(DensityEnsemble([]), (), start, before, motion.num_frames)
+    return PoseOffsets(context, pose, contacts, torch.full(pose.pack().shape, sigma, dtype=dtype))
 
 
 def test_without_unknowns_the_poses_are_the_guides():
     motion = walk(20, turn_rate=1.0)
-    poses = poses_of(motion, torch.ones(20, 2, dtype=torch.bool), torch.float64)
+    poses = offsets_of(motion, torch.ones(20, 2, dtype=torch.bool), torch.float64)
     trial = poses.build(torch.zeros(2, poses.sigma.numel(), dtype=torch.float64))
     assert trial.joints_world.shape == (2, 20, CANONICAL.num_joints, 3)
     assert (trial.joints_world[1] - motion.joint_positions()).abs().max() < 1e-5
@@ -80,9 +76,9 @@ def test_without_unknowns_the_poses_are_the_guides():
 
 
 def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
-    poses = poses_of(walk(60), torch.zeros(60, 2, dtype=torch.bool), torch.float64)
+    poses = offsets_of(walk(60), torch.zeros(60, 2, dtype=torch.bool), torch.float64)
     white = torch.randn(150, poses.sigma.numel(), generator=generator(), dtype=torch.float64)
-    heights = poses.build(white).joints_world[:, :, 0, 1] - poses.guide.root[:, 1]
+    heights = poses.build(white).joints_world[:, :, 0, 1] - poses.proposal.root_position[:, 1]
     assert float(heights.square().mean().sqrt()) == pytest.approx(0.05, rel=0.1)
     step = torch.diff(heights, dim=1).square().mean().sqrt()
     assert step < 0.6 * heights.square().mean().sqrt()  # white ones would differ by 1.4 times
@@ -90,7 +86,7 @@ def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
 
 def test_the_gradient_is_that_of_finite_differences():
     motion = walk(12, turn_rate=0.5)
-    poses = poses_of(motion, torch.tensor([True, False]).expand(12, 2).contiguous(), torch.float64)
+    poses = offsets_of(motion, torch.tensor([True, False]).expand(12, 2).contiguous(), torch.float64)
     objective = Objective(poses.build, [LatentPrior(1.0), FootContact(sigma_speed=0.1, sigma_height=0.03)])
     at = 0.3 * torch.randn(1, poses.sigma.numel(), generator=generator(1), dtype=torch.float64)
     _, gradient = objective.energy_and_gradient(at)
@@ -162,7 +158,7 @@ def test_of_several_densities_the_likelier_counts_in_each_window():
 def test_a_walk_that_is_moving_begins_so():
     """The density is not shown a first frame that stands: its step is the second's."""
     motion = walk(30)
-    place = map_refinement._extrapolate_backward(guide_of(motion, torch.zeros(30, 2, dtype=torch.bool)))
+    place = map_refinement._extrapolate_backward(BodyPose.of_motion(motion))
     step = motion.root_position[1, [0, 2]] - motion.root_position[0, [0, 2]]
     assert torch.allclose((motion.root_position[0, [0, 2]] - place.position_xz), step, atol=1e-4)
 
@@ -192,13 +188,13 @@ def test_windows_meet_without_a_jump():
 
 def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
     motion = standing_still(50, drift=0.2)
-    found = map_refinement.minimise
+    found = window_solvers.minimise
 
     def lost(*args, **kwargs):
         result = found(*args, **kwargs)
         return replace(result, x=torch.full_like(result.x, math.nan), energy=torch.full_like(result.energy, math.nan))
 
-    monkeypatch.setattr(map_refinement, "minimise", lost)
+    monkeypatch.setattr(window_solvers, "minimise", lost)
     stood = refine(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10))
     assert stood.motion.num_frames == 50
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-4
@@ -210,17 +206,6 @@ def test_short_proposals_break_nothing(frames):
     stood = refine(motion, odds(motion), told(motion), QUICK)
     assert stood.motion.num_frames == frames
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.1
-
-
-def test_a_guide_is_its_motion():
-    motion = walk(30, turn_rate=4.0)
-    guide = guide_of(motion, torch.zeros(30, 2, dtype=torch.bool))
-    assert torch.diff(guide.heading).abs().max() < 0.3
-    part = guide.slice(5, 9)
-    assert torch.equal(part.packed(), guide.packed()[5:9])
-    tilt = torch.stack([guide.angles[:, 0], 0 * guide.heading, guide.angles[:, 1]], dim=-1)
-    hips = rotations.multiply(rotations.about_y(guide.heading), rotations.from_rotation_vector(tilt))
-    assert apart_deg(hips.double(), motion.local_quat_xyzw[:, 0]).max() < 0.1
 
 
 def test_no_contact_and_no_gap_in_one_is_short():

@@ -60,11 +60,11 @@ def trial(batch=3, *, features=None, place=None, skeleton=CANONICAL, dtype=torch
     return Trial(
         features.to(dtype).requires_grad_(),
         GroundPose(place.position_xz.to(dtype), place.heading.to(dtype)),
-        draw[..., 1:].to(dtype),
-        draw[..., 0].to(dtype),
-        bits,
-        motion.joint_positions()[:PAST].to(dtype),
-        skeleton,
+        contacts=bits,
+        noise=draw[..., 1:].to(dtype),
+        log_density=draw[..., 0].to(dtype),
+        before=motion.joint_positions()[:PAST].to(dtype),
+        skeleton=skeleton,
     )
 
 

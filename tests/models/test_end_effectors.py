@@ -7,7 +7,8 @@ import torch
 from helpers import corpus, finite_difference, generator
 from scipy.spatial.transform import Rotation
 
-from mapctl.features import LAYOUT, GroundPose, decode, mirror_features
+from mapctl.features import LAYOUT, GroundPose, mirror_features
+from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
 from priors.refiner.end_effectors import compute_end_effectors, count_channels
 

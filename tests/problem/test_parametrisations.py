@@ -6,10 +6,13 @@ from catalogue import excite
 from helpers import corpus, finite_difference, generator, noise, tiny_model, walk
 
 from mapctl.features import LAYOUT, GroundPose
+from mapctl.pose import BodyPose
 from mapctl.problem.context import WindowContext
 from mapctl.problem.feature_states import FeatureStates
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
+from mapctl.problem.parametrisation import Parametrisation
+from mapctl.problem.pose_offsets import PoseOffsets
 from mapctl.protocols import DiscreteChoices
 from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood
 
@@ -123,3 +126,55 @@ def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
     row = joined.summary()["noise"]
     assert row["energy_nats"] == pytest.approx(float(joined.entries[0].energy.sum()))
     assert row["residual_mean"] <= row["residual_p95"] <= row["residual_max"]
+
+
+def offsets():
+    """Offsets about the same stretch of a walk."""
+    features, _ = states()
+    pose = BodyPose.of_features(features[0], CONTEXT.place)
+    bits = LAYOUT.pick(features[0], "contacts") > 0.5
+    return PoseOffsets(CONTEXT, pose, bits, torch.full(pose.pack().shape, 0.03, dtype=torch.float64))
+
+
+PARAMETRISATIONS = {
+    "latent noise": LatentNoise.from_unknowns(CONTEXT, noise(1, FRAMES, dtype=torch.float64).flatten(1)),
+    "feature states": states()[1],
+    "pose offsets": offsets(),
+}
+
+
+@pytest.mark.parametrize("name", PARAMETRISATIONS)
+def test_every_parametrisation_keeps_its_contract(name):
+    """Of any kind: a start, trials of candidates that are independent, and what the next window starts from."""
+    unknowns = PARAMETRISATIONS[name]
+    assert isinstance(unknowns, Parametrisation)
+    begin = unknowns.initial(torch.zeros(0, LAYOUT.size, dtype=torch.float64)[:, : begin_width(unknowns)]).double()
+    points = begin + 0.3 * torch.randn(3, begin.shape[1], generator=generator(4), dtype=torch.float64)
+    trial = unknowns.build(points)
+    assert trial.features.shape == (3, FRAMES, LAYOUT.size)
+    assert (trial.start, trial.before) == (CONTEXT.place, CONTEXT.before)
+    alone = unknowns.build(points[1:2])
+    torch.testing.assert_close(alone.features[0], trial.features[1])
+    torch.testing.assert_close(alone.log_density[0], trial.log_density[1])
+    assert len(unknowns.warm_start(points[:1])) == FRAMES
+    energy = Objective(unknowns.build, (LatentPrior(), Likelihood(), FootContact())).energy
+    direction = torch.randn(points.shape, generator=generator(5), dtype=torch.float64)
+    wanted = finite_difference(lambda at: energy(at).sum(), points, direction)
+    assert slope(lambda at: energy(at).sum(), points, direction) == pytest.approx(wanted, rel=1e-4)
+
+
+def begin_width(unknowns):
+    """Numbers a frame of what the last window hands on."""
+    return LAYOUT.size if isinstance(unknowns, FeatureStates) else LAYOUT.continuous
+
+
+def test_pose_offsets_move_the_proposal_by_so_many_sigmas():
+    unknowns = offsets()
+    still = unknowns.build(torch.zeros(1, unknowns.sigma.numel(), dtype=torch.float64))
+    torch.testing.assert_close(still.pose.pack()[0], unknowns.proposal.pack())
+    white = torch.zeros(1, FRAMES, unknowns.sigma.shape[1], dtype=torch.float64)
+    white[..., 1] = 1.0  # the height, in every frame
+    higher = unknowns.build(white.flatten(1))
+    lift = higher.pose.root_position[0, :, 1] - unknowns.proposal.root_position[:, 1]
+    assert (lift >= unknowns.sigma[:, 1]).all()  # smoothing to unit variance adds what goes together
+    assert (higher.pose.heading - still.pose.heading).abs().max() < 1e-9

@@ -2,22 +2,24 @@
 
 import time
 from dataclasses import replace
+from typing import ClassVar
 
 import pytest
 import torch
-from helpers import generator, tiny_density, tiny_model
+from helpers import corpus, generator, tiny_density, tiny_model
 
 from controllers.common.initial_state import select_initial_state
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, integrate_root
 from mapctl.problem.context import WindowContext
+from mapctl.problem.feature_states import FeatureStateSolver
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
-from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver
+from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver, replay
 from mapctl.problem.solution import Outcome
 from mapctl.problem.warm_start import BestOfSamples, SteeringKnots, SwarmProposal
-from mapctl.problem.window_solvers import FeatureStateSolver, LatentNoiseSolver
+from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -77,7 +79,7 @@ def test_a_window_ends_lower_than_it_began_within_its_budget(name):
     assert solved.energy < solved.start_energy
     assert solved.evaluations <= 12
     assert sum(float(e.energy.sum()) for e in solved.ledger.entries) == pytest.approx(solved.energy, rel=1e-4)
-    assert solved.carry.shape[0] == SHORT.frames
+    assert solved.warm_start.shape[0] == SHORT.frames
     assert not solved.trial.features.requires_grad
 
 
@@ -104,8 +106,8 @@ def test_the_next_window_starts_from_the_last_ones_tail():
     spent = LatentNoiseSolver(rounds=1, budget=Budget(evaluations=0))(
         context(done), terms_of(7, 10), done.warm_start, generator()
     )
-    torch.testing.assert_close(spent.carry[:4], done.warm_start)
-    assert float(spent.carry[4:].abs().max()) == 0
+    torch.testing.assert_close(spent.warm_start[:4], done.warm_start)
+    assert float(spent.warm_start[4:].abs().max()) == 0
 
 
 def test_solving_follows_the_curve_better_than_not_solving():
@@ -237,3 +239,45 @@ def test_the_warm_start_is_among_the_candidates():
         method = replace(METHODS[name], rounds=1, budget=Budget(evaluations=100))
         solved = method(context(begun), terms, begun.warm_start, generator())
         assert solved.start_energy <= float(plain) + 1e-3
+
+
+class Clock(LatentPrior):
+    """Remembers the times of the frames it was shown."""
+
+    shown: ClassVar[list[float]] = []
+
+    def residual(self, trial):
+        self.shown.append(float(trial.seconds[0]))
+        return super().residual(trial)
+
+
+def test_terms_know_the_time_of_the_frames_they_see():
+    Clock.shown.clear()
+    solver().solve(BEGUN, lambda first, frames: (Clock(),), 20, generator=generator())
+    assert Clock.shown == pytest.approx([1 / 30, 7 / 30, 13 / 30, 19 / 30])
+    Clock.shown.clear()
+    done, _ = solver().solve(BEGUN, lambda first, frames: (Clock(),), 7, generator=generator())
+    short = done.discard_history(2)
+    assert (len(short.features), short.discarded, short.windows) == (2, 5, ())
+    solver().solve(short, lambda first, frames: (Clock(),), 8, generator=generator())
+    assert Clock.shown[-1] == pytest.approx(7 / 30)
+
+
+@pytest.mark.parametrize(
+    ("frames", "laid"), [(50, [(10, 6)] * 7 + [(8, 8)]), (10, [(10, 10)]), (3, [(3, 3)]), (11, [(10, 6), (5, 5)])]
+)
+def test_windows_may_end_with_the_motion(frames, laid):
+    settings, done, found = replace(SHORT, beyond_end=False), 0, []
+    while done < frames:
+        found.append(settings.lay_window(done, frames))
+        done += found[-1][1]
+    assert (found, done) == (laid, frames)
+
+
+def test_a_replay_goes_on_from_a_state_or_from_the_likeliest():
+    features = corpus().clips()[0][:30]
+    whole = replay(DENSITY, features)
+    part = replay(DENSITY, features[:12])
+    on = replay(DENSITY, features, part, since=12)
+    for name in ("previous", "hidden", "cell"):
+        torch.testing.assert_close(getattr(on, name), getattr(whole, name))

@@ -37,7 +37,7 @@ def test_each_window_is_given_what_the_last_found_for_the_same_frames(frames):
     def method(context, terms, tail, generator, *, seconds=math.inf):
         solved = METHOD(context, terms, tail, generator, seconds=seconds)
         given.append(tail)
-        found.append(solved.carry)
+        found.append(solved.warm_start)
         return solved
 
     done, _ = solver(method).solve(BEGUN, terms_of, frames, generator=generator(0))

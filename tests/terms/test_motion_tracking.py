@@ -14,9 +14,7 @@ TARGET = encode(walk(20, turn_rate=0.3))[0]
 def trial(features: torch.Tensor, *, heading: float = 0.0) -> Trial:
     place = GroundPose(torch.tensor([2.0, -1.0]).double(), torch.tensor(heading).double())
     bits = LAYOUT.pick(features, "contacts") > 0.5
-    return Trial(
-        features[None], place, features[None], features[None, :, 0], bits[None], torch.zeros(0, 21, 3).double()
-    )
+    return Trial(features[None], place, contacts=bits[None], before=torch.zeros(0, 21, 3).double())
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.0, -7.0])

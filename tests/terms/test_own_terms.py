@@ -1,6 +1,6 @@
 """A term of the user's own that is wrong is named, with what is wrong of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -9,7 +9,6 @@ from test_terms_contract import trial
 from mapctl.errors import RequestError
 from mapctl.problem.objective import Objective
 from mapctl.terms import LatentPrior
-from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ BASE = trial(2)
 def objective(term):
     def build(unknowns):
         noise = unknowns.unflatten(-1, BASE.noise.shape[1:])
-        return Trial(BASE.features, BASE.start, noise, BASE.log_density, BASE.contacts, BASE.before)
+        return replace(BASE, noise=noise)
 
     return Objective(build, (LatentPrior(), term))
 

@@ -1,6 +1,7 @@
 """Travel: nothing for the wanted velocity, half squares in sigmas for what is missed along, across and in facing."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -25,7 +26,7 @@ def gliding(speed: float, direction: float, *, facing: float = 0.0) -> Trial:
     before[..., 2] = (back * math.cos(direction))[:, None]
     place = GroundPose(torch.zeros(2, dtype=torch.float64), torch.tensor(facing, dtype=torch.float64))
     bits = torch.zeros(1, FRAMES, 2, dtype=torch.bool)
-    return Trial(features, place, features, features[..., 0], bits, before)
+    return Trial(features, place, contacts=bits, before=before)
 
 
 def wanting(speed: float, direction: float, **more) -> RootVelocity:
@@ -68,7 +69,7 @@ def test_facing_is_an_angle():
 def test_what_was_missed_before_the_window_is_owed():
     """After a stretch at half the speed, the first frames cost though they are as wanted; the last do not."""
     slow = gliding(0.6, 0.0)
-    late = Trial(gliding(1.2, 0.0).features, slow.start, slow.noise, slow.log_density, slow.contacts, slow.before)
+    late = replace(slow, features=gliding(1.2, 0.0).features)
     energy = wanting(1.2, 0.0)(late)[0]
     assert float(energy[0]) > 1
     assert float(energy[-5:].max()) < 1e-9

@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import walk
 
-from mapctl.features import LAYOUT, encode
+from mapctl.features import encode
 from mapctl.terms import StepLength
 from mapctl.terms.trial import Trial
 
@@ -17,10 +17,8 @@ def trial(contacts, *, before=None, contacts_before=(False, False)) -> Trial:
     return Trial(
         features[1:].unsqueeze(0),
         start,
-        features.new_zeros(1, len(contacts), LAYOUT.continuous),
-        features.new_zeros(1, len(contacts)),
-        torch.tensor(contacts).unsqueeze(0).bool(),
-        past,
+        contacts=torch.tensor(contacts).unsqueeze(0).bool(),
+        before=past,
         contacts_before=torch.tensor(contacts_before),
     )
 

@@ -36,10 +36,10 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     return Trial(
         features.to(dtype),
         place,
-        draw[..., 1:].to(dtype),
-        30 * draw[..., 0].to(dtype),
-        bits,
-        before,
+        contacts=bits,
+        noise=draw[..., 1:].to(dtype),
+        log_density=30 * draw[..., 0].to(dtype),
+        before=before,
         contacts_before=planted,
     )
 
@@ -166,10 +166,6 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
             for name in ("velocities", "velocities_before")
         }
         term = replace(term, facing=None if term.facing is None else term.facing + turn, **turned)
-    if "root" in names:
-        root = term.root.clone()
-        root[:, ::2] = rotate_ground(root[:, ::2], angle.expand(len(root))) + torch.tensor(shift).double()
-        term = replace(term, root=root, heading=term.heading + turn)
     if "places" in names:
         places = term.places.clone()
         turned = rotate_ground(places[..., ::2], angle.expand(places.shape[:-1]))

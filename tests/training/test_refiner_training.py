@@ -10,7 +10,8 @@ from helpers import corpus, generator, walks
 from torch.nn.functional import logsigmoid
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose, decode, encode, mirror_features
+from mapctl.features import LAYOUT, GroundPose, encode, mirror_features
+from mapctl.pose import decode
 from priors.refiner.end_effectors import count_channels
 from priors.refiner.network import RefinerConfig
 from priors.training.adversarial import Critic, HistoryBuffer

@@ -12,9 +12,8 @@ from mapctl.commands.train import Train
 from mapctl.commands.train import windows as train_windows
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.recording import Capture
 from priors.denoiser.network import DenoiserConfig
-from priors.training.augmentation.corruption import CorruptionSettings, make_clean_capture
+from priors.training.augmentation.corruption import CorruptionSettings
 from priors.training.corpus import Corpus
 from priors.training.denoiser_run import DenoiserRequest, train
 from priors.training.recipes.denoiser import (
@@ -22,7 +21,6 @@ from priors.training.recipes.denoiser import (
     DenoiserTrainer,
     FeatureWindows,
     compute_denoiser_losses,
-    compute_joint_positions,
     validate,
 )
 
@@ -78,21 +76,6 @@ def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
     assert torch.diff(joints, dim=1).abs().max() < 1e-5
     turned = (joints - joints[:1]).abs().amax(dim=(1, 2)) > 0.05
     assert 0.2 < turned.double().mean() < 1
-
-
-def test_positions_of_a_clean_capture_are_those_of_its_motion():
-    from mapctl.features import GroundPose, decode
-    from mapctl.recording import Cleaned
-
-    features = corpus(1, 30).features
-    capture: Capture = make_clean_capture(features[None])
-    angles = torch.cat([capture.tilt, capture.joints.flatten(2)], dim=-1)
-    found = compute_joint_positions(
-        Cleaned(capture.root, capture.heading, angles, LAYOUT.pick(features[None], "contacts"))
-    )
-    place = GroundPose(torch.zeros(2, dtype=torch.float64), torch.zeros((), dtype=torch.float64))
-    wanted = decode(features.double(), place).joint_positions()
-    assert (found[0] - wanted).abs().max() < 1e-4
 
 
 def test_a_perfect_proposal_costs_nothing_but_contacts():

@@ -8,12 +8,13 @@ import torch
 from helpers import corpus, generator, walks
 from scipy.spatial.transform import Rotation
 
-from mapctl.features import LAYOUT, GroundPose, decode
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
+from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus
-from priors.training.windows import PositionWindows, compute_local_positions
+from priors.training.windows import PositionWindows
 
 SWAP = CANONICAL.mirror_partners()
 
@@ -39,13 +40,6 @@ def seen_from_the_root(motion):
     assert (torch.from_numpy(forward)[:, 2] * torch.cos(facing) > 0).all()  # upright, so that facing is near enough
     places = motion.joint_positions() - motion.root_position[:, None] * torch.tensor([1.0, 0.0, 1.0])
     return without_heading(places, facing)
-
-
-def test_local_places_are_the_motions_seen_from_its_root():
-    features = corpus(3, 60).features[60:120]
-    assert (compute_local_positions(features).double() - seen_from_the_root(decoded(features))).norm(
-        dim=-1
-    ).max() < 1e-5
 
 
 def test_a_window_is_the_motion_from_that_frame_on():

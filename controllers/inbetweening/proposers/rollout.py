@@ -19,13 +19,14 @@ from controllers.inbetweening.geometry.footholds import hold_planted
 from controllers.inbetweening.geometry.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from controllers.inbetweening.proposers.answers import GapSource, Proposal
 from mapctl import contacts, rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, decode, encode, integrate_root
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import true_intervals
+from mapctl.pose import decode
 from mapctl.problem import density_selection
-from mapctl.problem.context import WindowContext
+from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
 from mapctl.problem.warm_start import SteeringKnots, SwarmProposal, keep_warm_start
 from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -166,22 +167,16 @@ class Roller:
     def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
         """A rollout through frames start to stop; changes nothing but what was seen before them."""
         features, place = _encode_before_gap(self.body, self.odds, start)
-        state = self.density.infer_state(features) if self.state is None else self.state
         if self.done < start:
-            state = self.density.advance(state, features[None, self.done :])
-        self.state, self.done = state, start
+            self.state, self.done = replay(self.density, features, self.state, since=self.done), start
+        committed = CommittedFrames(self.state, place, features, _compute_past_joints(self.body, start))
         arrival = self._build_arrival_target(start, stop, settings)
-        context = WindowContext(
-            self.density, self.state, place, _compute_past_joints(self.body, start), len(arrival.places)
-        )
-        wishes = [arrival]
+        frames, targets = len(arrival.places), [arrival]
         if settings.trajectory is not None:
-            wishes.append(self._build_trajectory_target(start, stop, context.frames, settings))
-        noise = _sample_smooth_noise(context.frames, generator, settings)
-        for frames in range(settings.stage, context.frames, settings.stage) if settings.stage else ():
-            window = _solve_rollout(replace(context, frames=frames), wishes, noise[:frames], generator, settings)
-            noise = torch.cat([window.carry, noise[frames:]])
-        window = _solve_rollout(context, wishes, noise, generator, settings)
+            targets.append(self._build_trajectory_target(start, stop, frames, settings))
+        solver = RecedingHorizonSolver(self.density, method=settings.method)
+        noise = _sample_smooth_noise(frames, generator, settings)
+        window = _solve_in_stages(solver, committed, targets, noise, generator, settings)
         body, odds, missed = _insert_rollout(self.body, self.odds, window, place, start, stop, settings.tempo)
         return Rollout(start, self._planted(body, odds, start, stop), odds, missed)
 
@@ -260,17 +255,14 @@ def extrapolate_end(
     if density_selection.select_density_for_motion([judge], known).weight < 1:
         return Proposal(proposal, odds)
     density, first = select_likeliest_density(densities, known), start
+    solver = RecedingHorizonSolver(density, method=replace(settings.method, proposal=keep_warm_start))
     while start < stop:
         features, place = _encode_before_gap(body, odds, start)
-        state = density.advance(density.infer_state(features), features[None])
-        context = WindowContext(
-            density, state, place, _compute_past_joints(body, start), min(settings.longest, stop - start)
-        )
-        terms = (LatentPrior(settings.sigma_noise), settings.footing)
-        still = torch.zeros(context.frames, LAYOUT.continuous)
-        window = replace(settings.method, proposal=keep_warm_start)(context, terms, still, torch.Generator())
-        body, odds, _ = _insert_rollout(body, odds, window, place, start, start + context.frames)
-        start += context.frames
+        committed = CommittedFrames(replay(density, features), place, features, _compute_past_joints(body, start))
+        terms, count = (LatentPrior(settings.sigma_noise), settings.footing), min(settings.longest, stop - start)
+        window = solver.solve_window(committed, terms, count, generator=torch.Generator())
+        body, odds, _ = _insert_rollout(body, odds, window, place, start, start + count)
+        start += count
     body = replace(body, skeleton=proposal.skeleton, root_position=body.root_position * gap.scale)
     return Proposal(body, odds, (GapSource(first, stop, f"density {density.name}"),))
 
@@ -296,17 +288,25 @@ def _compute_past_joints(body: Motion, start: int) -> Float[Tensor, "past joints
     return body.slice(first, start).joint_positions().float()
 
 
-def _solve_rollout(
-    context: WindowContext,
-    wishes: Sequence[Keyframe],
+def _solve_in_stages(
+    solver: RecedingHorizonSolver,
+    committed: CommittedFrames,
+    targets: Sequence[Keyframe],
     noise: Tensor,
     generator: torch.Generator,
     settings: RolloutSettings,
 ) -> SolvedWindow:
-    """The rollout of the context's frames that comes nearest to the wishes, from this noise on."""
-    part = slice(0, context.frames)
-    near = [replace(wish, places=wish.places[part], wanted=wish.wanted[part]) for wish in wishes]
-    return settings.method(context, (LatentPrior(settings.sigma_noise), settings.footing, *near), noise, generator)
+    """The rollout of as many frames as `noise` has that comes nearest to the targets, the first frames alone first."""
+
+    def solve(frames: int) -> SolvedWindow:
+        part = slice(0, frames)
+        near = [replace(target, places=target.places[part], wanted=target.wanted[part]) for target in targets]
+        terms = (LatentPrior(settings.sigma_noise), settings.footing, *near)
+        return solver.solve_window(replace(committed, warm_start=noise[part]), terms, frames, generator=generator)
+
+    for frames in range(settings.stage, len(noise), settings.stage) if settings.stage else ():
+        noise = torch.cat([solve(frames).warm_start, noise[frames:]])
+    return solve(len(noise))
 
 
 def _sample_smooth_noise(

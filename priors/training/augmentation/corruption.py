@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, GroundPose, decode_local_rotations, integrate_root
+from mapctl.features import GroundPose
+from mapctl.pose import BodyPose
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 
@@ -77,13 +78,11 @@ def make_clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
     """The features as a perfect capture, from the origin."""
     batch, frames = features.shape[:2]
     origin = GroundPose(features.new_zeros(batch, 2), features.new_zeros(batch))
-    ground, heading = integrate_root(features, origin)
-    height = LAYOUT.pick(features, "root_height")
-    quats = decode_local_rotations(features, heading)
+    pose = BodyPose.of_features(features, origin)
     return Capture(
-        torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
-        quats[..., 0, :],
-        LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3)),
+        pose.root_position,
+        pose.local_quat_xyzw[..., 0, :],
+        pose.joint_rotvec,
         torch.ones(batch, frames, dtype=torch.bool),
         torch.ones(batch, frames, _JOINTS, dtype=torch.bool),
         torch.zeros(batch),

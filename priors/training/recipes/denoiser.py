@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from mapctl import kinematics, rotations
+from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
-from mapctl.recording import Cleaned
+from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL
 from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
@@ -141,14 +141,14 @@ def compute_denoiser_losses(
     cleaned = network(corrupt(clean, settings.corruption, generator))
     angles = torch.cat([clean.tilt, clean.joints.flatten(2)], dim=-1)
     bits = LAYOUT.pick(windows, "contacts")
-    wanted = compute_joint_positions(Cleaned(clean.root, clean.heading, angles, bits))
-    got = compute_joint_positions(cleaned)
+    packed = torch.cat([clean.root, clean.heading[..., None], angles], dim=-1)
+    wanted, got = BodyPose.unpack(packed).joints_world(), cleaned.pose.joints_world()
     place = 100 * _smooth_norm(got - wanted).mean()
     slip = 100 * _smooth_norm(torch.diff(got - wanted, dim=1))
     planted = bits[:, 1:] * bits[:, :-1]
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
-    turned = (cleaned.angles - angles).abs().mean()
-    contacts = cross_entropy(cleaned.contacts.float(), bits)
+    turned = (cleaned.pose.angles - angles).abs().mean()
+    contacts = cross_entropy(cleaned.contact_logits.float(), bits)
     loss = (
         place
         + settings.pace * slip.mean()
@@ -163,17 +163,6 @@ def compute_denoiser_losses(
         "angles_deg": torch.rad2deg(turned),
         "contacts_nats": contacts,
     }
-
-
-def compute_joint_positions(cleaned: Cleaned) -> Float[Tensor, "batch frames joints 3"]:
-    """In the world on canonical bones, metres."""
-    tilt, others = cleaned.angles[..., :2], cleaned.angles[..., 2:].unflatten(-1, (-1, 3))
-    hips = torch.stack([tilt[..., 0], torch.zeros_like(cleaned.heading), tilt[..., 1]], dim=-1)
-    turns = rotations.rotation_vector_to_matrix(torch.cat([hips[..., None, :], others], dim=-2))
-    x, y, z = kinematics.positions_from_matrices(CANONICAL, turns).unbind(-1)
-    sine, cosine = torch.sin(cleaned.heading)[..., None], torch.cos(cleaned.heading)[..., None]
-    turned = torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], dim=-1)
-    return turned + cleaned.root[..., None, :]
 
 
 def validate(network: DenoiserNetwork, corpus: Corpus, settings: DenoiserSettings) -> dict[str, Any]:
