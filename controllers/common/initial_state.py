@@ -57,8 +57,8 @@ def select_initial_state(
     """
     wanted = float(arcs[1] - arcs[0]) * fps
     ahead = min(_LOOK_AHEAD, len(arcs) - 1)
-    near = (prior.starts.speed - wanted).abs().argsort()[:_CANDIDATES]
-    state = prior.starts.state.pick(near)
+    near = (prior.initial_states.speed - wanted).abs().argsort()[:_CANDIDATES]
+    state = prior.initial_states.state.pick(near)
     noise = torch.zeros(len(near), _ROLLOUT_FRAMES, LAYOUT.continuous)
     with torch.no_grad():
         features, _ = prior.rollout(state, noise, prior.plan(state, noise))
@@ -98,7 +98,7 @@ def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Te
 
 def start_from_state(state: Any, place: GroundPose, skeleton: Skeleton) -> MotionStart:
     """A density's state (batch of one) as the beginning of a motion whose first frame stands at a place."""
-    first = state.previous
+    first = state.last_frame
     before = place.before(
         LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
     )

@@ -64,7 +64,9 @@ def clean_up_feet(
     """
     settings = settings or FootCleanupSettings()
     still = torch.zeros(0, skeleton.num_joints, 3)
-    done = CommittedFrames(state, GroundPose.origin(), state.previous.float(), still, torch.zeros(0, LAYOUT.continuous))
+    done = CommittedFrames(
+        state, GroundPose.origin(), state.last_frame.float(), still, torch.zeros(0, LAYOUT.continuous)
+    )
     waiting, left = torch.zeros(0, LAYOUT.size), frames
     for piece in pieces:
         waiting = torch.cat([waiting, piece.float()])

@@ -33,10 +33,10 @@ class WindowContext:
 
     def trial(self, features: Tensor, noise: Tensor, density: Tensor, contacts: Tensor) -> Trial:
         """A trial in this context."""
-        planted = LAYOUT.pick(self.state.previous, "contacts") > 0.5
+        planted = LAYOUT.pick(self.state.last_frame, "contacts") > 0.5
         return Trial(features, self.place, noise, density, contacts, self.before, self.skeleton, self.fps, planted)
 
 
 def _expand_state(state: Any, batch: int) -> Any:
     """The state for a batch of candidates."""
-    return state if state.batch == batch else state.repeat(batch)
+    return state.expand(batch)

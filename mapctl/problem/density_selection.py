@@ -7,7 +7,6 @@ less the sum of the logarithms of the standard deviations of the values. Contact
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from torch import Tensor
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.motion import Motion
+from mapctl.protocols import Density, DensityState
 
 SELECTION_WINDOW = 96
 """Frames over which a density's trust is told: of the windows of denoising, and of a card's `windows`."""
@@ -27,8 +27,8 @@ _NON_FINITE_LOG_DENSITY = -1e6  # nats
 class DensityChoice:
     """The density under which a motion is likeliest."""
 
-    density: Any
-    """Of those given."""
+    density: Density
+    """One of those given."""
     nats: Mapping[str, float]
     """By name of each density, the mean log density of a frame, physical units."""
 
@@ -59,11 +59,12 @@ class DensityInterval:
 
 
 def select_density(
-    densities: Sequence[Any], features: Float[Tensor, "frames size"], states: Sequence[Any]
+    densities: Sequence[Density], features: Float[Tensor, "frames size"], states: Sequence[DensityState]
 ) -> DensityChoice:
     """Of some densities with their states before the frames. RequestError where there are none.
 
-    To score a proposal, blur the densities first (`density.blurred(spread())`): they are sharper than it is right.
+    To score a proposal, give the densities its errors first (`density.with_observation_noise(proposal_sigma())`): they
+    are sharper than it is right.
     """
     if not densities:
         raise RequestError("no density to choose from")
@@ -75,13 +76,13 @@ def select_density(
     return DensityChoice(max(densities, key=lambda density: nats[density.name]), nats)
 
 
-def select_density_for_motion(densities: Sequence[Any], motion: Motion) -> DensityChoice:
+def select_density_for_motion(densities: Sequence[Density], motion: Motion) -> DensityChoice:
     """The same of a whole canonical motion at any rate, from its first frame on.
 
     RequestError where there are none; MapctlError for a motion of fewer than two frames at the priors' rate.
     """
     features = encode(motion.resample(PRIOR_FPS))[0].float()
-    return select_density(densities, features[1:], [density.initial_state(features[:1]) for density in densities])
+    return select_density(densities, features[1:], [density.start_after(features[:1]) for density in densities])
 
 
 def proposal_sigma() -> Float[Tensor, " continuous"]:
@@ -101,7 +102,7 @@ def to_physical_log_density(
     return log_density - feature_std[: LAYOUT.continuous].log().sum()
 
 
-def _mean_log_density(density: Any, features: Tensor, state: Any) -> float:
+def _mean_log_density(density: Density, features: Tensor, state: DensityState) -> float:
     """Mean of the frames; hopeless where it is not finite."""
     found = float(to_physical_log_density(density.log_prob(features[None], state), density.feature_std).mean())
     return found if math.isfinite(found) else _NON_FINITE_LOG_DENSITY
