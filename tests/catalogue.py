@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import torch
 from helpers import generator, tiny_density, tiny_model, walk
+from tiny_refiner import refiner_of
 from toy_density import toy_density
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.features import encode
-from mapctl.protocols import Density
+from mapctl.features import LAYOUT, encode
+from mapctl.protocols import Density, Refiner
 from mapctl.terms import (
     Clearance,
     FootContact,
@@ -103,6 +104,18 @@ NETWORKS: dict[str, LstmGmm] = {
     if isinstance(density, LstmGmmDensity) and not density.use_fast
 }
 """The networks of the reference path."""
+
+
+class _Rounding(Refiner):
+    """Contact bits are made hard, nothing else is changed."""
+
+    def stream(self, pieces):
+        for piece in pieces:
+            yield torch.cat([piece[..., : LAYOUT.continuous], piece[..., LAYOUT.continuous :] > 0.5], dim=-1)
+
+
+REFINERS: dict[str, Refiner] = {"lstm": refiner_of(), "toy": _Rounding()}
+"""The LSTM of drawn weights, and one that knows only `mapctl.protocols`."""
 
 
 def moved_curve(curve: Curve, turn: float, shift: tuple[float, float]) -> Curve:
