@@ -13,8 +13,8 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 import priors
-from controllers.inbetweening import infill
 from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.inbetweening.infill import infill
 from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
