@@ -1,17 +1,72 @@
-"""What the core asks of learned models. A model has the roles it can fill; none is given a fake one."""
+"""What the core asks of learned models. Subclass a protocol to write a new one: its abstract methods are all that must
+be written, all else has a default.
 
-from collections.abc import Iterable, Iterator
+Everywhere below, features are frames of `mapctl.features.LAYOUT` at PRIOR_FPS: `size` numbers, physical units (metres
+and radians, steps and turns by frame), of which the first `continuous` are real-valued and the last two are contact
+bits, 0 or 1, of the left and the right toe. Tensors are float32 on the CPU, batch first, and no batch row depends on
+another.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT
 from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.recording import Capture, CaptureProposal
 
-State = TypeVar("State")
+AnyState = TypeVar("AnyState", bound="DensityState")
+
+
+@runtime_checkable
+class DensityState(Protocol):
+    """What a density has seen so far, one batch row for each independent motion; never changed in place."""
+
+    last_frame: Float[Tensor, "batch size"]
+    """Features of the last frame seen."""
+
+    @property
+    def batch(self) -> int:
+        """Number of independent states."""
+        return len(self.last_frame)
+
+    @abstractmethod
+    def pick(self: AnyState, rows: Int[Tensor, " picked"]) -> AnyState:
+        """Return the states of some batch rows, in that order; a row may be named more than once."""
+        ...
+
+    def expand(self: AnyState, count: int) -> AnyState:
+        """Return a batch of `count`: copies of a batch of one, or the state itself if it has as many.
+
+        ValueError for any other batch.
+        """
+        if self.batch == count:
+            return self
+        if self.batch != 1:
+            raise ValueError(f"a state of batch {self.batch} cannot serve a batch of {count}")
+        return self.pick(torch.zeros(count, dtype=torch.long))
+
+
+@dataclass(frozen=True, eq=False)
+class LastFrameState(DensityState):
+    """State of a density that remembers nothing but the last frame."""
+
+    last_frame: Float[Tensor, "batch size"]
+    """Features of the last frame seen."""
+
+    def pick(self, rows: Int[Tensor, " picked"]) -> "LastFrameState":
+        """Return the states of some batch rows."""
+        return LastFrameState(self.last_frame[rows])
+
+
+State = TypeVar("State", bound=DensityState)
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,84 +74,16 @@ class DiscreteChoices:
     """The discrete choices along a rollout, fixed while its noise is optimised."""
 
     component: Int[Tensor, "batch frames"]
-    """Mixture component of each frame."""
+    """Mixture component of each frame; 0 where a density has only one."""
     contacts: Bool[Tensor, "batch frames 2"]
     """Left and right toe planted."""
 
 
-@runtime_checkable
-class Density(Protocol[State]):
-    """A density over next frames with explicit state: what was seen so far, batch first."""
-
-    def log_prob(
-        self, features: Float[Tensor, "batch frames size"], state: State, *, inputs: Tensor | None = None
-    ) -> Float[Tensor, "batch frames"]:
-        """Log density (nats, normalised units) of each frame given those before it, or given noisy `inputs` of them."""
-        ...
-
-    def sample(
-        self, state: State, frames: int, generator: torch.Generator, *, temperature: float = 1.0
-    ) -> tuple[Float[Tensor, "batch frames size"], State]:
-        """Frames drawn one after the other, and the state after them."""
-        ...
-
-    def advance(self, state: State, committed: Float[Tensor, "batch frames size"]) -> State:
-        """The state after the committed frames were seen."""
-        ...
-
-    def plan(self, state: State, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
-        """The likeliest discrete choices along the rollout that the noise gives."""
-        ...
-
-    def latents(
-        self, features: Float[Tensor, "batch frames size"], state: State
-    ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames continuous"]]:
-        """The plan and the noise whose rollout is the features."""
-        ...
-
-    def rollout(
-        self, state: State, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
-    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """Features x = mu_k + sigma_k noise with the plan's components k, and their log density; differentiable."""
-        ...
-
-
-@runtime_checkable
-class Inbetweener(Protocol):
-    """Proposes the frames and joints that a motion lacks."""
-
-    def propose(self, image: PositionImage) -> ProposedPositions:
-        """All joints in all frames; known ones may move."""
-        ...
-
-
-@runtime_checkable
-class Denoiser(Protocol):
-    """Proposes the motion behind a capture."""
-
-    def clean(self, capture: Capture) -> CaptureProposal:
-        """The proposal, of the capture's frames."""
-        ...
-
-
-@runtime_checkable
-class Refiner(Protocol):
-    """Makes a synthesised motion look captured without changing what it does."""
-
-    def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
-        """The refined frames."""
-        ...
-
-    def stream(self, pieces: Iterable[Float[Tensor, "batch piece size"]]) -> Iterator[Float[Tensor, "batch out size"]]:
-        """The same frames, from consecutive pieces, some frames behind them, in memory that does not grow."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
-class InitialStates:
+class InitialStates(Generic[State]):
     """Moments of mocap from which a density may begin: its state after a stretch of a clip."""
 
-    state: Any
+    state: State
     """A density's state, one batch row a start."""
     speed: Float[Tensor, " starts"]
     """Mean speed over the second before, m/s."""
@@ -121,3 +108,169 @@ class DataLimits:
     def max_steering_speed(self) -> float:
         """Highest speed that is asked of the prior while steering, m/s: a tenth beyond what its data show."""
         return 1.1 * self.fastest
+
+
+@runtime_checkable
+class Density(Protocol[State]):
+    """A density over the next frame given those before, which an explicit state sums up; the prior of a MAP problem.
+
+    Densities never change: what makes another of one returns a new one. They are told apart by identity, so a dataclass
+    needs eq=False. Methods take a state with as many batch rows as the other arguments.
+    """
+
+    name: str
+    """Name by which it was asked for, for reports; different among the densities of one problem."""
+    limits: DataLimits
+    """Speeds and turning that its training data show."""
+    initial_states: InitialStates[State]
+    """States to begin from, at least one."""
+
+    @abstractmethod
+    def start_after(self, last_frame: Float[Tensor, "batch size"]) -> State:
+        """Return a state that has seen one frame and remembers nothing before it."""
+        ...
+
+    @abstractmethod
+    def advance(self, state: State, committed: Float[Tensor, "batch frames size"]) -> State:
+        """Return the state after one or more further frames were seen, without gradient."""
+        ...
+
+    @abstractmethod
+    def log_prob(
+        self,
+        features: Float[Tensor, "batch frames size"],
+        state: State,
+        *,
+        inputs: Float[Tensor, "batch frames size"] | None = None,
+    ) -> Float[Tensor, "batch frames"]:
+        """Compute the log density of each frame given those before it, contact bits included; differentiable in both.
+
+        In nats, of features divided by `feature_std`. Where `inputs` are given, they stand in for the frames wherever
+        a frame is what is seen before the next (teacher forcing with noise), and features are only what is scored.
+        """
+        ...
+
+    @abstractmethod
+    def plan(self, state: State, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
+        """Choose the likeliest component and contact bits of each frame along the rollout that the noise gives."""
+        ...
+
+    @abstractmethod
+    def rollout(
+        self, state: State, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """Roll out features x = mu_k + sigma_k noise with the plan's components k and contacts, and their log density
+        under these (nats, as `log_prob`); both differentiable in the noise.
+
+        Standard normal noise gives the density itself, zero noise its plain continuation. A sigma may be a matrix.
+        """
+        ...
+
+    @abstractmethod
+    def latents(
+        self, features: Float[Tensor, "batch frames size"], state: State
+    ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames continuous"]]:
+        """Find the plan and the noise whose rollout is the features; the inverse of `rollout`, without gradient."""
+        ...
+
+    def sample(
+        self, state: State, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+    ) -> tuple[Float[Tensor, "batch frames size"], State]:
+        """Draw frames one after the other, and the state after them; the same generator gives the same frames.
+
+        `temperature` scales the noise. Default: a rollout of normal noise with the likeliest discrete choices.
+        """
+        noise = temperature * torch.randn(state.batch, frames, LAYOUT.continuous, generator=generator)
+        with torch.no_grad():
+            features, _ = self.rollout(state, noise, self.plan(state, noise))
+        return features, self.advance(state, features)
+
+    def infer_state(self, features: Float[Tensor, "frames size"]) -> State:
+        """Find the state (batch of one) before a motion's first frame that makes the motion likely.
+
+        Default: an empty memory, and a frame before the first that is as the first.
+        """
+        return self.start_after(features[:1])
+
+    @property
+    def feature_mean(self) -> Float[Tensor, " size"]:
+        """Mean of the training data, physical units: where searches over features begin. Default: zeros."""
+        return torch.zeros(LAYOUT.size)
+
+    @property
+    def feature_std(self) -> Float[Tensor, " size"]:
+        """Physical size of the unit in which `log_prob` takes each feature. Default: ones, physical units."""
+        return torch.ones(LAYOUT.size)
+
+    @property
+    def reference_log_density(self) -> float:
+        """Log density a frame (nats, physical units, with a proposal's observation noise) below which motion is not
+        like the training data, so that the density counts less. Default: minus infinity, it always counts in full.
+        """
+        return -math.inf
+
+    def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "Density[State]":
+        """Return the density of the same motion seen with independent errors of this sigma (physical units); its
+        rollouts may stay as they are. Default: itself, for a density that is not sharper than proposals are right.
+        """
+        return self
+
+    @property
+    def labels(self) -> Mapping[str, Sequence[str]]:
+        """Values by group (gait, style) that it can be conditioned on. Default: none."""
+        return {}
+
+    def conditioned_on(self, labels: Sequence[str]) -> "Density[State]":
+        """Return the density given labels of its data (`run`, `style=active`), with initial states to match.
+
+        RequestError for a label that it does not know. Default: refuse all.
+        """
+        if labels:
+            raise RequestError(f"the prior {self.name!r} knows no label {labels[0]!r}, it has none")
+        return self
+
+    def conditioned_like_start(self, start: int) -> "Density[State]":
+        """Return the density given the labels of the clip that an initial state was taken from. Default: itself."""
+        return self
+
+    def warm_up(self) -> None:
+        """Load or compile what the first use would, so that no clock counts it. Default: nothing."""
+
+
+@runtime_checkable
+class Inbetweener(Protocol):
+    """Proposes the frames and joints that a motion lacks."""
+
+    def propose(self, image: PositionImage) -> ProposedPositions:
+        """All joints in all frames; known ones may move."""
+        ...
+
+
+@runtime_checkable
+class Denoiser(Protocol):
+    """Proposes the motion behind a capture with noise and missing joints."""
+
+    @abstractmethod
+    def clean(self, capture: Capture) -> CaptureProposal:
+        """Propose a motion of the capture's frames (two or more), on canonical bones at PRIOR_FPS, for each batch row.
+
+        What the capture's masks call unseen says nothing and is proposed as well.
+        """
+        ...
+
+
+@runtime_checkable
+class Refiner(Protocol):
+    """Makes a synthesised motion look captured without changing what it does."""
+
+    @abstractmethod
+    def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
+        """Refine consecutive pieces of one motion, in memory that does not grow; contact bits are 0 or 1.
+
+        As many frames come out as went in, a fixed number of frames behind, cut into pieces in any way.
+        """
+        ...
+
+    def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
+        """Refine a whole motion. Default: `stream` of one piece."""
+        return torch.cat(list(self.stream([features])), dim=1)

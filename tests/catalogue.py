@@ -1,11 +1,16 @@
 """One instance of every term, and small densities: what the contract tests, and only they, must know of them."""
 
+from dataclasses import replace
+
 import torch
-from helpers import generator, tiny_model, walk
+from helpers import generator, tiny_density, tiny_model, walk
+from tiny_refiner import refiner_of
+from toy_density import toy_density
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.features import encode
+from mapctl.features import LAYOUT, encode
+from mapctl.protocols import Density, Refiner
 from mapctl.terms import (
     Clearance,
     FootContact,
@@ -20,6 +25,7 @@ from mapctl.terms import (
     Support,
     Term,
 )
+from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm
 
 FRAMES = 12
@@ -52,18 +58,6 @@ TERMS: dict[str, Term] = {
 """Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
 
 
-def densities(dtype: torch.dtype = torch.float64) -> dict[str, LstmGmm]:
-    """Random networks: one Gaussian, several, and the paper's variant: absolute frames, diagonal Gaussians."""
-    networks = {
-        "one": tiny_model(components=1, dtype=dtype),
-        "several": tiny_model(components=3, seed=1, dtype=dtype),
-        "absolute": tiny_model(components=2, seed=2, retain=0.0, correlated=False, dtype=dtype),
-    }
-    for seed, network in enumerate(networks.values()):
-        excite(network, seed)
-    return networks
-
-
 def excite(network: LstmGmm, seed: int) -> None:
     """Larger output weights, so that components and contact bits change along a rollout; values correlate."""
     with torch.no_grad():
@@ -72,6 +66,43 @@ def excite(network: LstmGmm, seed: int) -> None:
         if network.correlation is not None:
             values = network.correlation
             values += 0.1 * torch.randn(values.shape, generator=generator(seed), dtype=values.dtype)
+
+
+def _lstm_gmm(dtype: torch.dtype = torch.float64, *, seed: int = 0, **shape) -> LstmGmmDensity:
+    """A random network on the reference path."""
+    network = tiny_model(seed=seed, dtype=dtype, **shape)
+    excite(network, seed)
+    return replace(tiny_density(dtype=dtype), reference=network)
+
+
+DENSITIES: dict[str, Density] = {
+    "one": _lstm_gmm(components=1),
+    "several": _lstm_gmm(components=3, seed=1),
+    "absolute": _lstm_gmm(components=2, seed=2, retain=0.0, correlated=False),
+    "kernels": replace(_lstm_gmm(torch.float32, components=3, seed=1), use_fast=True),
+    "toy": toy_density(torch.float64),
+}
+"""LSTM-GMM of one Gaussian, of several, and the paper's variant (absolute frames, diagonal Gaussians), on the reference
+path; the second on the fast path; and one that knows only `mapctl.protocols`."""
+
+NETWORKS: dict[str, LstmGmm] = {
+    kind: density.reference
+    for kind, density in DENSITIES.items()
+    if isinstance(density, LstmGmmDensity) and not density.use_fast
+}
+"""The networks of the reference path."""
+
+
+class _Rounding(Refiner):
+    """Contact bits are made hard, nothing else is changed."""
+
+    def stream(self, pieces):
+        for piece in pieces:
+            yield torch.cat([piece[..., : LAYOUT.continuous], piece[..., LAYOUT.continuous :] > 0.5], dim=-1)
+
+
+REFINERS: dict[str, Refiner] = {"lstm": refiner_of(), "toy": _Rounding()}
+"""The LSTM of drawn weights, and one that knows only `mapctl.protocols`."""
 
 
 def moved_curve(curve: Curve, turn: float, shift: tuple[float, float]) -> Curve:

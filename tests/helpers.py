@@ -182,11 +182,12 @@ def tiny_density(
     model = tiny_model(width=width, components=components, seed=seed)
     data = corpus()
     found = select_initial_states(model, data, count=starts, generator=generator(seed))
-    shown, names = asdict(measure_data_limits(data)), {"starts": list(found.names)}
-    card = Card("lstm-gmm", model.config.as_card(), licence="none", data=names, abilities=shown, **Card.layout_fields())
-    density = LstmGmmDensity("tiny", model.to(dtype), found, card, use_fast=False)
+    limits, names = measure_data_limits(data), {"starts": list(found.names)}
+    shape, shown = model.config.as_card(), asdict(limits)
+    card = Card("lstm-gmm", shape, licence="none", data=names, abilities=shown, **Card.layout_fields())
+    density = LstmGmmDensity("tiny", model.to(dtype), found, limits, card, use_fast=False)
     if dtype is not torch.float32:
-        for part in ("previous", "hidden", "cell"):
+        for part in ("last_frame", "hidden", "cell"):
             object.__setattr__(found.state, part, getattr(found.state, part).to(dtype))
     return density
 

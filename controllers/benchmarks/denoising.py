@@ -18,7 +18,7 @@ from controllers.inbetweening.infill import infill
 from mapctl import metrics, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
-from mapctl.protocols import Denoiser, Inbetweener
+from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording.inspection import Inspection, inspect_recording
 
 Row = dict[str, Any]
@@ -64,7 +64,7 @@ def benchmark_denoising(
     denoiser: Denoiser,
     *,
     infiller: Inbetweener | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """By condition over all clips, then by kind of clip in the standard condition, then clean clips."""
@@ -100,7 +100,7 @@ def evaluate_clip(
     truth: Motion,
     spoilt: CorruptedClip,
     denoiser: Denoiser,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     infiller: Inbetweener | None = None,
 ) -> Row:
     """Mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside mocap's,

@@ -13,7 +13,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.foot_contact import TOES
 
@@ -26,7 +26,7 @@ Row = dict[str, Any]
 def benchmark_gaps(
     kinds: Mapping[str, Sequence[Motion]],
     infiller: Inbetweener,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
@@ -52,7 +52,7 @@ def benchmark_gaps(
 
 
 def _evaluate_gap(
-    clip: Motion, length: int, beside: int, infiller: Inbetweener, densities: Sequence[Any]
+    clip: Motion, length: int, beside: int, infiller: Inbetweener, densities: Sequence[Density]
 ) -> Row | None:
     """None for a clip that is too short."""
     if clip.num_frames < length + 2 * beside:

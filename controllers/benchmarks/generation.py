@@ -20,7 +20,7 @@ from mapctl.metrics.realism import (
     spread_ratios,
 )
 from mapctl.motion import Motion
-from mapctl.protocols import Refiner
+from mapctl.protocols import Density, Refiner
 
 Row = dict[str, Any]
 
@@ -55,7 +55,10 @@ class _Variant:
 
 
 def benchmark_generation(
-    prior: Any, refiner: Refiner | None, mocap: Sequence[Motion], settings: GenerationBenchmarkSettings | None = None
+    prior: Density,
+    refiner: Refiner | None,
+    mocap: Sequence[Motion],
+    settings: GenerationBenchmarkSettings | None = None,
 ) -> list[Row]:
     """A row for mocap and one for each variant, walking and running apart, then all together.
 
@@ -100,7 +103,9 @@ def _list_variants(refiner: Refiner | None) -> list[_Variant]:
     return [_Variant("density", None, None), _Variant("density, footing", None, FootCleanupSettings()), *refined]
 
 
-def _generate_clips(prior: Any, variant: _Variant, settings: GenerationBenchmarkSettings) -> tuple[list[Motion], float]:
+def _generate_clips(
+    prior: Density, variant: _Variant, settings: GenerationBenchmarkSettings
+) -> tuple[list[Motion], float]:
     """Clips, and milliseconds of processor time a frame."""
     wishes, clips = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
     starts = sample_stratified_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
@@ -112,7 +117,7 @@ def _generate_clips(prior: Any, variant: _Variant, settings: GenerationBenchmark
     return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
 
 
-def _generate_clip(prior: Any, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
+def _generate_clip(prior: Density, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
     generator = torch.Generator().manual_seed(seed)
     return generate(prior, seconds=seconds, generator=generator, settings=wishes, refiner=variant.refiner)
 
@@ -122,10 +127,10 @@ def _compare_gait_spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread
     return {f"{name}_spread": ratio for name, ratio in spread_ratios(measure_gait_spread(clips), data).items()}
 
 
-def _measure_diversity(prior: Any, variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
+def _measure_diversity(prior: Density, variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
     """Average pairwise distance of samples from one start, mean over a few starts."""
     found = []
-    for start in range(0, len(prior.starts.speed), max(1, len(prior.starts.speed) // 4)):
+    for start in range(0, len(prior.initial_states.speed), max(1, len(prior.initial_states.speed) // 4)):
         wishes = replace(GenerateSettings(foot_cleanup=variant.foot_cleanup), start=start)
         samples = [
             _generate_clip(prior, variant, wishes, settings.sample_seconds, settings.seed + k)

@@ -1,7 +1,7 @@
 """What the solver costs and which of its choices pay: the tables behind `mapctl bench`. Ratios within one run."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.problem.warm_start import BestOfSamples, SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.terms import LatentPrior, Likelihood
@@ -46,15 +47,18 @@ class SolverBenchmarkSettings:
     """Of starts and draws."""
 
 
-def benchmark_speed(prior: Any, settings: SolverBenchmarkSettings = SolverBenchmarkSettings()) -> list[Row]:
-    """Energy and gradient of one window on the fast path and on the torch reference, then whole solves."""
-    reference = replace(prior, use_fast=False)
+def benchmark_speed(
+    prior: Density, reference: Density, settings: SolverBenchmarkSettings = SolverBenchmarkSettings()
+) -> list[Row]:
+    """Energy and gradient of one window on the fast path and on the torch `reference`, then whole solves."""
     rows = [_benchmark_evaluation(prior, reference, count, settings) for count in settings.particles]
     return rows + [_benchmark_follow(prior, seconds, settings) for seconds in settings.lengths]
 
 
-def benchmark_free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed: int = 0) -> list[Row]:
-    """Long free runs at temperature 1: a row each, and one of their means beside the training data's own values.
+def benchmark_free_run(
+    prior: Density, data: Mapping[str, float], *, runs: int = 8, frames: int = 10_000, seed: int = 0
+) -> list[Row]:
+    """Long free runs at temperature 1: a row each, and one of their means beside the training `data`'s own values.
 
     A character that had stopped would show in its slowest second; one that came apart in its largest feature, in
     standard deviations.
@@ -74,22 +78,21 @@ def benchmark_free_run(prior: Any, *, runs: int = 8, frames: int = 10_000, seed:
                 "largest_feature_sigma": float(_standardise_features(prior, features).abs().max()),
             }
         )
-    data = prior.card.quality["data"]
     return [*rows, {"run": "all", **summarise_states(torch.cat(everything))}, {"run": "training data", **data}]
 
 
-def _sample_free_run(prior: Any, frames: int, seed: int) -> Tensor:
+def _sample_free_run(prior: Density, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     told, state, _ = initialise_generation(prior, GenerateSettings(), None, generator)
     return told.sample(state, frames, generator)[0][0]
 
 
-def _standardise_features(prior: Any, features: Tensor) -> Tensor:
+def _standardise_features(prior: Density, features: Tensor) -> Tensor:
     size = LAYOUT.continuous
     return ((features - prior.feature_mean) / prior.feature_std)[..., :size]
 
 
-def benchmark_ablation(prior: Any, settings: SolverBenchmarkSettings = SolverBenchmarkSettings()) -> list[Row]:
+def benchmark_ablation(prior: Density, settings: SolverBenchmarkSettings = SolverBenchmarkSettings()) -> list[Row]:
     """Starts and unknowns compared: energy, path error and time on three smooth curves and a corner."""
     shapes = {
         "circle:4": curves.circle(radius=4.0),
@@ -104,7 +107,7 @@ def benchmark_ablation(prior: Any, settings: SolverBenchmarkSettings = SolverBen
     ]
 
 
-def list_ablation_variants(prior: Any) -> dict[str, FollowSettings]:
+def list_ablation_variants(prior: Density) -> dict[str, FollowSettings]:
     """The variants of the ablation by name."""
     plain, size = LatentNoiseSolver(), LAYOUT.continuous
     best = replace(plain, proposal=BestOfSamples(count=32), budget=Budget(evaluations=152))
@@ -120,7 +123,7 @@ def list_ablation_variants(prior: Any) -> dict[str, FollowSettings]:
 
 
 def _evaluate_variant(
-    prior: Any, curve: Curve, wishes: FollowSettings, label: str, settings: SolverBenchmarkSettings
+    prior: Density, curve: Curve, wishes: FollowSettings, label: str, settings: SolverBenchmarkSettings
 ) -> Row:
     began = time.process_time()
     solution = _follow_to_end(prior, curve, settings.seconds, settings.seed, wishes)
@@ -142,7 +145,7 @@ def _target_energy(solution: Solution) -> float:
     return float(sum(e.energy.sum() for e in solution.ledger.entries if e.name in ("path", "footing")))
 
 
-def _benchmark_evaluation(prior: Any, reference: Any, count: int, settings: SolverBenchmarkSettings) -> Row:
+def _benchmark_evaluation(prior: Density, reference: Density, count: int, settings: SolverBenchmarkSettings) -> Row:
     fast, slow = (_time_evaluation(p, count, settings) for p in (prior, reference))
     return {
         "what": f"energy and gradient, 34 frames, {count} candidates",
@@ -153,7 +156,7 @@ def _benchmark_evaluation(prior: Any, reference: Any, count: int, settings: Solv
     }
 
 
-def _time_evaluation(prior: Any, count: int, settings: SolverBenchmarkSettings) -> float:
+def _time_evaluation(prior: Density, count: int, settings: SolverBenchmarkSettings) -> float:
     curve, wishes = curves.circle(radius=4.0), FollowSettings()
     frames = wishes.window.frames
     arcs = torch.arange(2 * frames, dtype=torch.float64) * 1.2 / PRIOR_FPS
@@ -168,7 +171,7 @@ def _time_evaluation(prior: Any, count: int, settings: SolverBenchmarkSettings) 
     return 1000 * _time_fastest(lambda: objective.energy_and_gradient(unknowns), settings.repeats)
 
 
-def _benchmark_follow(prior: Any, seconds: float, settings: SolverBenchmarkSettings) -> Row:
+def _benchmark_follow(prior: Density, seconds: float, settings: SolverBenchmarkSettings) -> Row:
     began = time.process_time()
     solution = _follow_to_end(prior, curves.circle(radius=4.0), seconds, settings.seed, FollowSettings())
     frames = solution.motion.num_frames
@@ -180,7 +183,7 @@ def _benchmark_follow(prior: Any, seconds: float, settings: SolverBenchmarkSetti
     }
 
 
-def _follow_to_end(prior: Any, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:
+def _follow_to_end(prior: Density, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:
     """A walk to its end: half a one has no place in a table, so Ctrl-C ends the bench."""
     generator = torch.Generator().manual_seed(seed)
     solution = follow(prior, curve, seconds=seconds, settings=wishes, generator=generator)

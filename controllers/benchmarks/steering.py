@@ -16,6 +16,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics import measure
 from mapctl.metrics.travel import measure_commands
+from mapctl.protocols import Density
 
 Row = dict[str, Any]
 
@@ -36,7 +37,7 @@ class SteeringBenchmarkSettings:
     """Of the commands and the first pose."""
 
 
-def benchmark_steering(prior: Any, settings: SteeringBenchmarkSettings | None = None) -> list[Row]:
+def benchmark_steering(prior: Density, settings: SteeringBenchmarkSettings | None = None) -> list[Row]:
     """A row for each kind of change, and one for all with cost and feet."""
     settings = settings or SteeringBenchmarkSettings()
     generator = torch.Generator().manual_seed(settings.seed)
@@ -64,7 +65,7 @@ def benchmark_steering(prior: Any, settings: SteeringBenchmarkSettings | None = 
     ]
 
 
-def benchmark_pursuit(prior: Any, seed: int = 0) -> list[Row]:
+def benchmark_pursuit(prior: Density, seed: int = 0) -> list[Row]:
     """Curves walked live at 1 m/s by looking half a metre ahead."""
     rows = []
     for name, seconds in (("circle:2", 13.0), ("wave:1x8", 8.5)):

@@ -17,7 +17,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.intent.keyframes import Keys
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.terms.foot_contact import TOES
@@ -33,7 +33,7 @@ Row = dict[str, Any]
 def benchmark_tweening(
     kinds: Mapping[str, Sequence[Motion]],
     infiller: Inbetweener,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
@@ -49,8 +49,8 @@ def benchmark_tweening(
             keys = Keys((0, *inner, TWEEN_FRAMES - 1))
             density = select_likeliest_density(densities, to_canonical(clip)[0])
             roll = partial(roll_through_gaps, densities=[density], generator=draws)
-            best = partial(lowest_energy, count=_NUM_ALTERNATIVES, rollable=densities, generator=draws)
-            ways = (partial(tween, rollable=densities), partial(tween, another=roll), best)
+            best = partial(lowest_energy, count=_NUM_ALTERNATIVES, rollout_densities=densities, generator=draws)
+            ways = (partial(tween, rollout_densities=densities), partial(tween, another=roll), best)
             for method, way in zip(told, ways, strict=True):
                 began = time.perf_counter()
                 made = way(clip, keys, infiller).motion
@@ -62,8 +62,8 @@ def benchmark_tweening(
         ]
         shown = [clip.slice(0, 4 * PRIOR_FPS) for clip in clips if clip.num_frames >= 4 * PRIOR_FPS]
         for count in _END_LENGTHS:
-            for by, extending in (("infiller", ()), ("density", densities)):
-                each = [_evaluate_end(clip, count, infiller, extending) for clip in shown]
+            for by, rollout_densities in (("infiller", ()), ("density", densities)):
+                each = [_evaluate_end(clip, count, infiller, rollout_densities) for clip in shown]
                 rows += (
                     [
                         {
@@ -111,10 +111,10 @@ def _measure_worst_frames(places: Tensor, ends: Sequence[int], toes: Sequence[in
     }
 
 
-def _evaluate_end(clip: Motion, count: int, infiller: Inbetweener, extending: Sequence[Any]) -> Row:
+def _evaluate_end(clip: Motion, count: int, infiller: Inbetweener, rollout_densities: Sequence[Density]) -> Row:
     first = clip.num_frames - count
     began = time.perf_counter()
-    made = infill(clip, infiller, [Mask(ALL, first, clip.num_frames)], extending=extending).motion
+    made = infill(clip, infiller, [Mask(ALL, first, clip.num_frames)], rollout_densities=rollout_densities).motion
     seconds = time.perf_counter() - began
     away = (made.joint_positions() - clip.joint_positions())[first:].norm(dim=-1)
     ends = [each.slice(first, clip.num_frames) for each in (made, clip)]

@@ -56,11 +56,11 @@ class Character:
         """A curve as the prior's size sees it."""
         return curve if self.scale == 1.0 else Curve(curve.points / self.scale, curve.closed)
 
-    def abilities(self, abilities: DataLimits) -> DataLimits:
+    def data_limits(self, limits: DataLimits) -> DataLimits:
         """What the prior's data show, at the person's size."""
         if self.scale == 1.0:
-            return abilities
-        return DataLimits(abilities.slowest * self.scale, abilities.fastest * self.scale, abilities.turn_rate)
+            return limits
+        return DataLimits(limits.slowest * self.scale, limits.fastest * self.scale, limits.turn_rate)
 
     def command(self, command: Command) -> Command:
         """A command as the prior's size sees it."""

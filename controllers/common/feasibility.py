@@ -15,16 +15,16 @@ _OVERSHOOT = 0.15  # metres: the last frame of a walk may lie a step of one fram
 _CORNER_SECONDS = 1.0
 
 
-def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], abilities: DataLimits) -> list[str]:
+def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], limits: DataLimits) -> list[str]:
     """Sentences about speeds and corners beyond the prior's data, and about a curve that ends too soon."""
     notes = []
     speeds = torch.diff(arcs) * PRIOR_FPS
     fastest, slowest = round(float(speeds.max()), 3), round(float(speeds.min()), 3)
-    if fastest > abilities.fastest:
-        notes.append(f"{fastest:.2f} m/s is faster than the prior's data, which reach {abilities.fastest:.2f} m/s")
-    if slowest < abilities.slowest:
-        notes.append(f"{slowest:.2f} m/s is slower than the prior's data, which begin at {abilities.slowest:.2f} m/s")
-    notes += _check_corners(request, arcs, abilities)
+    if fastest > limits.fastest:
+        notes.append(f"{fastest:.2f} m/s is faster than the prior's data, which reach {limits.fastest:.2f} m/s")
+    if slowest < limits.slowest:
+        notes.append(f"{slowest:.2f} m/s is slower than the prior's data, which begin at {limits.slowest:.2f} m/s")
+    notes += _check_corners(request, arcs, limits)
     if not request.curve.closed and float(arcs[-1]) > request.curve.length + _OVERSHOOT:
         over = float(arcs[-1]) - request.curve.length
         notes.append(
@@ -54,16 +54,16 @@ def _find_interval_around(off: Bool[Tensor, " frames"], worst: int) -> tuple[int
     return int(before[-1]) + 1 if len(before) else 0, int(after[0]) - 1 if len(after) else len(off) - 1
 
 
-def _check_corners(request: PathRequest, arcs: Tensor, abilities: DataLimits) -> list[str]:
+def _check_corners(request: PathRequest, arcs: Tensor, limits: DataLimits) -> list[str]:
     """The sharpest turn over one second of the walk (or all of a shorter one), if it is beyond the data."""
     step = min(round(_CORNER_SECONDS * PRIOR_FPS), len(arcs) - 1)
     samples = request.curve.curvature(arcs) * torch.gradient(arcs)[0]
     turned = torch.nn.functional.pad(samples.cumsum(0), (1, 0))
     turned = (turned[step:] - turned[:-step]).abs()
     worst = int(turned.argmax())
-    if float(turned[worst]) <= abilities.turn_rate:
+    if float(turned[worst]) <= limits.turn_rate:
         return []
-    degrees, able = (torch.rad2deg(torch.tensor(v)).item() for v in (float(turned[worst]), abilities.turn_rate))
+    degrees, able = (torch.rad2deg(torch.tensor(v)).item() for v in (float(turned[worst]), limits.turn_rate))
     return [
         f"the curve turns {degrees:.0f} degrees within a second at {float(arcs[worst]):.1f} m, "
         f"where the prior's data turn at most {able:.0f}"

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from mapctl.problem.context import WindowContext
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import CommittedFrames
+from mapctl.protocols import Density, DensityState
 from mapctl.rotations import wrap_angle
 from mapctl.skeleton import Skeleton
 from mapctl.terms import Term
@@ -40,7 +40,7 @@ class MotionStart:
 
 
 def select_initial_state(
-    prior: Any,
+    prior: Density,
     curve: Curve,
     arcs: Float[Tensor, " frames"],
     terms_of: Callable[[int, int], Sequence[Term]],
@@ -58,13 +58,13 @@ def select_initial_state(
     """
     wanted = float(arcs[1] - arcs[0]) * fps
     ahead = min(_LOOK_AHEAD, len(arcs) - 1)
-    near = (prior.starts.speed - wanted).abs().argsort()[:_CANDIDATES]
-    state = prior.starts.state.pick(near)
+    near = (prior.initial_states.speed - wanted).abs().argsort()[:_CANDIDATES]
+    state = prior.initial_states.state.pick(near)
     noise = torch.zeros(len(near), _ROLLOUT_FRAMES, LAYOUT.continuous)
     with torch.no_grad():
         features, _ = prior.rollout(state, noise, prior.plan(state, noise))
     places = GroundPose(_first_point(curve).expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs))
-    before, planted = torch.zeros(0, skeleton.num_joints, 3), LAYOUT.pick(state.previous, "contacts") > 0.5
+    before, planted = torch.zeros(0, skeleton.num_joints, 3), LAYOUT.pick(state.last_frame, "contacts") > 0.5
     context = WindowContext(prior, state, places, before, ahead, skeleton, fps, planted, first_frame=1)
     flat = noise[:, :ahead].flatten(1)
     with torch.no_grad():
@@ -98,9 +98,9 @@ def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Te
     return sideways[:, edge:-edge].square().mean(-1).sqrt()
 
 
-def start_from_state(state: Any, place: GroundPose, skeleton: Skeleton) -> MotionStart:
+def start_from_state(state: DensityState, place: GroundPose, skeleton: Skeleton) -> MotionStart:
     """A density's state (batch of one) as the beginning of a motion whose first frame stands at a place."""
-    first = state.previous
+    first = state.last_frame
     before = place.before(
         LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
     )

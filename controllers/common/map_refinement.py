@@ -7,7 +7,6 @@ ahead into the next, and the next goes on from where its committed frames end.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,6 +26,7 @@ from mapctl.problem.ledger import Ledger
 from mapctl.problem.pose_offsets import PoseOffsetSolver
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
 from mapctl.problem.solution import Outcome, WindowRecord
+from mapctl.protocols import Density
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
@@ -98,7 +98,7 @@ def refine(
     capture: Capture,
     settings: RefinementSettings,
     *,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     targets: EffectorTargets | None = None,
 ) -> RefinedMotion:
     """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was. `targets` are

@@ -1,7 +1,6 @@
 """The energy of a finished motion: what it would cost the MAP problem as it stands, whoever proposed it."""
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -14,6 +13,7 @@ from mapctl.problem import density_selection
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import replay
+from mapctl.protocols import Density
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Clearance, Jerk, Likelihood, Support, Term
@@ -23,7 +23,11 @@ _PRECEDING_FRAMES = 3  # frames that the others are seen after
 
 
 def score(
-    motion: Motion, stands: Bool[Tensor, "frames 2"], density: Any, settings: RefinementSettings, rig: Rig | None = None
+    motion: Motion,
+    stands: Bool[Tensor, "frames 2"],
+    density: Density,
+    settings: RefinementSettings,
+    rig: Rig | None = None,
 ) -> Ledger:
     """By term: the likelihood under a density, footing, clearance, what the body stands on, and jerk, of a motion on
     any rig of more than three frames at the prior's rate; `stands` are its contacts at that rate.

@@ -8,7 +8,6 @@ capture's own rig, at its own rate, with all of its frames.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 
@@ -18,7 +17,7 @@ from controllers.denoising.result import DenoiseResult, join_segments
 from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
-from mapctl.protocols import Denoiser
+from mapctl.protocols import Denoiser, Density
 from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import (
     Mask,
@@ -49,7 +48,7 @@ def denoise(
     *,
     masks: Sequence[Mask] = (),
     settings: DenoiseSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> DenoiseResult:
@@ -107,7 +106,7 @@ def _denoise_segment(
     denoiser: Denoiser,
     masks: Sequence[Mask],
     settings: DenoiseSettings,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     rig: Rig,
 ) -> DenoiseResult:
     began = time.perf_counter()

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,7 +21,7 @@ from mapctl.contacts import debounced
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.problem.density_selection import DensityInterval
-from mapctl.protocols import Denoiser
+from mapctl.protocols import Denoiser, Density
 from mapctl.recording import Capture, artefacts
 from mapctl.recording.frequency_bands import split_bands
 from mapctl.recording.inspection import Inspection
@@ -74,7 +73,7 @@ class SegmentDenoiser:
         self.shown = self.bands.at_prior_rate()
         self.capture = self._build_capture(seen)
 
-    def run(self, densities: Sequence[Any]) -> DenoiseResult:
+    def run(self, densities: Sequence[Density]) -> DenoiseResult:
         """Propose, give back, put the feet down, return to the rig."""
         proposal, contacts = self._propose()
         if self.bands.exact:

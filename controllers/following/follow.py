@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,6 +19,7 @@ from mapctl.pose import decode
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
 from mapctl.problem.solution import Solution, Status
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
+from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import FootContact, LatentPrior, Path, Term
 
@@ -62,7 +62,7 @@ class FollowSettings:
 
 
 def follow(
-    prior: Any,
+    prior: Density,
     curve: Curve,
     *,
     seconds: float | None = None,
@@ -75,7 +75,7 @@ def follow(
 ) -> Solution:
     """A character walks the curve from its first point, facing along it.
 
-    `prior` is a Density with `starts` and `abilities` (see mapctl.protocols); `speed` is m/s or a profile along the
+    `speed` is m/s or a profile along the
     arc; without `seconds` the curve is walked once. On another `skeleton` (canonical names) strides are as long as its
     legs, and the toes' rest height is that of `settings.footing`. The first frame is the start pose. The
     motion is at PRIOR_FPS; `Motion.resample` gives other rates. After `deadline_seconds` of wall clock, and at
@@ -100,7 +100,7 @@ def follow(
     done, outcome = solver.solve(
         start.committed, terms_of, frames, generator=generator, progress=progress, deadline=deadline
     )
-    known = (*([lowered] if lowered else ()), *check_path(request, arcs[:frames], person.abilities(prior.abilities)))
+    known = (*([lowered] if lowered else ()), *check_path(request, arcs[:frames], person.data_limits(prior.limits)))
     motion = person.motion(decode(done.features, start.before_first, skeleton=person.small))
     done = replace(done, ledger=person.ledger(done.ledger))
     return _build_solution(motion, done, Status(outcome), known, curve, settings.joint)

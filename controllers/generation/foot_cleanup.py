@@ -6,7 +6,6 @@ closeness keeps what the motion does. Works piece by piece in memory that does n
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,6 +17,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.window_solvers import GuidedNoiseSolver
+from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import FootContact, LatentPrior, MotionTracking, Term
 
@@ -47,11 +47,11 @@ class FootCleanupSettings:
 
 
 def clean_up_feet(
-    prior: Any,
+    prior: Density,
     pieces: Iterable[Float[Tensor, "_ size"]],
     *,
     frames: int,
-    state: Any,
+    state: DensityState,
     generator: torch.Generator,
     settings: FootCleanupSettings | None = None,
     skeleton: Skeleton = CANONICAL,
@@ -63,7 +63,7 @@ def clean_up_feet(
     """
     settings = settings or FootCleanupSettings()
     still = torch.zeros(0, skeleton.num_joints, 3)
-    done = CommittedFrames(state, GroundPose.origin(), state.previous.float(), still)
+    done = CommittedFrames(state, GroundPose.origin(), state.last_frame.float(), still)
     waiting, left = torch.zeros(0, LAYOUT.size), frames
     for piece in pieces:
         waiting = torch.cat([waiting, piece.float()])
@@ -80,7 +80,7 @@ def clean_up_feet(
 
 
 def _clean_up_window(
-    prior: Any,
+    prior: Density,
     done: CommittedFrames,
     window: Float[Tensor, "frames size"],
     count: int,

@@ -6,7 +6,6 @@ stand that the motion's own contact labels call planted. All three work piece by
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,7 +19,7 @@ from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.problem.receding_horizon import replay
-from mapctl.protocols import Refiner
+from mapctl.protocols import Density, DensityState, Refiner
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
 _CHUNK = 600
@@ -51,7 +50,7 @@ class GenerateSettings:
 
 
 def stream(
-    prior: Any,
+    prior: Density,
     *,
     seconds: float,
     generator: torch.Generator,
@@ -72,7 +71,7 @@ def stream(
 
 
 def stream_features(
-    prior: Any,
+    prior: Density,
     *,
     seconds: float,
     generator: torch.Generator,
@@ -85,7 +84,7 @@ def stream_features(
 
 
 def generate(
-    prior: Any,
+    prior: Density,
     *,
     seconds: float,
     generator: torch.Generator,
@@ -111,9 +110,9 @@ def generate(
 
 
 def initialise_generation(
-    prior: Any, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
-) -> tuple[Any, Any, GroundPose]:
-    """The prior as it is to be told, its state and the place (float64) before the first frame.
+    prior: Density, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
+) -> tuple[Density, DensityState, GroundPose]:
+    """The prior, conditioned as it is to be, its state and the place (float64) before the first frame.
 
     Begins at a start of its own, or at the end of a clip, of which nothing is told; the clip's lengths are divided by
     `scale`, the size of its performer beside the prior's.
@@ -126,14 +125,14 @@ def initialise_generation(
         features, place = encode(canonical.resample(PRIOR_FPS))
         ground, heading = integrate_root(features, place)
         seen = features.float()
-        state = replay(prior, seen[1:], prior.initial_state(seen[:1]))
+        state = replay(prior, seen[1:], prior.start_after(seen[:1]))
         return prior, state, GroundPose(ground[-1], heading[-1])
-    count = len(prior.starts.speed)
+    count = len(prior.initial_states.speed)
     if settings.start is not None and not 0 <= settings.start < count:
         raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
-    drawn = int(torch.multinomial(prior.starts.weight, 1, generator=generator))
+    drawn = int(torch.multinomial(prior.initial_states.weight, 1, generator=generator))
     pick = drawn if settings.start is None else settings.start
-    state = prior.starts.state.pick(torch.tensor([pick]))
+    state = prior.initial_states.state.pick(torch.tensor([pick]))
     return (
         prior.conditioned_like_start(pick) if settings.condition_on_start else prior,
         state,
@@ -141,21 +140,21 @@ def initialise_generation(
     )
 
 
-def sample_stratified_starts(prior: Any, count: int, generator: torch.Generator) -> list[int]:
+def sample_stratified_starts(prior: Density, count: int, generator: torch.Generator) -> list[int]:
     """A start for each of several motions, which together begin as the data do: spread over the speeds by weight.
 
     A golden-ratio sequence from a drawn beginning, so that a few motions are already spread, and the first of many are
     those of a few.
     """
-    slow_to_fast = torch.argsort(prior.starts.speed)
-    upto = prior.starts.weight[slow_to_fast].double().cumsum(0)
+    slow_to_fast = torch.argsort(prior.initial_states.speed)
+    upto = prior.initial_states.weight[slow_to_fast].double().cumsum(0)
     first = torch.rand((), generator=generator, dtype=torch.float64)
     drawn = torch.remainder(first + _GOLDEN * torch.arange(count, dtype=torch.float64), 1.0) * upto[-1]
     return slow_to_fast[torch.searchsorted(upto, drawn).clamp(max=len(upto) - 1)].tolist()
 
 
 def _start_stream(
-    prior: Any,
+    prior: Density,
     seconds: float,
     generator: torch.Generator,
     settings: GenerateSettings,
@@ -185,7 +184,7 @@ def _start_stream(
 
 
 def _sample_chunks(
-    prior: Any, state: Any, generator: torch.Generator, temperature: float
+    prior: Density, state: DensityState, generator: torch.Generator, temperature: float
 ) -> Iterator[Float[Tensor, "_ size"]]:
     """Draws without end."""
     while True:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +18,7 @@ from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.kinematics import heading, inverse
 from mapctl.kinematics.inverse import Limb
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
@@ -53,7 +52,7 @@ def blend(
     infiller: Inbetweener | None,
     *,
     settings: InfillSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
 ) -> InfillResult:
     """The motion with its limbs where the source's are, seen from shoulder or hip, in size, and bent as those are; all

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 
@@ -42,13 +41,13 @@ def chain(
     generator: torch.Generator,
     settings: ChainSettings | None = None,
     filling: InfillSettings | None = None,
-    densities: Sequence[Any] = (),
-    extending: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
+    rollout_densities: Sequence[Density] = (),
 ) -> InfillResult:
     """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
 
     Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's. In gaps
-    that the infiller does not know, one of the densities `extending` is rolled if it slides less.
+    that the infiller does not know, one of `rollout_densities` is rolled if it slides less.
     """
     settings = settings or ChainSettings()
     if len(clips) < 2:
@@ -71,7 +70,9 @@ def chain(
             replace(whole, root_position=whole.root_position[held], local_quat_xyzw=whole.local_quat_xyzw[held])
         ).join(piece)
     assert whole is not None, "there are clips"
-    done = infill(body.on_rig(whole), infiller, masks, settings=filling, densities=densities, extending=extending)
+    done = infill(
+        body.on_rig(whole), infiller, masks, settings=filling, densities=densities, rollout_densities=rollout_densities
+    )
     return replace(done, notes=(*done.notes, *notes))
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -17,7 +16,7 @@ from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import Mask, expand_masks, resolve_joint_names
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
@@ -31,16 +30,15 @@ def infill(
     masks: Sequence[Mask],
     *,
     settings: InfillSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
     course: Curve | None = None,
-    extending: Sequence[Any] = (),
+    rollout_densities: Sequence[Density] = (),
 ) -> InfillResult:
     """Fill what the masks say is missing. RequestError for masks that do not fit, or a method without its network.
 
     What stands in a gap does not matter. A gap at the motion's beginning or end is extended into: at the end by one of
-    the densities `extending`, if what is known is like their data. On a `course` the hips go along it while they are
-    lost.
+    `rollout_densities`, if what is known is like their data. On a `course` the hips go along it while they are lost.
     """
     masks = resolve_joint_names(motion, masks, rig)
     # What rig it is must not be told from what stands in a gap.
@@ -55,8 +53,8 @@ def infill(
     ) -> Proposal:
         chosen = Proposal(proposal, odds)
         if course is None:
-            chosen = choose_proposals(gap, proposal, odds, targets, densities=extending)
-        end = extrapolate_end(gap, chosen.motion, chosen.odds, densities=extending)
+            chosen = choose_proposals(gap, proposal, odds, targets, densities=rollout_densities)
+        end = extrapolate_end(gap, chosen.motion, chosen.odds, densities=rollout_densities)
         return replace(end, sources=(*chosen.sources, *end.sources))
 
     done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course, another=another)

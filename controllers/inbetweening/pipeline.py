@@ -28,7 +28,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restor
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.ledger import Ledger
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.frequency_bands import upsample
 from mapctl.retarget import from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
@@ -101,7 +101,7 @@ def fill(
     infiller: Inbetweener | None,
     *,
     settings: InfillSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
     targets: EffectorTargets | None = None,
     course: Curve | None = None,

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -14,6 +13,7 @@ from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.ledger import Ledger
+from mapctl.protocols import Density
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
@@ -41,7 +41,7 @@ def refine_gaps(
     bits: Tensor,
     gap: CanonicalGap,
     settings: RefinementSettings,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     targets: EffectorTargets | None,
 ) -> tuple[Motion, Ledger]:
     """The proposal with its feet put down, gap by gap; and the ledger of these."""

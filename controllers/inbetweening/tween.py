@@ -17,7 +17,7 @@ from controllers.inbetweening.proposers.selection import choose_proposals
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import RigMap, as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 
@@ -28,15 +28,15 @@ def tween(
     infiller: Inbetweener | None,
     *,
     settings: InfillSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
-    rollable: Sequence[Any] = (),
+    rollout_densities: Sequence[Density] = (),
     another: Proposer | None = None,
 ) -> InfillResult:
     """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
 
-    Where keys are so far apart that the infiller does not know enough, one of the densities `rollable` proposes if a
-    viewer would see less sliding (see `controllers.inbetweening.proposers.selection`); `another` takes the place of
+    Where keys are so far apart that the infiller does not know enough, one of `rollout_densities` proposes if a viewer
+    would see less sliding (see `controllers.inbetweening.proposers.selection`); `another` takes the place of
     that choice. RequestError for keys that do not fit the motion or its rig; keys that nobody could reach in time get a
     note.
     """
@@ -45,7 +45,7 @@ def tween(
     lost, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
     hasty = check_keyframes(shown, canonical, rigmap, lost, targets)
     if another is None and (settings is None or settings.method == "map"):
-        another = partial(choose_proposals, densities=rollable)
+        another = partial(choose_proposals, densities=rollout_densities)
     done = fill(
         motion,
         lost,

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,7 +21,7 @@ from mapctl.intent.keyframes import Keys
 from mapctl.metrics.realism import Diversity, measure_diversity
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 
@@ -62,25 +61,25 @@ def sample_variations(
     infiller: Inbetweener,
     count: int,
     *,
-    rollable: Sequence[Any],
+    rollout_densities: Sequence[Density],
     generator: torch.Generator,
     settings: InfillSettings | None = None,
     rolling: RolloutSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Variations:
     """So many motions through the same keys. The first answers are the same however many are asked for.
 
-    The first is that of `tween`; in the others densities that are `rollable` are drawn from and steered from key to
-    key. RequestError for fewer than two, for keys that are too near to each other to leave a choice, and as `tween`.
+    The first is that of `tween`; in the others one of `rollout_densities` is drawn from and steered from key to key.
+    RequestError for fewer than two, for keys that are too near to each other to leave a choice, and as `tween`.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
     settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [_make_first(motion, partial(make, rollable=rollable))]
-    density = select_likeliest_density(rollable, to_canonical(found[0].motion, rig)[0])
+    found = [_make_first(motion, partial(make, rollout_densities=rollout_densities))]
+    density = select_likeliest_density(rollout_densities, to_canonical(found[0].motion, rig)[0])
     found += _sample_rollouts(make, count - 1, density, generator, rolling, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
         raise RequestError(f"no two keys have {_format_span(rolling)} between them, which leaves nothing to vary")
@@ -94,11 +93,11 @@ def lowest_energy(
     infiller: Inbetweener,
     count: int,
     *,
-    rollable: Sequence[Any],
+    rollout_densities: Sequence[Density],
     generator: torch.Generator,
     settings: InfillSettings | None = None,
     rolling: RolloutSettings | None = None,
-    densities: Sequence[Any] = (),
+    densities: Sequence[Density] = (),
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> InfillResult:
@@ -110,7 +109,7 @@ def lowest_energy(
     settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
     make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
     found = [_make_first(motion, make), make(another=_propose_interpolation)]
-    density = select_likeliest_density(rollable, to_canonical(found[0].motion, rig)[0])
+    density = select_likeliest_density(rollout_densities, to_canonical(found[0].motion, rig)[0])
     found += _sample_rollouts(make, count - 2, density, generator, rolling, progress)
     nats = [Variation(one, score(one.motion, one.contacts, density, settings.refinement, rig)).energy for one in found]
     names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
@@ -133,7 +132,7 @@ def _make_first(motion: Motion, make: Callable[..., InfillResult]) -> InfillResu
 def _sample_rollouts(
     make: Callable[..., InfillResult],
     count: int,
-    density: Any,
+    density: Density,
     generator: torch.Generator,
     rolling: RolloutSettings,
     progress: Callable[[int, int], None] | None,

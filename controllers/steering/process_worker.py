@@ -19,6 +19,7 @@ from mapctl import curves
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command
+from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
 
 _WARM_UP_STEPS = 3  # steps before the clock starts, in which what is loaded on first use is loaded
@@ -49,7 +50,7 @@ class ProcessClock:
 
     real = True
 
-    def __init__(self, connection: Connection, pilot: Autopilot, prior: Any):
+    def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
         self._connection, self._pilot, self._prior = connection, pilot, prior
         self.again = False
         self._began = 0.0  # when the stream's second 0 is
@@ -111,7 +112,7 @@ class ProcessClock:
             self._pause(*content)
         elif word == "walk":
             points, speed = content
-            self._pilot.walk(curves.through(points), min(speed, self._prior.abilities.max_steering_speed))
+            self._pilot.walk(curves.through(points), min(speed, self._prior.limits.max_steering_speed))
         else:
             command, notes = steer.accept(self._prior, *content)
             self._notes += notes

@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -28,6 +27,7 @@ from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, Re
 from mapctl.problem.solution import Outcome
 from mapctl.problem.warm_start import BestOfSamples, SteeringKnots
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
+from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
@@ -89,7 +89,7 @@ class SteerSettings:
 class SteerState:
     """Everything that the next step depends on; of a fixed size."""
 
-    prior: Any
+    prior: Density
     """The density."""
     settings: SteerSettings
     """The same in every step, in metres of the prior's size."""
@@ -128,7 +128,7 @@ class SteerFrames:
 
 
 def begin(
-    prior: Any,
+    prior: Density,
     command: Command,
     *,
     generator: torch.Generator,
@@ -146,7 +146,7 @@ def begin(
     chosen = settings or SteerSettings()
     person = Character(skeleton, chosen.footing.rest_height)
     command = person.command(command)
-    starts = (_condition_prior(prior, command.told) if command.told else prior).starts
+    starts = (_condition_prior(prior, command.told) if command.told else prior).initial_states
     near = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
@@ -161,14 +161,14 @@ def begin(
     return SteerState(prior, settings, person, start.committed, wish, torch.tensor([wish.velocity])), frames
 
 
-def accept(prior: Any, command: Command) -> tuple[Command, list[str]]:
+def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
     """The nearest command that the prior can hold, and a sentence for each number that was changed (Command.within).
 
     RequestError where it tells the prior what it does not know.
     """
     if command.told:
         _condition_prior(prior, command.told)
-    return command.within(prior.abilities.max_steering_speed)
+    return command.within(prior.limits.max_steering_speed)
 
 
 def step(state: SteerState, command: Command, *, seconds: float | None = None) -> tuple[SteerState, SteerFrames]:
@@ -224,9 +224,9 @@ def _scale_target_to_character(wish: SteeringTarget, person: Character) -> Steer
 
 
 @lru_cache(maxsize=64)
-def _condition_prior(prior: Any, labels: tuple[str, ...]) -> Any:
-    """The prior that has been told; kept, since it takes as long to make as a step may last."""
-    return prior.told(labels)
+def _condition_prior(prior: Density, labels: tuple[str, ...]) -> Density:
+    """The prior given the labels; kept, since it takes as long to make as a step may last."""
+    return prior.conditioned_on(labels)
 
 
 def _solve_step(

@@ -17,6 +17,7 @@ from mapctl.runtime.progress import show_progress
 if TYPE_CHECKING:
     from controllers.benchmarks.denoising import CleanClip
     from mapctl.motion import Motion
+    from priors.lstm_gmm.density import LstmGmmDensity
 
 
 @dataclass(frozen=True)
@@ -110,11 +111,11 @@ class Bench:
             ]
         if self.what == "live":
             return self._bench_live(name)
-        return {
-            "speed": solver.benchmark_speed,
-            "ablation": solver.benchmark_ablation,
-            "free-run": solver.benchmark_free_run,
-        }[self.what](prior)
+        if self.what == "speed":
+            return solver.benchmark_speed(prior, prior.without_kernels())
+        if self.what == "free-run":
+            return solver.benchmark_free_run(prior, prior.card.quality["data"])
+        return solver.benchmark_ablation(prior)
 
     def _bench_denoise(self) -> list[dict[str, Any]]:
         import priors
@@ -224,7 +225,7 @@ class Bench:
                 rows.append(benchmark_live(load, characters=count, minutes=self.minutes, progress=progress))
         return rows
 
-    def _bench_generation(self, prior: Any, name: str) -> list[dict[str, Any]]:
+    def _bench_generation(self, prior: "LstmGmmDensity", name: str) -> list[dict[str, Any]]:
         import priors
         from controllers.benchmarks.generation import GenerationBenchmarkSettings, benchmark_generation
         from mapctl import formats, retarget

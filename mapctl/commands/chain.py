@@ -56,7 +56,7 @@ class Chain:
             infiller,
             settings=settings,
             filling=InfillSettings(method=self.method),
-            extending=priors.load_choice("auto") if self.method == "map" else (),
+            rollout_densities=priors.load_choice("auto") if self.method == "map" else (),
             generator=torch.Generator().manual_seed(self.seed),
         )
         formats.save(done.motion, self.out)

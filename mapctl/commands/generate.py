@@ -67,7 +67,7 @@ class Generate:
 
         prior = priors.load(self.prior)
         if self.style not in (None, "none"):
-            prior = prior.told([name.strip() for name in self.style.split(",")])
+            prior = prior.conditioned_on([name.strip() for name in self.style.split(",")])
         wanted = self.refiner != "auto" or (self.no_footing and not self.no_refine)
         refiner = priors.refiner_of(self.prior, self.refiner) if wanted else None
         person = character.read_character(self.rig)

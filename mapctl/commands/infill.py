@@ -104,11 +104,18 @@ class Infill:
 
         infiller = None if self.method == "linear" else priors.load_infiller(self.infiller or "infiller")
         densities = priors.load_choice(self.prior)
-        extending = () if self.method != "map" else priors.load_choice(self.prior or "auto")
+        rollout_densities = () if self.method != "map" else priors.load_choice(self.prior or "auto")
         settings = InfillSettings(method=self.method)
         course = None if self.curve is None else options.read_curve(self.curve, None)
         return infill(
-            motion, infiller, masks, settings=settings, densities=densities, rig=rig, course=course, extending=extending
+            motion,
+            infiller,
+            masks,
+            settings=settings,
+            densities=densities,
+            rig=rig,
+            course=course,
+            rollout_densities=rollout_densities,
         )
 
     def _tell(self, done: "InfillResult") -> None:

@@ -65,7 +65,7 @@ class Live:
             characters = self._start_characters()
         try:
             return LiveApp(
-                characters, orders, port=self.port, fastest=prior.abilities.max_steering_speed, labels=prior.labels
+                characters, orders, port=self.port, fastest=prior.limits.max_steering_speed, labels=prior.labels
             )
         except BaseException:
             for character in characters:

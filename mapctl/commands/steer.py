@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from controllers.steering.loop import Recorder, StepRecord
     from mapctl.intent.steering import CommandTrack
     from mapctl.motion import Motion
+    from priors.lstm_gmm.density import LstmGmmDensity
 
 _EXIT_NOT_SATISFIED = 3
 _TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
@@ -68,9 +69,9 @@ class Steer:
 
         track = read_commands(self.commands)
         person, prior = character.read_character(self.rig), priors.load(self.prior)
-        track, lowered = track.limit_speed(prior.abilities.max_steering_speed)
+        track, lowered = track.limit_speed(prior.limits.max_steering_speed)
         for labels in {command.told for command in track.commands if command.told}:
-            prior.told(labels)  # what it does not know is said now
+            prior.conditioned_on(labels)  # what it does not know is said now
         recorder, records, frames = self._run_steering(prior, track, person)
         motion = recorder.motion(frames)
         person.on_rig(motion).save(self.out)
@@ -102,7 +103,7 @@ class Steer:
         return SteeringLimits(self.acceleration, self.braking, math.radians(self.turn_rate))
 
     def _run_steering(
-        self, prior: Any, track: "CommandTrack", person: character.Character
+        self, prior: "LstmGmmDensity", track: "CommandTrack", person: character.Character
     ) -> tuple["Recorder", list["StepRecord"], int]:
         import torch
 
@@ -132,7 +133,7 @@ class Steer:
         records: Sequence["StepRecord"],
         track: "CommandTrack",
         lowered: Sequence[str],
-        prior: Any,
+        prior: "LstmGmmDensity",
     ) -> dict[str, Any]:
         from controllers.steering.loop import summarise_step_timing
         from mapctl import metrics, report

@@ -176,9 +176,15 @@ class Tween:
         settings = InfillSettings(method=method)
         if self.best_of > 1 and infiller is not None:
             return tween_variations.tween_lowest_energy(self, asked, infiller, settings)
-        rollable = () if method != "map" else priors.load_choice(self.prior or "auto")
+        rollout_densities = () if method != "map" else priors.load_choice(self.prior or "auto")
         return tween(
-            asked.motion, asked.keys, infiller, settings=settings, densities=densities, rig=asked.rig, rollable=rollable
+            asked.motion,
+            asked.keys,
+            infiller,
+            settings=settings,
+            densities=densities,
+            rig=asked.rig,
+            rollout_densities=rollout_densities,
         )
 
     def _build_report(

@@ -1,7 +1,6 @@
 """What is known before a window: what a parametrisation of its frames builds trials from."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +9,7 @@ from torch import Tensor
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.problem.density_selection import DensityEnsemble
-from mapctl.protocols import Density
+from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.trial import Trial
 
@@ -21,8 +20,8 @@ class WindowContext:
 
     density: Density | DensityEnsemble
     """The prior, or several."""
-    state: Any
-    """The prior's state after the committed frames: batch of one, or one row for each candidate."""
+    state: DensityState | tuple[DensityState, ...]
+    """The prior's state after the committed frames, batch of one or one row for each candidate; a tuple of several."""
     place: GroundPose
     """Ground pose of the last committed frame."""
     before: Float[Tensor, "past joints 3"]
@@ -45,9 +44,15 @@ class WindowContext:
             raise MapctlError("a rollout needs one density")
         return self.density
 
-    def expand_state(self, batch: int) -> Any:
-        """The state for a batch of candidates."""
-        return self.state if self.state.batch == batch else self.state.repeat(batch)
+    @property
+    def prior_state(self) -> DensityState:
+        """The one density's state."""
+        assert not isinstance(self.state, tuple)
+        return self.state
+
+    def expand_state(self, batch: int) -> DensityState:
+        """The one density's state for a batch of candidates."""
+        return self.prior_state.expand(batch)
 
     def build_trial(
         self,

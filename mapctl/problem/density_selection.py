@@ -7,7 +7,6 @@ less the sum of the logarithms of the standard deviations of the values. Contact
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from torch import Tensor
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.motion import Motion
+from mapctl.protocols import Density, DensityState
 
 SELECTION_WINDOW = 96
 """Frames over which a density's trust is told: of the windows of denoising, and of a card's `windows`."""
@@ -27,8 +27,8 @@ _NON_FINITE_LOG_DENSITY = -1e6  # nats
 class DensityChoice:
     """The density under which a motion is likeliest."""
 
-    density: Any
-    """Of those given."""
+    density: Density
+    """One of those given."""
     nats: Mapping[str, float]
     """By name of each density, the mean log density of a frame, physical units."""
 
@@ -63,29 +63,36 @@ class DensityEnsemble:
     """Densities of which every window uses the likeliest; their states are a tuple, one for each, and none may be
     given."""
 
-    densities: Sequence[Any]
+    densities: Sequence[Density]
     """The densities, their log densities comparable (see `select_density`)."""
 
-    def infer_state(self, features: Float[Tensor, "frames size"]) -> tuple[Any, ...]:
+    def infer_state(self, features: Float[Tensor, "frames size"]) -> tuple[DensityState, ...]:
         """Each density's state before a motion's first frames."""
         return tuple(density.infer_state(features) for density in self.densities)
 
-    def advance(self, state: Sequence[Any], committed: Float[Tensor, "batch frames size"]) -> tuple[Any, ...]:
+    def advance(
+        self, state: DensityState | tuple[DensityState, ...], committed: Float[Tensor, "batch frames size"]
+    ) -> tuple[DensityState, ...]:
         """Each density's state after the committed frames."""
+        assert isinstance(state, tuple)
         return tuple(one.advance(before, committed) for one, before in zip(self.densities, state, strict=True))
 
-    def select(self, features: Float[Tensor, "frames size"], state: Sequence[Any]) -> tuple["DensityChoice", Any]:
+    def select(
+        self, features: Float[Tensor, "frames size"], state: DensityState | tuple[DensityState, ...]
+    ) -> tuple["DensityChoice", DensityState]:
         """The density under which the frames are likeliest, and its state."""
+        assert isinstance(state, tuple)
         choice = select_density(self.densities, features, state)
         return choice, state[list(self.densities).index(choice.density)]
 
 
 def select_density(
-    densities: Sequence[Any], features: Float[Tensor, "frames size"], states: Sequence[Any]
+    densities: Sequence[Density], features: Float[Tensor, "frames size"], states: Sequence[DensityState]
 ) -> DensityChoice:
     """Of some densities with their states before the frames. RequestError where there are none.
 
-    To score a proposal, blur the densities first (`density.blurred(spread())`): they are sharper than it is right.
+    To score a proposal, give the densities its errors first (`density.with_observation_noise(proposal_sigma())`): they
+    are sharper than it is right.
     """
     if not densities:
         raise RequestError("no density to choose from")
@@ -97,13 +104,13 @@ def select_density(
     return DensityChoice(max(densities, key=lambda density: nats[density.name]), nats)
 
 
-def select_density_for_motion(densities: Sequence[Any], motion: Motion) -> DensityChoice:
+def select_density_for_motion(densities: Sequence[Density], motion: Motion) -> DensityChoice:
     """The same of a whole canonical motion at any rate, from its first frame on.
 
     RequestError where there are none; MapctlError for a motion of fewer than two frames at the priors' rate.
     """
     features = encode(motion.resample(PRIOR_FPS))[0].float()
-    return select_density(densities, features[1:], [density.initial_state(features[:1]) for density in densities])
+    return select_density(densities, features[1:], [density.start_after(features[:1]) for density in densities])
 
 
 def proposal_sigma() -> Float[Tensor, " continuous"]:
@@ -123,7 +130,7 @@ def to_physical_log_density(
     return log_density - feature_std[: LAYOUT.continuous].log().sum()
 
 
-def _mean_log_density(density: Any, features: Tensor, state: Any) -> float:
+def _mean_log_density(density: Density, features: Tensor, state: DensityState) -> float:
     """Mean of the frames; hopeless where it is not finite."""
     found = float(to_physical_log_density(density.log_prob(features[None], state), density.feature_std).mean())
     return found if math.isfinite(found) else _NON_FINITE_LOG_DENSITY

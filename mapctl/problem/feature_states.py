@@ -97,7 +97,7 @@ class FeatureStateSolver:
 def _continue_features(context: WindowContext, warm_start: Tensor) -> Float[Tensor, "1 frames size"]:
     """The last window's features and the prior's zero-noise rollout after them."""
     known = warm_start[: context.frames].unsqueeze(0)
-    state = replay(context.prior, known[0], context.state) if len(warm_start) else context.state
+    state = replay(context.prior, known[0], context.prior_state) if len(warm_start) else context.prior_state
     noise = warm_start.new_zeros(1, context.frames - known.shape[1], LAYOUT.continuous)
     with torch.no_grad():
         beyond, _ = context.prior.rollout(state, noise, context.prior.plan(state, noise))

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,7 +19,7 @@ from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, WindowRecord
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
-from mapctl.protocols import Density
+from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term
 
@@ -58,7 +57,7 @@ class HorizonSettings:
 class CommittedFrames:
     """Everything fixed so far."""
 
-    state: Any
+    state: DensityState | tuple[DensityState, ...]
     """The density's state after it, batch of one."""
     place: GroundPose
     """Ground pose of its last frame."""
@@ -205,7 +204,9 @@ class RecedingHorizonSolver:
         )
 
 
-def replay(density: Density, features: Float[Tensor, "frames size"], state: Any = None, *, since: int = 0) -> Any:
+def replay(
+    density: Density, features: Float[Tensor, "frames size"], state: DensityState | None = None, *, since: int = 0
+) -> DensityState:
     """The density's state after known frames: from its state before the frame `since`, or where there is none from one
     before the first that makes them likely (Wang et al. 2019, Eq. 26).
     """

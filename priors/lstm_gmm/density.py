@@ -1,55 +1,56 @@
-"""A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its starts and its card."""
+"""A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its initial states and its card."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.protocols import DataLimits, DiscreteChoices, InitialStates
+from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates
 from priors import checkpoints
-from priors.lstm_gmm import labels
+from priors.lstm_gmm import labels as clip_labels
+from priors.lstm_gmm.fast.rollout import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
-
-if TYPE_CHECKING:
-    from priors.lstm_gmm.fast.rollout import FastRollout
+from priors.lstm_gmm.state_inference import infer_lstm_state
 
 
 @dataclass(frozen=True, eq=False)
-class LstmGmmDensity:
-    """A Density (see mapctl.protocols) that rolls out on the fast path unless told otherwise."""
+class LstmGmmDensity(Density[LstmState]):
+    """The network as a density that rolls out on the fast path unless told otherwise."""
 
     name: str
-    """How it was asked for."""
+    """Name, file or run folder by which it was asked for."""
     reference: LstmGmm
     """The torch network: the specification, and the only path on a GPU."""
-    starts: InitialStates
+    initial_states: InitialStates[LstmState]
     """Moments of mocap to begin from."""
+    limits: DataLimits
+    """Speeds and turning that the training data show."""
     card: checkpoints.Card
     """What the weights are."""
     use_fast: bool = True
     """Whether rollouts and samples take the hand-written kernels."""
 
     @cached_property
-    def fast(self) -> "FastRollout":
+    def _fast(self) -> FastRollout:
         """The kernels, built on first use."""
-        from priors.lstm_gmm.fast.rollout import FastRollout
-
         return FastRollout(self.reference)
 
     @property
-    def _rollout_engine(self) -> "FastRollout | LstmGmm":
-        return self.fast if self.use_fast else self.reference
+    def _rollout_engine(self) -> FastRollout | LstmGmm:
+        return self._fast if self.use_fast else self.reference
 
-    @property
-    def abilities(self) -> DataLimits:
-        """What the training data show."""
-        return DataLimits(**self.card.abilities)
+    def warm_up(self) -> None:
+        """Load the kernels of the fast path, if it is taken."""
+        _ = self._rollout_engine
+
+    def without_kernels(self) -> "LstmGmmDensity":
+        """The same density on the torch reference, to compare the fast path with."""
+        return replace(self, use_fast=False)
 
     @property
     def feature_mean(self) -> Float[Tensor, " size"]:
@@ -70,39 +71,38 @@ class LstmGmmDensity:
             found.setdefault(group, []).append(value)
         return found
 
-    def told(self, wanted: Sequence[str]) -> "LstmGmmDensity":
-        """The same density told labels of its data for good (`run`, `active`, `style=active`), with starts to match.
-
-        RequestError for labels that it does not know.
+    def conditioned_on(self, labels: Sequence[str]) -> "LstmGmmDensity":
+        """The same density given labels of its data for good (`run`, `active`, `style=active`), with initial states to
+        match. RequestError for labels that it does not know.
         """
-        full = [self._label(name) for name in wanted]
-        known = labels.read(self.starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
+        full, starts = [self._label(name) for name in labels], self.initial_states
+        known = clip_labels.read(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
         fitting = known.held.sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
-        weight = self.starts.weight[rows]
+        weight = starts.weight[rows]
         picked = InitialStates(
-            self.starts.state.pick(rows),
-            self.starts.speed[rows],
-            tuple(self.starts.names[i] for i in rows.tolist()),
+            starts.state.pick(rows),
+            starts.speed[rows],
+            tuple(starts.names[i] for i in rows.tolist()),
             weight / weight.sum(),
         )
-        return replace(self, reference=self.reference.told(full), starts=picked)
+        return replace(self, reference=self.reference.conditioned_on(full), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
-        """The same density told what its data say of the clip that a start was taken from, so that it goes on so."""
-        held = labels.read(self.starts.names, self.card.data.get("labels", ""))
+        """The same density given what its data say of the clip that a start was taken from, so that it goes on so."""
+        held = clip_labels.read(self.initial_states.names, self.card.data.get("labels", ""))
         names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
         known = [name for name in names if name in self.reference.config.labels]
-        return replace(self, reference=self.reference.told(known))
+        return replace(self, reference=self.reference.conditioned_on(known))
 
-    def with_observation_noise(self, spread: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
-        """The same density, scoring motion that was seen with errors of this spread (physical units); see LstmGmm."""
-        return replace(self, reference=self.reference.with_observation_noise(spread))
+    def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
+        """The same density, scoring motion that was seen with errors of this sigma (physical units); see LstmGmm."""
+        return replace(self, reference=self.reference.with_observation_noise(sigma))
 
     @property
     def reference_log_density(self) -> float:
         """Log density a frame (physical units, see mapctl.problem.density_selection) that 98 % of the windows of its
-        own held-out data reach when blurred by `choosing.spread()`; minus infinity where the card does not say.
+        own held-out data reach when blurred by `proposal_sigma()`; minus infinity where the card does not say.
         """
         return float(self.card.quality.get("windows", {}).get("p2", -math.inf))
 
@@ -118,16 +118,14 @@ class LstmGmmDensity:
         values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items()) or "none"
         raise RequestError(f"the prior {self.name!r} knows no {group} {value!r}, only {values}")
 
-    def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
+    def start_after(self, last_frame: Float[Tensor, "batch size"]) -> LstmState:
         """A state with empty memory after one frame."""
-        return self.reference.initial_state(previous)
+        return self.reference.start_after(last_frame)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
         """The state, before them, that makes a motion's first frames likely (Eq. 26); see
         priors.lstm_gmm.state_inference."""
-        from priors.lstm_gmm.state_inference import infer_lstm_state
-
-        return infer_lstm_state(self.reference, self.starts.state, features)
+        return infer_lstm_state(self.reference, self.initial_states.state, features)
 
     def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
         """See Density."""
@@ -165,7 +163,7 @@ def load(name: str) -> LstmGmmDensity:
             tuple(card.data["starts"]),
             tensors.pop("starts.weight"),
         )
-        DataLimits(**card.abilities)
+        limits = DataLimits(**card.abilities)
         model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
         model.load_state_dict(tensors)
-    return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, card)
+    return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, limits, card)

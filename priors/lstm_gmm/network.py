@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, FeatureLayout
-from mapctl.protocols import DiscreteChoices
+from mapctl.protocols import DensityState, DiscreteChoices
 from priors.config import NetworkConfig, require_at_least
 
 NOISE_UNIT = 0.1
@@ -54,32 +54,19 @@ class LstmGmmConfig(NetworkConfig):
 
 
 @dataclass(frozen=True, eq=False)
-class LstmState:
+class LstmState(DensityState):
     """What the density has seen: the last frame and the memory of both LSTM layers."""
 
-    previous: Float[Tensor, "batch size"]
+    last_frame: Float[Tensor, "batch size"]
     """Last committed frame, physical units."""
     hidden: Float[Tensor, "2 batch width"]
     """h of both layers."""
     cell: Float[Tensor, "2 batch width"]
     """C of both layers."""
 
-    @property
-    def batch(self) -> int:
-        """How many independent states."""
-        return self.previous.shape[0]
-
     def pick(self, rows: Int[Tensor, " picked"]) -> "LstmState":
         """The states of some batch rows."""
-        return LstmState(self.previous[rows], self.hidden[:, rows].contiguous(), self.cell[:, rows].contiguous())
-
-    def repeat(self, count: int) -> "LstmState":
-        """A batch of one, `count` times."""
-        return LstmState(
-            self.previous.expand(count, -1),
-            self.hidden.expand(-1, count, -1).contiguous(),
-            self.cell.expand(-1, count, -1).contiguous(),
-        )
+        return LstmState(self.last_frame[rows], self.hidden[:, rows].contiguous(), self.cell[:, rows].contiguous())
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +148,8 @@ class LstmGmm(nn.Module):
         unit = torch.eye(self.layout.continuous).to(whitening).expand_as(whitening)
         return torch.linalg.solve_triangular(whitening, unit, upper=False, unitriangular=True)
 
-    def told(self, labels: Iterable[str]) -> "LstmGmm":
-        """A copy that has been told these labels for good; its inputs are taken to be clean.
+    def conditioned_on(self, labels: Iterable[str]) -> "LstmGmm":
+        """A copy given these labels for good; its inputs are taken to be clean.
 
         RequestError for a label that the network does not know.
         """
@@ -179,14 +166,14 @@ class LstmGmm(nn.Module):
                 model.fc1.bias += self.condition(known.to(self.mean))
         return model
 
-    def with_observation_noise(self, spread: Float[Tensor, " continuous"]) -> "LstmGmm":
-        """A copy whose `log_prob` is of motion seen with independent errors of this spread (physical units).
+    def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmm":
+        """A copy whose `log_prob` is of motion seen with independent errors of this sigma (physical units).
 
         Sharp densities say nothing of how wrong a motion is that is off by more than they allow. What the errors add
         to the correlated values is taken to be independent as well, which keeps the density a density.
         """
         model, size = copy.deepcopy(self), self.layout.continuous
-        variance = (spread.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
+        variance = (sigma.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
         if (whitening := self.whitening) is not None:
             variance = torch.einsum("kij,kj->ki", whitening.detach().square(), variance)
         model.blur = variance.clone()
@@ -196,10 +183,10 @@ class LstmGmm(nn.Module):
         """Physical to normalised units; contact bits become -1 and 1, since their mean and spread are set to a half."""
         return (features - self.mean) / self.std
 
-    def initial_state(self, previous: Float[Tensor, "batch size"]) -> LstmState:
+    def start_after(self, last_frame: Float[Tensor, "batch size"]) -> LstmState:
         """A state with empty memory after one frame."""
-        zero = previous.new_zeros(2, previous.shape[0], self.config.width)
-        return LstmState(previous, zero, zero)
+        zero = last_frame.new_zeros(2, last_frame.shape[0], self.config.width)
+        return LstmState(last_frame, zero, zero)
 
     def forward(
         self,
@@ -243,13 +230,13 @@ class LstmGmm(nn.Module):
         `inputs` is what the network sees of the frames where that differs from them: the noisy inputs of Eq. 15.
         """
         seen = features if inputs is None else inputs
-        before = torch.cat([state.previous.unsqueeze(1), seen[:, :-1]], dim=1)
+        before = torch.cat([state.last_frame.unsqueeze(1), seen[:, :-1]], dim=1)
         mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
         return mixture.log_prob(self._target(features), self.whitening, self.blur)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
         """The state after the committed frames were seen."""
-        before = torch.cat([state.previous.unsqueeze(1), committed[:, :-1]], dim=1)
+        before = torch.cat([state.last_frame.unsqueeze(1), committed[:, :-1]], dim=1)
         with torch.no_grad():
             _, (hidden, cell) = self(self.normalise(before), (state.hidden, state.cell))
         return LstmState(committed[:, -1], hidden, cell)
@@ -315,7 +302,7 @@ class LstmGmm(nn.Module):
         Of each frame's components, the one that explains it best.
         """
         with torch.no_grad():
-            before = torch.cat([state.previous.unsqueeze(1), features[:, :-1]], dim=1)
+            before = torch.cat([state.last_frame.unsqueeze(1), features[:, :-1]], dim=1)
             mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
             error = self._target(features)[..., : self.layout.continuous].unsqueeze(-2) - mixture.mean
             if (whitening := self.whitening) is not None:
@@ -328,10 +315,10 @@ class LstmGmm(nn.Module):
             return DiscreteChoices(component, bits), noise.gather(-2, chosen)[..., 0, :]
 
     def _step(self, state: LstmState) -> tuple[Mixture, LstmState]:
-        inputs = self.normalise(state.previous).unsqueeze(1)
+        inputs = self.normalise(state.last_frame).unsqueeze(1)
         mixture, (hidden, cell) = self(inputs, (state.hidden, state.cell))
         mixture = Mixture(*(part.squeeze(1) for part in vars(mixture).values()))
-        return mixture, LstmState(state.previous, hidden, cell)
+        return mixture, LstmState(state.last_frame, hidden, cell)
 
     def _compose(
         self,

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
+from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
@@ -110,8 +111,8 @@ class RefinerNetwork(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class LstmRefiner:
-    """A trained refiner (see mapctl.protocols.Refiner)."""
+class LstmRefiner(Refiner):
+    """A trained refiner."""
 
     name: str
     """How it was asked for."""
@@ -119,10 +120,6 @@ class LstmRefiner:
     """Weights."""
     card: checkpoints.Card
     """What they are."""
-
-    def refine(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames size"]:
-        """The whole motion refined; contact bits are 0 or 1."""
-        return torch.cat(list(self.stream([features])), dim=1)
 
     def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
         """Consecutive pieces refined, `lookahead` frames behind their input, in memory that does not grow.

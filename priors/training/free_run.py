@@ -19,7 +19,7 @@ def measure_free_runs(
     """
     clips = [clip for clip in corpus.clips() if len(clip) > 60]
     clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]
-    state = model.initial_state(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
+    state = model.start_after(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
     state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
     features, _ = model.sample(state, frames, torch.Generator().manual_seed(seed), temperature=temperature)
     settled = features[:, min(_SETTLING_FRAMES, frames // 2) :].cpu()

@@ -29,7 +29,7 @@ def select_initial_states(model: LstmGmm, corpus: Corpus, *, count: int, generat
     picked = _select_by_speed(speeds, count)
     states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]
     state = LstmState(
-        torch.cat([s.previous for s in states]),
+        torch.cat([s.last_frame for s in states]),
         torch.cat([s.hidden for s in states], 1),
         torch.cat([s.cell for s in states], 1),
     )
@@ -85,5 +85,5 @@ def _compute_weights(corpus: Corpus, speeds: Float[Tensor, " starts"]) -> Float[
 def _state_after(model: LstmGmm, clip: Float[Tensor, "frames size"]) -> LstmState:
     """The state after the whole clip was seen."""
     with torch.no_grad():
-        state = model.initial_state(clip[:1])
+        state = model.start_after(clip[:1])
         return model.advance(state, clip[1:].unsqueeze(0))

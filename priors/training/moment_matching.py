@@ -70,7 +70,7 @@ def free_run_moment_loss(
     if context < _PAST_FRAMES:
         raise RequestError(f"free runs are matched in windows of at least {2 * _PAST_FRAMES} frames, got {length}")
     windows = windows[: settings.batch]
-    state = model.advance(model.initial_state(windows[:, 0]), windows[:, 1:context])
+    state = model.advance(model.start_after(windows[:, 0]), windows[:, 1:context])
     past, away = windows[:, :context], int(torch.randint(settings.wander + 1, (1,), generator=generator))
     if away > 0:
         wandered, state = model.sample(state, away, generator)

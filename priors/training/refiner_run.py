@@ -104,7 +104,7 @@ def sample_corpus(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int
     clips = [clip for clip in corpus.clips() if len(clip) >= _WARM_UP_FRAMES]
     lengths = torch.tensor([float(len(clip)) for clip in clips])
     picked = torch.multinomial(lengths, count, replacement=True, generator=generator).tolist()
-    state = prior.initial_state(torch.stack([clips[i][0] for i in picked]))
+    state = prior.start_after(torch.stack([clips[i][0] for i in picked]))
     state = prior.advance(state, torch.stack([clips[i][1:_WARM_UP_FRAMES] for i in picked]))
     features, _ = prior.sample(state, frames, generator)
     return Corpus(tuple(f"sample {k}" for k in range(count)), (frames,) * count, features.float().flatten(0, 1))

@@ -131,7 +131,7 @@ def export(
     )
     tensors = dict(model.state_dict())
     tensors |= {
-        "starts.previous": found.state.previous,
+        "starts.previous": found.state.last_frame,
         "starts.hidden": found.state.hidden,
         "starts.cell": found.state.cell,
         "starts.speed": found.speed,

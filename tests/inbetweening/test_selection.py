@@ -72,7 +72,7 @@ def test_the_infiller_is_asked_alone_for_what_it_knows(start, stop, asked):
 def test_somebody_who_stands_stays_where_he_is(seconds):
     motion = still(30 * seconds + 1)
     wandering = tiny_infiller(drawn=0.05)
-    done = tween(motion, Keys((0, 30 * seconds)), wandering, rollable=[tiny_density()])
+    done = tween(motion, Keys((0, 30 * seconds)), wandering, rollout_densities=[tiny_density()])
     assert [source.by for source in done.sources] == [STANDING_STILL]
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)
     assert away.max() < 0.02

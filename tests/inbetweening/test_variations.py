@@ -13,8 +13,8 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 import priors
-from controllers.inbetweening import infill
 from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.inbetweening.infill import infill
 from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
@@ -70,7 +70,7 @@ def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
         Keys.of(keys, **told),
         tiny_infiller(drawn=0.02),
         count,
-        rollable=[prior],
+        rollout_densities=[prior],
         generator=generator(seed),
         rolling=QUICK,
     )
@@ -140,7 +140,7 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
     fill = partial(infill, motion, tiny_infiller(drawn=0.02), masks)
-    plain, made = fill(), fill(extending=[prior])
+    plain, made = fill(), fill(rollout_densities=[prior])
     known = ~made.lost.frames
     for one in (plain, made):
         assert torch.equal(one.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
@@ -153,7 +153,7 @@ def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
         f"by the density {prior.name}",
     ]
     assert plain.notes[1].split(",")[0].endswith("extended by the infiller")
-    again = fill(extending=[prior])
+    again = fill(rollout_densities=[prior])
     assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
 
 
@@ -161,15 +161,15 @@ def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(
     class Stern:
         """Finds everything unlikely."""
 
-        name, usual_nats = "stern", 1e9
+        name, reference_log_density = "stern", 1e9
 
         def __getattr__(self, name):
             return getattr(prior, name)
 
-        def with_observation_noise(self, spread):
+        def with_observation_noise(self, sigma):
             return self
 
-    done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], extending=[Stern()])
+    done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], rollout_densities=[Stern()])
     assert done.notes == ("a gap at the end: the motion is extended by the infiller, with nothing after it to meet",)
 
 
@@ -188,7 +188,13 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
 def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     motion = on_rig("canonical", FRAMES)
     made = lowest_energy(
-        motion, Keys(keys), tiny_infiller(drawn=0.02), 4, rollable=[prior], generator=generator(0), rolling=QUICK
+        motion,
+        Keys(keys),
+        tiny_infiller(drawn=0.02),
+        4,
+        rollout_densities=[prior],
+        generator=generator(0),
+        rolling=QUICK,
     )
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
     told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
@@ -204,7 +210,10 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
 
 
 def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
-    motion, take = on_rig("canonical", FRAMES), partial(lowest_energy, rollable=[prior], generator=generator(0))
+    motion, take = (
+        on_rig("canonical", FRAMES),
+        partial(lowest_energy, rollout_densities=[prior], generator=generator(0)),
+    )
     with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):
         take(motion, Keys(KEYS), tiny_infiller(), 1)
     with pytest.raises(RequestError, match="leaves nothing to vary"):

@@ -158,7 +158,7 @@ def test_wishes_that_make_no_sense_are_refused(wishes, message):
 
 def test_a_speed_beyond_the_data_is_named_with_both_numbers():
     solution = follow(curves.line(length=9), seconds=0.4, speed=9.0)
-    fastest = DENSITY.abilities.fastest
+    fastest = DENSITY.limits.fastest
     assert f"9.00 m/s is faster than the prior's data, which reach {fastest:.2f} m/s" in solution.status.text
     assert solution.status.outcome is Outcome.INFEASIBLE
     assert not solution.status.ok
@@ -234,7 +234,7 @@ def test_the_start_is_one_of_the_best_by_the_wishes_speed():
     curve = curves.circle(radius=2)
     terms_of = build_follow_terms(curve, arcs, QUICK)
     found = select_initial_state(DENSITY, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator())
-    assert any(torch.equal(found.committed.state.previous[0], row) for row in DENSITY.starts.state.previous)
+    assert any(torch.equal(found.committed.state.last_frame[0], row) for row in DENSITY.initial_states.state.last_frame)
     stood = found.before_first.displace(found.committed.features[0, :2], found.committed.features[0, 2])
     torch.testing.assert_close(stood.position_xz, found.committed.place.position_xz, atol=1e-6, rtol=0)
     torch.testing.assert_close(stood.heading, found.committed.place.heading)

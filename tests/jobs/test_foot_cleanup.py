@@ -29,7 +29,7 @@ def clip(frames: int = 60, *, noise: float = 0.01) -> torch.Tensor:
 
 
 def finished(pieces, frames, *, settings=SETTINGS):
-    state = DENSITY.initial_state(corpus().clips()[1][:1])
+    state = DENSITY.start_after(corpus().clips()[1][:1])
     return torch.cat(
         list(clean_up_feet(DENSITY, pieces, frames=frames, state=state, generator=generator(), settings=settings))
     )
@@ -82,7 +82,7 @@ def test_too_few_frames_to_look_ahead_are_refused():
 @pytest.mark.parametrize("seed", range(3))
 def test_latents_are_what_rolls_out_to_the_motion(seed):
     model, frames = tiny_model(seed=seed).double(), clip(20).double()
-    state = model.initial_state(frames[:1])
+    state = model.start_after(frames[:1])
     plan, noise = model.latents(frames[None, 1:], state)
     rebuilt, _ = model.rollout(state, noise, plan)
     torch.testing.assert_close(rebuilt[0], frames[1:], atol=1e-8, rtol=1e-8)
@@ -90,7 +90,7 @@ def test_latents_are_what_rolls_out_to_the_motion(seed):
 
 def test_a_guide_that_is_all_that_is_wished_comes_back():
     guide = clip(13)[1:]
-    state = DENSITY.initial_state(clip(13)[:1])
+    state = DENSITY.start_after(clip(13)[:1])
     context = WindowContext(DENSITY, state, GroundPose.origin(), torch.zeros(0, 21, 3), 12)
     exact = GuidedNoiseSolver(guide, share=1.0)
     tail = torch.zeros(0, LAYOUT.continuous)

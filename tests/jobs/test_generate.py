@@ -73,8 +73,8 @@ def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
 def test_it_is_what_the_prior_samples_from_the_chosen_start():
     motion = made(0.5, seed=3, settings=replace(RAW, start=2, temperature=0.5))
     draws = generator(3)
-    torch.multinomial(DENSITY.starts.weight, 1, generator=draws)
-    state = DENSITY.starts.state.pick(torch.tensor([2]))
+    torch.multinomial(DENSITY.initial_states.weight, 1, generator=draws)
+    state = DENSITY.initial_states.state.pick(torch.tensor([2]))
     features, _ = DENSITY.sample(state, 20, draws, temperature=0.5)
     torch.testing.assert_close(encode(motion)[0][1:, 2:66], features[0, 1:15, 2:66].double(), atol=1e-5, rtol=0)
 
@@ -106,7 +106,7 @@ def test_a_clip_warms_up_the_memory():
     clip = walk(40)
     motion = made(0.2, start_clip=clip, settings=replace(RAW, temperature=0.0))
     features, place = encode(clip)
-    state = DENSITY.advance(DENSITY.initial_state(features[:1].float()), features[None, 1:].float())
+    state = DENSITY.advance(DENSITY.start_after(features[:1].float()), features[None, 1:].float())
     drawn, _ = DENSITY.sample(state, 6, generator(0), temperature=0.0)
     expected = decode(torch.cat([features, drawn[0].double()]), place)
     torch.testing.assert_close(motion.joint_positions(), expected.joint_positions()[40:], atol=1e-5, rtol=0)
@@ -160,15 +160,15 @@ def test_features_are_the_motion_and_its_contact_labels():
 
 
 def test_starts_are_drawn_by_their_weight():
-    only = replace(DENSITY, starts=replace(DENSITY.starts, weight=torch.tensor([0.0, 0.0, 1.0, 0.0])))
+    only = replace(DENSITY, initial_states=replace(DENSITY.initial_states, weight=torch.tensor([0.0, 0.0, 1.0, 0.0])))
     for seed in range(5):
         _, state, _ = initialise_generation(only, RAW, None, generator(seed))
-        assert torch.equal(state.previous, DENSITY.starts.state.previous[2:3])
+        assert torch.equal(state.last_frame, DENSITY.initial_states.state.last_frame[2:3])
 
 
 def test_starts_of_several_motions_are_spread_by_weight_and_the_first_do_not_depend_on_how_many():
     weight = torch.tensor([0.1, 0.2, 0.3, 0.4])
-    prior = replace(DENSITY, starts=replace(DENSITY.starts, weight=weight))
+    prior = replace(DENSITY, initial_states=replace(DENSITY.initial_states, weight=weight))
     drawn = sample_stratified_starts(prior, 200, generator(1))
     counts = torch.bincount(torch.tensor(drawn), minlength=4) / 200
     torch.testing.assert_close(counts, weight, atol=0.015, rtol=0)

@@ -20,10 +20,10 @@ DENSITY = tiny_density()
 
 def write(folder: Path, *, card: Card = DENSITY.card, drop: str = "", half: bool = False) -> Path:
     """The tiny density as a training run leaves it."""
-    state = DENSITY.starts.state
+    state = DENSITY.initial_states.state
     tensors = dict(DENSITY.reference.state_dict())
-    tensors |= {"starts.previous": state.previous, "starts.hidden": state.hidden, "starts.cell": state.cell}
-    tensors |= {"starts.speed": DENSITY.starts.speed, "starts.weight": DENSITY.starts.weight}
+    tensors |= {"starts.previous": state.last_frame, "starts.hidden": state.hidden, "starts.cell": state.cell}
+    tensors |= {"starts.speed": DENSITY.initial_states.speed, "starts.weight": DENSITY.initial_states.weight}
     tensors.pop(drop, None)
     checkpoints.save(tensors, card, folder / "model.safetensors", half=half)
     return folder / "model.safetensors"
@@ -59,12 +59,12 @@ def test_a_prior_is_found_by_file_folder_or_stem(tmp_path, named):
     path = write(tmp_path)
     asked = {"file": path, "folder": tmp_path, "stem": path.with_suffix("")}[named]
     loaded = priors.load(str(asked))
-    assert loaded.starts.names == DENSITY.starts.names
-    torch.testing.assert_close(loaded.starts.state.hidden, DENSITY.starts.state.hidden)
-    frames = DENSITY.starts.state.previous[:1].expand(3, -1)[None]
-    state = DENSITY.starts.state.pick(torch.tensor([0]))
+    assert loaded.initial_states.names == DENSITY.initial_states.names
+    torch.testing.assert_close(loaded.initial_states.state.hidden, DENSITY.initial_states.state.hidden)
+    frames = DENSITY.initial_states.state.last_frame[:1].expand(3, -1)[None]
+    state = DENSITY.initial_states.state.pick(torch.tensor([0]))
     torch.testing.assert_close(loaded.log_prob(frames, state), DENSITY.log_prob(frames, state))
-    assert loaded.abilities == DENSITY.abilities
+    assert loaded.limits == DENSITY.limits
     assert not any(p.requires_grad for p in loaded.reference.parameters())
 
 

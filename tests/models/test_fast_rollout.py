@@ -43,7 +43,7 @@ def gradients(engine: LstmGmm | FastRollout, state: LstmState, noise: torch.Tens
     state = LstmState(*(part.clone().requires_grad_() for part in vars(state).values()))
     features, density = engine.rollout(state, noise, plan)
     pull = [torch.randn(part.shape, generator=generator).to(part) for part in (features, density)]
-    inputs = (noise, state.previous, state.hidden, state.cell)
+    inputs = (noise, state.last_frame, state.hidden, state.cell)
     grads = torch.autograd.grad([(features * pull[0]).sum(), (density * pull[1]).sum()], inputs)
     return features.detach(), density.detach(), *grads
 
@@ -120,7 +120,7 @@ def test_particles_do_not_touch_each_other():
     fast = FastRollout(model)
     plan = fast.plan(state, noise)
     together = gradients(fast, state, noise, plan)[0]
-    alone = LstmState(state.previous[2:3], state.hidden[:, 2:3], state.cell[:, 2:3])
+    alone = LstmState(state.last_frame[2:3], state.hidden[:, 2:3], state.cell[:, 2:3])
     single, _ = fast.rollout(alone, noise[2:3], DiscreteChoices(plan.component[2:3], plan.contacts[2:3]))
     assert torch.allclose(single[0], together[2], rtol=1e-5, atol=1e-5)
 
@@ -134,14 +134,14 @@ def test_samples_repeat_with_the_seed_and_carry_the_state_on():
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     wanted = model.advance(state, first)
-    for name in ("previous", "hidden", "cell"):
+    for name in ("last_frame", "hidden", "cell"):
         assert relative(getattr(after, name), getattr(wanted, name)) < 1e-5
 
 
 def test_samples_are_distributed_as_the_reference():
     model, state, _ = make(12, 1)
     count = 20_000
-    many = state.repeat(count)
+    many = state.expand(count)
     ours, _ = FastRollout(model).sample(many, 2, torch.Generator().manual_seed(1), temperature=0.7)
     theirs, _ = model.sample(many, 2, torch.Generator().manual_seed(2), temperature=0.7)
     error = (ours.mean(0) - theirs.mean(0)) / (theirs.std(0) * (2 / count) ** 0.5 + 1e-9)

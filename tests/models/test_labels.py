@@ -7,6 +7,7 @@ import torch
 from helpers import corpus, generator
 
 from mapctl.errors import RequestError
+from mapctl.protocols import DataLimits
 from priors.checkpoints import Card
 from priors.lstm_gmm import labels
 from priors.lstm_gmm.density import LstmGmmDensity
@@ -70,15 +71,15 @@ def told_network() -> LstmGmm:
 
 def test_a_copy_that_was_told_is_the_network_under_that_condition():
     network, inputs = told_network(), torch.randn(1, 6, 68, generator=generator())
-    memory = network.initial_state(inputs[:, 0])
+    memory = network.start_after(inputs[:, 0])
     condition = torch.tensor([[0.0, 0.0, 1.0]])  # clean; not running; old
     expected, _ = network(inputs, (memory.hidden, memory.cell), condition=condition)
     untold, _ = network(inputs, (memory.hidden, memory.cell))
-    old, _ = network.told(["style=old"])(inputs, (memory.hidden, memory.cell))
+    old, _ = network.conditioned_on(["style=old"])(inputs, (memory.hidden, memory.cell))
     torch.testing.assert_close(old.mean, expected.mean)
     assert not torch.allclose(untold.mean, expected.mean)
     with pytest.raises(RequestError, match="no label 'style=new', only gait=run, style=old"):
-        network.told(["style=new"])
+        network.conditioned_on(["style=new"])
 
 
 def test_half_of_the_windows_are_told_nothing_and_none_more_than_is_known():
@@ -98,17 +99,17 @@ def labelled_density() -> LstmGmmDensity:
     found = select_initial_states(model, replace(data, names=names), count=4, generator=generator())
     pattern = r"_(?P<gait>run)?(walk)?_(?P<style>old)?"
     card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.layout_fields())
-    return LstmGmmDensity("named", model, found, card, use_fast=False)
+    return LstmGmmDensity("named", model, found, DataLimits(0.5, 1.5, 1.0), card, use_fast=False)
 
 
 def test_a_told_density_begins_where_the_labels_hold():
     density = labelled_density()
-    old_runner = density.told(["run", "style=old"])
-    assert old_runner.starts.names == ("a_run_old_1",)
-    assert len(density.told(["old"]).starts.names) == 2
-    assert float(old_runner.starts.weight.sum()) == 1
-    assert len(density.told([]).starts.names) == 4
-    state, noise = density.starts.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
+    old_runner = density.conditioned_on(["run", "style=old"])
+    assert old_runner.initial_states.names == ("a_run_old_1",)
+    assert len(density.conditioned_on(["old"]).initial_states.names) == 2
+    assert float(old_runner.initial_states.weight.sum()) == 1
+    assert len(density.conditioned_on([]).initial_states.names) == 4
+    state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
     plan = density.plan(state, noise)
     told, untold = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
     assert not torch.allclose(told, untold)
@@ -125,13 +126,13 @@ def test_a_told_density_begins_where_the_labels_hold():
 )
 def test_what_is_not_known_is_called_what_it_may_be(name, said):
     with pytest.raises(RequestError) as refused:
-        labelled_density().told([name])
+        labelled_density().conditioned_on([name])
     assert said in str(refused.value)
 
 
 def test_the_fast_path_is_told_too():
-    told = replace(labelled_density().told(["old"]), use_fast=True)
-    state, noise = told.starts.state.pick(torch.tensor([0])), torch.randn(1, 5, 66, generator=generator())
+    told = replace(labelled_density().conditioned_on(["old"]), use_fast=True)
+    state, noise = told.initial_states.state.pick(torch.tensor([0])), torch.randn(1, 5, 66, generator=generator())
     plan = told.reference.plan(state, noise)
     fast, reference = (engine.rollout(state, noise, plan)[0] for engine in (told, told.reference))
     torch.testing.assert_close(fast, reference, rtol=1e-4, atol=1e-5)

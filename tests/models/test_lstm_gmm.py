@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from catalogue import densities
-from helpers import corpus, finite_difference, generator, noise, tiny_density
+from catalogue import NETWORKS
+from helpers import corpus, generator, noise, tiny_density, tiny_model
 from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, MultivariateNormal
 
 from mapctl.features import LAYOUT
@@ -11,7 +11,6 @@ from mapctl.protocols import DiscreteChoices
 from priors.lstm_gmm.network import LstmState
 
 SIZE = LAYOUT.continuous
-NETWORKS = densities()
 each_network = pytest.mark.parametrize("kind", NETWORKS)
 
 
@@ -23,7 +22,7 @@ def clip(batch=2, frames=9, first=20):
 def warm(network, batch=2):
     """A state that has seen some frames."""
     seen = clip(batch, 12, first=8)
-    return network.advance(network.initial_state(seen[:, 0]), seen[:, 1:])
+    return network.advance(network.start_after(seen[:, 0]), seen[:, 1:])
 
 
 def rolled(network, state, frames=8, seed=0):
@@ -35,7 +34,7 @@ def rolled(network, state, frames=8, seed=0):
 
 def mixture_of(network, state, frames):
     """The mixtures that the network predicts along given frames."""
-    before = torch.cat([state.previous[:, None], frames[:, :-1]], 1)
+    before = torch.cat([state.last_frame[:, None], frames[:, :-1]], 1)
     return network(network.normalise(before), (state.hidden, state.cell))[0]
 
 
@@ -105,68 +104,14 @@ def test_noise_is_the_standardised_error_of_the_chosen_component(kind):
     assert torch.equal(frames[..., SIZE:] > 0.5, plan.contacts)
 
 
-@each_network
-def test_a_state_advanced_by_frames_continues_their_rollout(kind):
-    network = NETWORKS[kind]
-    state = warm(network)
-    draws, plan, frames, density = rolled(network, state)
-    later = network.advance(state, frames[:, :5])
-    torch.testing.assert_close(network.log_prob(frames[:, 5:], later), network.log_prob(frames, state)[:, 5:])
-    rest, scores = network.rollout(later, draws[:, 5:], DiscreteChoices(plan.component[:, 5:], plan.contacts[:, 5:]))
-    torch.testing.assert_close((rest, scores), (frames[:, 5:], density[:, 5:]))
-    again = network.plan(later, draws[:, 5:])
-    assert torch.equal(again.component, plan.component[:, 5:])
-
-
-@each_network
-def test_the_pullback_of_a_rollout_is_that_of_finite_differences(kind):
-    network = NETWORKS[kind]
-    state = warm(network)
-    draws, plan, frames, _ = rolled(network, state, frames=5)
-    weight = torch.randn(frames.shape, generator=generator(5), dtype=torch.float64)
-
-    def measure(values):
-        features, density = network.rollout(state, values, plan)
-        return (features * weight).sum() + density.sum()
-
-    leaf = draws.clone().requires_grad_(True)
-    (gradient,) = torch.autograd.grad(measure(leaf), leaf)
-    direction = noise(2, 5, seed=6, dtype=torch.float64)
-    assert float((gradient * direction).sum()) == pytest.approx(finite_difference(measure, draws, direction), rel=1e-5)
-
-
-@each_network
-def test_rows_of_a_batch_know_nothing_of_each_other(kind):
-    network = NETWORKS[kind]
-    state, frames = warm(network, 3), clip(3)
-    together = network.log_prob(frames, state)
-    for row in range(3):
-        alone = state.pick(torch.tensor([row]))
-        torch.testing.assert_close(network.log_prob(frames[row : row + 1], alone)[0], together[row])
-    copies = state.pick(torch.tensor([1])).repeat(4)
-    assert copies.batch == 4
-    torch.testing.assert_close(network.log_prob(frames[1:2].expand(4, -1, -1), copies), together[1].expand(4, -1))
-
-
-def test_noisy_inputs_are_seen_but_not_scored():
-    network = NETWORKS["several"]
-    state, frames = warm(network), clip()
-    seen = frames.clone()
-    seen[:, 4, :SIZE] += 0.05 * network.std[:SIZE]
-    plain, noisy = network.log_prob(frames, state), network.log_prob(frames, state, inputs=seen)
-    torch.testing.assert_close(noisy[:, :5], plain[:, :5])
-    assert float((noisy[:, 5:] - plain[:, 5:]).abs().min()) > 1e-6
-    torch.testing.assert_close(network.log_prob(frames, state, inputs=frames), plain)
-
-
 def test_without_a_say_of_the_network_the_mean_is_the_clamped_share_of_the_last_frame():
-    network = densities()["several"]
+    network = tiny_model(dtype=torch.float64)
     with torch.no_grad():
         network.out.weight.zero_()
         network.out.bias.zero_()
     previous = network.mean + network.std * torch.linspace(-9, 9, LAYOUT.size).double()
     plan = DiscreteChoices(torch.zeros(1, 1, dtype=torch.long), torch.zeros(1, 1, 2, dtype=torch.bool))
-    frames, _ = network.rollout(network.initial_state(previous[None]), torch.zeros(1, 1, SIZE).double(), plan)
+    frames, _ = network.rollout(network.start_after(previous[None]), torch.zeros(1, 1, SIZE).double(), plan)
     expected = 0.9 * torch.linspace(-9, 9, LAYOUT.size).double().clamp(-5, 5)
     torch.testing.assert_close(network.normalise(frames)[0, 0, :SIZE], expected[:SIZE])
 
@@ -176,7 +121,7 @@ def test_draws_follow_the_mixture(kind):
     network = NETWORKS[kind]
     count = 4000
     state = warm(network, 1)
-    drawn, _ = network.sample(state.repeat(count), 1, generator(3))
+    drawn, _ = network.sample(state.expand(count), 1, generator(3))
     mixture = mixture_of(network, state, clip(1, 1))
     weight = mixture.log_weight[0, 0].exp()[:, None]
     mean = (weight * mixture.mean[0, 0]).sum(0)
@@ -190,18 +135,6 @@ def test_draws_follow_the_mixture(kind):
     torch.testing.assert_close((values[:, :SIZE] ** 2).mean(0), second, rtol=0.15, atol=1e-3)
     bits = drawn[:, 0, SIZE:].double().mean(0)
     torch.testing.assert_close(bits, torch.sigmoid(mixture.contact_logit[0, 0]), atol=0.04, rtol=0)
-
-
-@each_network
-def test_sampling_returns_the_state_after_its_frames_and_obeys_the_seed(kind):
-    network = NETWORKS[kind]
-    state = warm(network)
-    drawn, after = network.sample(state, 6, generator(1))
-    expected = network.advance(state, drawn)
-    for part in ("previous", "hidden", "cell"):
-        torch.testing.assert_close(getattr(after, part), getattr(expected, part))
-    assert torch.equal(network.sample(state, 6, generator(1))[0], drawn)
-    assert not torch.equal(network.sample(state, 6, generator(2))[0], drawn)
 
 
 def test_at_temperature_zero_only_the_discrete_choices_are_drawn():
@@ -220,14 +153,12 @@ def test_long_free_runs_stay_finite():
 
 def test_a_loaded_density_offers_what_its_network_does():
     density = tiny_density()
-    state = density.starts.state.pick(torch.tensor([0, 2]))
+    state = density.initial_states.state.pick(torch.tensor([0, 2]))
     draws = noise(2, 4)
     plan = density.plan(state, draws)
     frames, scores = density.rollout(state, draws, plan)
     torch.testing.assert_close((frames, scores), density.reference.rollout(state, draws, plan))
     after = density.advance(state, frames)
     assert isinstance(after, LstmState)
-    torch.testing.assert_close(after.previous, frames[:, -1])
+    torch.testing.assert_close(after.last_frame, frames[:, -1])
     assert density.log_prob(frames, state).shape == (2, 4)
-    assert density.abilities.slowest < density.abilities.fastest
-    assert len(density.starts.names) == len(density.starts.speed) == density.starts.state.batch == 4

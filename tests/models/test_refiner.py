@@ -1,52 +1,22 @@
 """The refiner: what it may change and what it may see, whole or in pieces, and its file."""
 
 from dataclasses import replace
-from functools import cache
 
 import pytest
 import torch
-from helpers import corpus, generator
+from helpers import generator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
+from tiny_refiner import TINY, network_of, refiner_of, walks
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
 from priors import checkpoints
 from priors.refiner import network as refiners
-from priors.refiner.end_effectors import count_channels
-from priors.refiner.network import LstmRefiner, RefinerConfig, RefinerNetwork
 
-TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
 BITS = LAYOUT.slices["contacts"]
-
-
-walks = cache(corpus)
-
-
-def network_of(config=TINY, *, trained=True, scale=1.0):
-    """In float64, with the statistics of the walks; `trained` draws the last layer, which is zero at first."""
-    features = walks().features
-    reach = torch.linspace(-0.5, 0.5, count_channels(config.joints))
-    with torch.random.fork_rng():
-        torch.manual_seed(3)
-        network = RefinerNetwork(
-            config,
-            mean=features.mean(0),
-            std=features.std(0).clamp(min=0.002),
-            reach_mean=reach,
-            reach_std=1 + reach.abs(),
-        )
-        if trained:
-            torch.nn.init.normal_(network.last.weight, std=scale)
-            torch.nn.init.normal_(network.last.bias, std=scale)
-    return network.double().eval().requires_grad_(False)
-
-
-def refiner_of(config=TINY, **how):
-    card = checkpoints.Card("refiner", config.as_card(), licence="none", **checkpoints.Card.layout_fields())
-    return LstmRefiner("tiny", network_of(config, **how), card)
 
 
 def clips(frames=40, count=2):
@@ -146,12 +116,6 @@ def test_a_frame_sees_the_past_and_its_look_ahead_but_nothing_later(changed, loo
     first = max(0, changed - lookahead)
     assert float(difference[:first].sum()) == pytest.approx(0, abs=1e-12)
     assert float(difference[first:].min()) > 0
-
-
-def test_it_does_not_matter_what_else_is_in_the_batch():
-    refiner, features = refiner_of(), clips(count=3)
-    one_by_one = torch.cat([refiner.refine(features[k : k + 1]) for k in range(3)])
-    torch.testing.assert_close(refiner.refine(features), one_by_one, atol=1e-12, rtol=0)
 
 
 def test_in_float32_too_the_whole_is_its_pieces():

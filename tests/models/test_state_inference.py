@@ -31,7 +31,7 @@ def nats(state, features):
 
 def prior(state):
     """Of the memory, by the mean and spread of the known ones."""
-    known = tiny().starts.state
+    known = tiny().initial_states.state
     total = 0.0
     for mine, theirs in ((state.hidden, known.hidden), (state.cell, known.cell)):
         spread = theirs.std(dim=1, correction=0).clamp_min(0.05)
@@ -42,8 +42,8 @@ def prior(state):
 def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_one():
     first = frames()[:10]
     found = tiny().infer_state(frames())
-    assert nats(found, first) > nats(tiny().initial_state(first[:1]), first) + 10
-    known = tiny().starts.state
+    assert nats(found, first) > nats(tiny().start_after(first[:1]), first) + 10
+    known = tiny().initial_states.state
     for row in range(known.batch):
         other = known.pick(torch.tensor([row]))
         other = LstmState(first[:1], other.hidden, other.cell)
@@ -54,11 +54,11 @@ def test_the_same_frames_give_the_same_state():
     one, other = (tiny().infer_state(frames()) for _ in range(2))
     assert torch.equal(one.hidden, other.hidden)
     assert torch.equal(one.cell, other.cell)
-    assert torch.equal(one.previous, frames()[:1])
+    assert torch.equal(one.last_frame, frames()[:1])
 
 
 def test_without_a_search_it_is_the_best_of_the_known_ones():
-    known = tiny().starts.state
+    known = tiny().initial_states.state
     found = infer_lstm_state(tiny().reference, known, frames(), StateInferenceSettings(budget=Budget(evaluations=1)))
     apart = (known.hidden - found.hidden).abs().amax(dim=(0, 2))
     assert float(apart.min()) < 1e-5
@@ -69,7 +69,7 @@ def test_short_motions_and_one_known_state_will_do():
         state = tiny().infer_state(frames()[:count])
         assert state.batch == 1
         assert bool(torch.isfinite(state.cell).all())
-    one = tiny().starts.state.pick(torch.tensor([0]))
+    one = tiny().initial_states.state.pick(torch.tensor([0]))
     assert bool(torch.isfinite(infer_lstm_state(tiny().reference, one, frames()).hidden).all())
 
 

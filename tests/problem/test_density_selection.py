@@ -7,6 +7,7 @@ from functools import cache
 import pytest
 import torch
 from helpers import corpus, generator, tiny_density, walk
+from toy_density import ToyDensity, toy_density
 
 import priors
 from mapctl.errors import MapctlError, RequestError
@@ -17,24 +18,30 @@ from priors.training.recipes.lstm_gmm import compute_window_nats
 
 
 @dataclass(frozen=True, eq=False)
-class Flat:
+class Flat(ToyDensity):
     """A density that says the same of every frame."""
 
-    name: str
-    nats: float
+    name: str = "flat"
+    nats: float = 0.0
     """Of a frame, normalised units."""
-    feature_std: torch.Tensor
-    reference_log_density: float = 0.0
+    std: float = 1.0
+    usual: float = 0.0
 
-    def initial_state(self, previous):
-        return None
+    @property
+    def feature_std(self):
+        return torch.full((LAYOUT.size,), self.std)
 
-    def log_prob(self, features, state):
+    @property
+    def reference_log_density(self):
+        return self.usual
+
+    def log_prob(self, features, state, *, inputs=None):
         return torch.full(features.shape[:2], self.nats)
 
 
-def flat(name, nats, std=1.0, usual=0.0):
-    return Flat(name, nats, torch.full((LAYOUT.size,), std), usual)
+def flat(name, nats, std=1.0, usual=0.0, kind=Flat):
+    toy = toy_density()
+    return kind(toy.initial_states, toy.mean, toy.sigma, name=name, nats=nats, std=std, usual=usual)
 
 
 @cache
@@ -55,13 +62,13 @@ def test_other_units_of_the_network_change_nothing():
 
     @dataclass(frozen=True, eq=False)
     class Gaussian(Flat):
-        def log_prob(self, features, state):
+        def log_prob(self, features, state, *, inputs=None):
             size = LAYOUT.continuous
             white = features[..., :size] / self.feature_std[:size]
             spread = 0.1 / self.feature_std[:size]  # of the same physical density
             return (-0.5 * (white / spread).square() - spread.log()).sum(-1)
 
-    densities = [Gaussian(f"{std}", 0.0, torch.full((LAYOUT.size,), std)) for std in (0.5, 3.0)]
+    densities = [flat(f"{std}", 0.0, std, kind=Gaussian) for std in (0.5, 3.0)]
     nats = density_selection.select_density_for_motion(densities, walk(20)).nats
     assert nats["0.5"] == pytest.approx(nats["3.0"], rel=1e-5)
 
@@ -107,7 +114,7 @@ def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
 
 def test_blur_widens_the_density_and_nothing_widens_it_by_nothing():
     features = encode(walk(40))[0].float()[None]
-    state = tiny().initial_state(features[:, 0])
+    state = tiny().start_after(features[:, 0])
     sharp = tiny().log_prob(features[:, 1:], state)
     none = tiny().with_observation_noise(torch.zeros(LAYOUT.continuous)).log_prob(features[:, 1:], state)
     assert torch.allclose(none, sharp, rtol=1e-4)
@@ -125,7 +132,7 @@ def test_a_blurred_density_is_that_of_a_sum():
     """Of one Gaussian with independent values: its variances and those of the errors add up."""
     density = tiny_density(components=1)
     features = encode(walk(12))[0].float()[None]
-    state, spread = density.initial_state(features[:, 0]), 3 * density_selection.proposal_sigma()
+    state, spread = density.start_after(features[:, 0]), 3 * density_selection.proposal_sigma()
     model = density.reference
     with torch.no_grad():
         mixture, _ = model(model.normalise(features[:, :-1]), (state.hidden, state.cell))

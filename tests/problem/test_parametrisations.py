@@ -3,7 +3,7 @@
 import pytest
 import torch
 from catalogue import excite
-from helpers import corpus, finite_difference, generator, noise, tiny_model, walk
+from helpers import corpus, finite_difference, generator, noise, tiny_density, walk
 
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.pose import BodyPose
@@ -19,29 +19,29 @@ from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood
 FRAMES, SIZE = 7, LAYOUT.continuous
 
 
-def network():
-    model = tiny_model(dtype=torch.float64)
-    excite(model, 0)
-    return model
+def excited():
+    density = tiny_density(dtype=torch.float64)
+    excite(density.reference, 0)
+    return density
 
 
-def context(model):
+def context(density):
     """After some frames of a walk, facing anywhere."""
     seen = corpus().clips()[0][None, :30].double()
-    state = model.advance(model.initial_state(seen[:, 0]), seen[:, 1:])
+    state = density.advance(density.start_after(seen[:, 0]), seen[:, 1:])
     place = GroundPose(torch.tensor([1.0, -2.0]).double(), torch.tensor(0.8).double())
-    return WindowContext(model, state, place, walk(10).joint_positions(), FRAMES)
+    return WindowContext(density, state, place, walk(10).joint_positions(), FRAMES)
 
 
-MODEL = network()
-CONTEXT = context(MODEL)
+DENSITY = excited()
+CONTEXT = context(DENSITY)
 
 
 def states():
     """The states' unknowns around a stretch of a walk."""
     features = corpus().clips()[0][None, 30 : 30 + FRAMES].double()
     bits = LAYOUT.pick(features, "contacts") > 0.5
-    return features, FeatureStates(CONTEXT, MODEL.std[:SIZE], MODEL.mean[:SIZE], bits)
+    return features, FeatureStates(CONTEXT, DENSITY.feature_std[:SIZE], DENSITY.feature_mean[:SIZE], bits)
 
 
 def slope(function, at, direction):
@@ -54,7 +54,7 @@ def test_latents_build_the_rollout_of_their_plan():
     draws = noise(3, FRAMES, dtype=torch.float64)
     latents = LatentNoise.from_unknowns(CONTEXT, draws.flatten(1))
     trial = latents.build(draws.flatten(1))
-    features, density = MODEL.rollout(CONTEXT.state.repeat(3), draws, latents.plan)
+    features, density = DENSITY.rollout(CONTEXT.state.expand(3), draws, latents.plan)
     torch.testing.assert_close((trial.features, trial.log_density), (features, density))
     torch.testing.assert_close(trial.noise, draws)
     assert torch.equal(trial.contacts, LAYOUT.pick(features, "contacts") > 0.5)
@@ -76,7 +76,7 @@ def test_states_build_their_own_features_and_teacher_forced_density():
     features, variables = states()
     trial = variables.build(variables.from_features(features))
     torch.testing.assert_close(trial.features, features, atol=1e-9, rtol=0)
-    torch.testing.assert_close(trial.log_density, MODEL.log_prob(features, CONTEXT.state))
+    torch.testing.assert_close(trial.log_density, DENSITY.log_prob(features, CONTEXT.state))
     assert float(trial.noise.abs().max()) == 0
 
 
@@ -87,9 +87,9 @@ def test_the_input_noise_of_states_is_in_units_of_the_papers_sigma():
     unknowns[:, half:] = noise(1, FRAMES, dtype=torch.float64).flatten(1)
     trial = variables.build(unknowns)
     seen = features.clone()
-    seen[..., :SIZE] += 0.05 * MODEL.std[:SIZE] * unknowns[:, half:].unflatten(-1, (FRAMES, SIZE))
+    seen[..., :SIZE] += 0.05 * DENSITY.feature_std[:SIZE] * unknowns[:, half:].unflatten(-1, (FRAMES, SIZE))
     torch.testing.assert_close(trial.features, features, atol=1e-9, rtol=0)
-    torch.testing.assert_close(trial.log_density, MODEL.log_prob(features, CONTEXT.state, inputs=seen))
+    torch.testing.assert_close(trial.log_density, DENSITY.log_prob(features, CONTEXT.state, inputs=seen))
 
 
 @pytest.mark.parametrize("kind", ["latents", "states"])

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from helpers import corpus, generator, tiny_density, tiny_model
+from helpers import corpus, generator, tiny_density
 
 from controllers.common.initial_state import select_initial_state
 from mapctl import curves
@@ -93,7 +93,7 @@ def test_windows_join_without_a_seam(method):
     ground, heading = integrate_root(done.features[1:], begun.place)
     torch.testing.assert_close((done.place.position_xz, done.place.heading), (ground[-1], heading[-1]))
     expected = DENSITY.advance(begun.state, done.features[None, 1:])
-    for part in ("previous", "hidden", "cell"):
+    for part in ("last_frame", "hidden", "cell"):
         torch.testing.assert_close(getattr(done.state, part), getattr(expected, part))
     assert all(len(entry.energy) == 20 for entry in done.ledger.entries)
     assert done.joints_world.shape == (SHORT.past, 21, 3)
@@ -177,18 +177,20 @@ def test_an_interrupt_keeps_whole_windows_and_goes_on_where_there_is_none():
 
 def interrupted():
     """A density in whose first rollout Ctrl-C is pressed."""
-    model = tiny_model()
+    density = tiny_density()
+    model = density.reference
 
     def press(state, noise, plan):
         raise KeyboardInterrupt
 
     model.rollout = press
-    return model
+    return density
 
 
 def broken(after):
     """A density that answers NaN from its window number `after` on."""
-    model = tiny_model()
+    density = tiny_density()
+    model = density.reference
     rollout, advance, windows = model.rollout, model.advance, [0]
 
     def counting(state, committed):
@@ -196,11 +198,11 @@ def broken(after):
         return advance(state, committed)
 
     def failing(state, noise, plan):
-        features, density = rollout(state, noise, plan)
-        return (features * torch.nan, density * torch.nan) if windows[0] >= after else (features, density)
+        features, nats = rollout(state, noise, plan)
+        return (features * torch.nan, nats * torch.nan) if windows[0] >= after else (features, nats)
 
     model.advance, model.rollout = counting, failing
-    return model
+    return density
 
 
 @pytest.mark.parametrize("after", [0, 2])
@@ -279,5 +281,5 @@ def test_a_replay_goes_on_from_a_state_or_from_the_likeliest():
     whole = replay(DENSITY, features)
     part = replay(DENSITY, features[:12])
     on = replay(DENSITY, features, part, since=12)
-    for name in ("previous", "hidden", "cell"):
+    for name in ("last_frame", "hidden", "cell"):
         torch.testing.assert_close(getattr(on, name), getattr(whole, name))

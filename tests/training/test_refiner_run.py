@@ -34,9 +34,9 @@ SETTINGS = AdversarialSettings(
 def density(tmp_path_factory):
     """Untrained, with the statistics of the walks: it walks on, with noise."""
     prior, path = tiny_density(), tmp_path_factory.mktemp("density") / "walks.safetensors"
-    starts = prior.starts
+    starts = prior.initial_states
     tensors = prior.reference.state_dict() | {
-        "starts.previous": starts.state.previous,
+        "starts.previous": starts.state.last_frame,
         "starts.hidden": starts.state.hidden,
         "starts.cell": starts.state.cell,
         "starts.speed": starts.speed,

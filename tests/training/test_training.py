@@ -104,7 +104,7 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert {"validation_nats", "free_run_speed_ratio", "free_run_finite"} <= set(card.training["curve"][-1])
     assert card.quality["test_nats_per_frame"]
     assert prior.reference_log_density == card.quality["windows"]["p2"] <= card.quality["windows"]["mean"]
-    assert 0 < prior.abilities.slowest < prior.abilities.fastest < 3
+    assert 0 < prior.limits.slowest < prior.limits.fastest < 3
     assert any("step 6: " in line for line in news)
     files = {file.name for file in out.iterdir()}
     assert files == {"cache", "checkpoint.json", "step-6-checkpoint.safetensors", "model.json", path.name}
@@ -404,8 +404,8 @@ def test_starts_are_the_states_after_stretches_of_clips():
     clips = dict(zip(data.names, data.clips(), strict=True))
     for row, name in enumerate(found.names):
         clip = clips[name]
-        end = 1 + int((clip == found.state.previous[row]).all(-1).nonzero()[0])
-        expected = trainer.model.advance(trainer.model.initial_state(clip[:1]), clip[None, 1:end])
+        end = 1 + int((clip == found.state.last_frame[row]).all(-1).nonzero()[0])
+        expected = trainer.model.advance(trainer.model.start_after(clip[:1]), clip[None, 1:end])
         torch.testing.assert_close(found.state.hidden[:, row], expected.hidden[:, 0])
         assert float(found.speed[row]) == pytest.approx(float(ground_speed(clip[end - 30 : end]).mean()), rel=1e-5)
 

@@ -7,7 +7,6 @@ still missed is spread over the gap.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -29,6 +28,7 @@ from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
 from mapctl.problem.warm_start import SteeringKnots, SwarmProposal, keep_warm_start
 from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow
+from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -88,7 +88,7 @@ def roll_through_gaps(
     odds: Float[Tensor, "frames 2"],
     targets: EffectorTargets | None = None,
     *,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     generator: torch.Generator,
     settings: RolloutSettings | None = None,
 ) -> Proposal:
@@ -138,18 +138,18 @@ class Roller:
     """All frames so far, on canonical bones."""
     odds: Float[Tensor, "frames 2"]
     """Log odds of contacts."""
-    density: Any
+    density: Density
     """That is rolled."""
     targets: EffectorTargets | None
     """Places wanted on the way."""
-    state: Any = None
+    state: DensityState | None = None
     """Of the density, after `done` frames."""
     done: int = 0
     """Frames that the state has seen."""
 
     @staticmethod
     def of(
-        gap: CanonicalGap, proposal: Motion, odds: Tensor, densities: Sequence[Any], targets: EffectorTargets | None
+        gap: CanonicalGap, proposal: Motion, odds: Tensor, densities: Sequence[Density], targets: EffectorTargets | None
     ) -> "Roller":
         """By the density under which the proposal is likeliest."""
         body = Motion(CANONICAL, proposal.fps, proposal.root_position / gap.scale, proposal.local_quat_xyzw)
@@ -167,9 +167,11 @@ class Roller:
     def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
         """A rollout through frames start to stop; changes nothing but what was seen before them."""
         features, place = _encode_before_gap(self.body, self.odds, start)
-        if self.done < start:
-            self.state, self.done = replay(self.density, features, self.state, since=self.done), start
-        committed = CommittedFrames(self.state, place, features, _compute_past_joints(self.body, start))
+        state = self.state
+        if state is None or self.done < start:
+            state = replay(self.density, features, state, since=self.done)
+        self.state, self.done = state, start
+        committed = CommittedFrames(state, place, features, _compute_past_joints(self.body, start))
         arrival = self._build_arrival_target(start, stop, settings)
         frames, targets = len(arrival.places), [arrival]
         if settings.trajectory is not None:
@@ -234,7 +236,7 @@ def extrapolate_end(
     proposal: Motion,
     odds: Float[Tensor, "frames 2"],
     *,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     settings: RolloutSettings | None = None,
 ) -> Proposal:
     """The proposal with the likeliest rollout from where it is last known to its end, if nothing is known there; the
@@ -267,7 +269,7 @@ def extrapolate_end(
     return Proposal(body, odds, (GapSource(first, stop, f"density {density.name}"),))
 
 
-def select_likeliest_density(densities: Sequence[Any], motion: Motion) -> Any:
+def select_likeliest_density(densities: Sequence[Density], motion: Motion) -> Density:
     """The density under which a canonical motion, seen with a proposal's errors, is likeliest."""
     if len(densities) == 1:
         return densities[0]

@@ -7,7 +7,6 @@ long way round, a limb that jumps.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -24,6 +23,7 @@ from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.problem.warm_start import keep_warm_start
 from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -105,7 +105,7 @@ def choose_proposals(
     odds: Float[Tensor, "frames 2"],
     targets: EffectorTargets | None = None,
     *,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     settings: ChoiceSettings | None = None,
 ) -> Proposal:
     """The proposal, an infiller's, but in gaps where another answer costs a viewer less; and who proposed those.

@@ -103,8 +103,7 @@ def walk(
     from mapctl.skeleton import CANONICAL
     from mapctl.terms import FootContact
 
-    if prior.use_fast:
-        _ = prior.fast
+    prior.warm_up()
     bones = CANONICAL if person is None else person.skeleton
     settings = None if person is None else FollowSettings(footing=FootContact(rest_height=person.toe_rest_height))
     began = time.perf_counter()

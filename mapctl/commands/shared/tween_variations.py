@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from controllers.inbetweening.pipeline import InfillResult, InfillSettings
     from controllers.inbetweening.variations import Variations
     from mapctl.commands.tween import Tween
+    from mapctl.protocols import Inbetweener
 
 _MAX_ANSWERS = 1000
 _FIRST_SAMPLED = 3  # answers before it are the infiller's and slerp's
@@ -49,7 +50,7 @@ def check_answers(command: "Tween", given: Sequence[Path]) -> None:
 
 
 def tween_lowest_energy(
-    command: "Tween", asked: "KeyframeClip", infiller: Any, settings: "InfillSettings"
+    command: "Tween", asked: "KeyframeClip", infiller: "Inbetweener", settings: "InfillSettings"
 ) -> "InfillResult":
     """The likeliest of several answers."""
     from controllers.inbetweening.variations import lowest_energy
@@ -121,7 +122,7 @@ def _load_rollout_arguments(command: "Tween", asked: "KeyframeClip") -> dict[str
     import priors
 
     return {
-        "rollable": priors.load_choice(command.prior or "auto"),
+        "rollout_densities": priors.load_choice(command.prior or "auto"),
         "densities": priors.load_choice(command.prior),
         "generator": torch.Generator().manual_seed(command.seed),
         "rig": asked.rig,

@@ -72,7 +72,7 @@ class FastRollout:
         """
         self._check(plan, noise)
         batch = len(noise)
-        previous = state.previous.expand(batch, -1)
+        previous = state.last_frame.expand(batch, -1)
         hidden, cell = state.hidden.expand(-1, batch, -1), state.cell.expand(-1, batch, -1)
         return _Rollout.apply(noise, previous, hidden, cell, plan, self)
 
@@ -80,11 +80,11 @@ class FastRollout:
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """Frames drawn one after the other (section 4.1.4): the model's in distribution, not in numbers."""
-        batch, size = len(state.previous), self._layout.continuous
+        batch, size = len(state.last_frame), self._layout.continuous
         noise = temperature * torch.randn(batch, frames, size, generator=generator)
         choices = _allocate_choices(batch, frames, torch.rand(batch, frames, 3, generator=generator))
         run = self._run(state, noise, choices, layout.SAMPLED, slots=2)
-        features = _to_tensor(run.features, batch).to(state.previous.dtype)
+        features = _to_tensor(run.features, batch).to(state.last_frame.dtype)
         return features, self._state_after(run, features[:, -1])
 
     def _check(self, plan: DiscreteChoices, noise: Tensor) -> None:
@@ -103,7 +103,7 @@ class FastRollout:
         rows, width = layout.pad_batch_size(batch), self._config.width
         tape = layout.allocate_tape(self._weights, slots=slots, batch=rows)
         settings, size, lanes = self._settings, self._layout.size, len(self._weights.fc2)
-        tape.frame[0, :batch, :size] = (_to_array(state.previous) - settings.mean[:size]) / settings.std[:size]
+        tape.frame[0, :batch, :size] = (_to_array(state.last_frame) - settings.mean[:size]) / settings.std[:size]
         tape.lstm_input[0, :, :, lanes:] = 0
         tape.lstm_input[0, :, :batch, lanes : lanes + width] = _to_array(state.hidden)
         tape.cell[0] = 0

@@ -225,7 +225,7 @@ class DensityTrainer:
         """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
         model, size = self.model, self.model.layout.continuous
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
-        memory = model.initial_state(windows[:, 0])
+        memory = model.start_after(windows[:, 0])
         condition = torch.cat([level / NOISE_UNIT, told], -1) if model.config.knows_noise else told
         with torch.autocast(self.device, torch.bfloat16, enabled=self.settings.bfloat16):
             mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
@@ -260,7 +260,7 @@ def compute_validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -
     with torch.no_grad():
         for clip in corpus.clips():
             clip = clip[:frames].unsqueeze(0).to(model.mean.device)
-            nats = -model.log_prob(clip[:, 1:], model.initial_state(clip[:, 0]))
+            nats = -model.log_prob(clip[:, 1:], model.start_after(clip[:, 0]))
             total, count = total + nats.sum().item(), count + nats.numel()
     return total / count
 
@@ -273,7 +273,7 @@ def compute_window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, 
     blurred, found = model.cpu().with_observation_noise(density_selection.proposal_sigma()), []
     with torch.no_grad():
         for clip in (clip for corpus in corpora for clip in corpus.clips() if len(clip) > 1):
-            nats = blurred.log_prob(clip[None, 1:], blurred.initial_state(clip[:1]))[0]
+            nats = blurred.log_prob(clip[None, 1:], blurred.start_after(clip[:1]))[0]
             parts = density_selection.to_physical_log_density(nats, blurred.std).split(
                 density_selection.SELECTION_WINDOW
             )
