@@ -32,8 +32,11 @@ test test-all bench: export OMP_NUM_THREADS = 1
 test test-all bench: export MKL_NUM_THREADS = 1
 test test-all bench: export OPENBLAS_NUM_THREADS = 1
 
+# A file's tests stay together: they share what is costly to make. Tests run in as many processes as there are WORKERS.
+WORKERS := 2
+
 test: $(READY) $(BROWSER)
-	$(VENV)/python -m pytest -m "not slow"
+	$(VENV)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile
 
 test-all: $(READY) $(BROWSER)
 	$(VENV)/python -m pytest

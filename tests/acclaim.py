@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mapctl import rotations
+
 # Name, parent, direction, length in metres and the turns it has; in a T-pose facing +Z, left toward +X.
 _LEG = (
     ("hipjoint", "root", (0.6, -0.8, 0), 0.11, ""),
@@ -190,3 +192,26 @@ def _person(random: np.random.Generator) -> tuple[Bone, ...]:
 
 def _text(values: np.ndarray) -> str:
     return " ".join(repr(float(value)) for value in values)
+
+
+def ends_of(motion):
+    """Where the End Sites are, (frames, 3) by joint name."""
+    places, turns = motion.joint_positions(), motion.joint_rotations()
+    return {
+        name: (places[:, j] + rotations.rotate(turns[:, j], places.new_tensor(site).expand(len(places), 3))).numpy()
+        for name, site in motion.skeleton.end_offsets.items()
+        for j in [motion.skeleton.index(name)]
+    }
+
+
+def assert_same_places(motion, told):
+    """Joints at the bones' starts, End Sites at the last bones' ends."""
+    starts, ends = told.places()
+    places = motion.joint_positions().numpy()
+    assert set(motion.skeleton.names) == set(starts)
+    for joint, name in enumerate(motion.skeleton.names):
+        np.testing.assert_allclose(places[:, joint], starts[name], atol=1e-9, err_msg=name)
+    leaves = {bone.name for bone in told.bones} - {bone.parent for bone in told.bones}
+    assert set(motion.skeleton.end_offsets) == leaves
+    for name, place in ends_of(motion).items():
+        np.testing.assert_allclose(place, ends[name], atol=1e-9, err_msg=name)

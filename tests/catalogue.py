@@ -9,8 +9,8 @@ from toy_density import toy_density
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.features import LAYOUT, encode
 from mapctl.protocols import Density, Refiner
+from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.terms import (
     Clearance,
     FootContact,
@@ -26,10 +26,14 @@ from mapctl.terms import (
     Term,
 )
 from priors.lstm_gmm.density import LstmGmmDensity
+from mapctl.terms.trial import Trial
 from priors.lstm_gmm.network import LstmGmm
 
 FRAMES = 12
 """Of the windows that the terms are tried on."""
+
+PAST = 8
+"""Frames before them."""
 
 _ARCS = 0.3 + 0.04 * torch.arange(FRAMES, dtype=torch.float64)
 _RISING = torch.linspace(0, 3, 400, dtype=torch.float64)
@@ -56,6 +60,29 @@ TERMS: dict[str, Term] = {
     "travel, facing": RootVelocity(_VELOCITIES, _VELOCITIES[:3], facing=4 * torch.arange(FRAMES).double()),
 }
 """Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
+
+
+def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
+    """Windows of a walk, each disturbed on its own, with the frames of the walk before it."""
+    motion = walk(PAST + FRAMES, turn_rate=0.2)
+    vectors, start = encode(motion)
+    ground, heading = integrate_root(vectors[:PAST], start)
+    scale = disturbed * vectors.std(0)
+    features = vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
+    draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
+    bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
+    place = GroundPose(ground[-1].to(dtype), heading[-1].to(dtype))
+    before = motion.joint_positions()[PAST - past : PAST].to(dtype)
+    planted = torch.tensor([True, False])
+    return Trial(
+        features.to(dtype),
+        place,
+        contacts=bits,
+        noise=draw[..., 1:].to(dtype),
+        log_density=30 * draw[..., 0].to(dtype),
+        before=before,
+        contacts_before=planted,
+    )
 
 
 def excite(network: LstmGmm, seed: int) -> None:

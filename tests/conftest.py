@@ -12,6 +12,7 @@ from inspect import isclass, isfunction, isgeneratorfunction
 from pathlib import Path
 from typing import ForwardRef, get_args
 
+import hypothesis
 import jaxtyping
 import pytest
 import torch
@@ -19,6 +20,9 @@ from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray, TypeCheckError, install_import_hook
 
 torch.set_num_threads(1)
+# A machine whose other cores are busy is no failure.
+hypothesis.settings.register_profile("mapctl", deadline=None)
+hypothesis.settings.load_profile("mapctl")
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
@@ -78,6 +82,24 @@ def data(tmp_path_factory) -> Path:
     from helpers import write_corpus
 
     return write_corpus(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture
+def actors() -> list:
+    """Two characters that note what they are told."""
+    from stage import Actor
+
+    return [Actor(), Actor()]
+
+
+@pytest.fixture
+def show(actors) -> Iterator:
+    """The live viewer with those two on its stage; it has to close both."""
+    from stage import live_app
+
+    with live_app(actors) as made:
+        yield made
+    assert all(actor.heard[-1] == ("close",) for actor in actors)
 
 
 @pytest.fixture

@@ -60,6 +60,20 @@ def walk(frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, 
     return Motion(CANONICAL, Fraction(fps), root, local)
 
 
+def walk_through(places_xz, *, headings=0.0, fps=30, swing=0.5, wobble=0.0, seed=0):
+    """The canonical body at these places; its legs swing once a second and its joints wobble (radians)."""
+    frames = len(places_xz)
+    time = torch.arange(frames, dtype=torch.float64) / fps
+    vectors = wobble * torch.randn(frames, 21, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    for side, sign in (("left", 1), ("right", -1)):
+        vectors[:, CANONICAL.index(f"{side}UpperLeg"), 0] += sign * swing * torch.sin(2 * math.pi * time)
+    quats = rotations.from_rotation_vector(vectors)
+    quats[:, 0] = rotations.about_y(torch.as_tensor(headings, dtype=torch.float64).expand(frames))
+    places = torch.as_tensor(places_xz, dtype=torch.float64)
+    root = torch.stack([places[:, 0], torch.full((frames,), 0.87, dtype=torch.float64), places[:, 1]], dim=-1)
+    return Motion(CANONICAL, Fraction(fps), root, quats)
+
+
 def _swing(phase: Tensor, seed: int) -> Tensor:
     """Rotation vectors (frames, joints, 3) of a gait, with a smooth wobble that the seed draws."""
     offset = 6.3 * torch.rand(CANONICAL.num_joints, 3, generator=generator(seed), dtype=torch.float64)

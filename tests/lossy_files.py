@@ -10,6 +10,30 @@ from mapctl.formats import bvh
 from mapctl.formats.bvh import layout, text
 from mapctl.motion import Motion
 
+GOOD = """HIERARCHY
+ROOT hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT leg
+  {
+    OFFSET 10 0 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0 0 10
+    }
+  }
+}
+MOTION
+Frames: 3
+Frame Time: 0.0333333
+1 90 3 10 20 30 1 2 3
+2 91 4 11 21 31 2 3 4
+3 92 5 12 22 32 3 4 5
+"""
+"""A whole BVH file: two joints, three frames."""
+
 
 def without(source: Path, out: Path, lost: Sequence[tuple[str, int, int]], *, word: str = "nan") -> Path:
     """The BVH file with a word in place of the values of channels whose label begins so, from a frame up to another."""

@@ -1,6 +1,8 @@
 """A stage without a browser: characters that note what they are told, and the loop for a while."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from helpers import walk
@@ -8,6 +10,8 @@ from helpers import walk
 from mapctl.errors import RequestError
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import CANONICAL
+from scenes.live.app import LiveApp
+from scenes.live.inputs import SteeringInputs
 
 
 def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameChunk:
@@ -58,6 +62,17 @@ class Actor:
 
     def close(self):
         self.heard.append(("close",))
+
+
+@contextmanager
+def live_app(actors: list[Actor]) -> Iterator[LiveApp]:
+    """The viewer of these characters."""
+    labels = {"gait": ["run", "walk"], "style": ["old"]}
+    show = LiveApp(actors, [SteeringInputs() for _ in actors], port=8090, fastest=3.8, labels=labels)
+    try:
+        yield show
+    finally:
+        show.close()
 
 
 def run(show, ticks: int = 20) -> None:

@@ -4,9 +4,17 @@ from pathlib import Path
 
 import torch
 
+from controllers.common.map_refinement import RefinementSettings
+from controllers.denoising.denoise import DenoiseSettings
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
 from priors import checkpoints
 from priors.denoiser.network import ConvDenoiser, DenoiserConfig, DenoiserNetwork
 
+QUICK = DenoiseSettings(
+    refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4))
+)
+"""Of a denoising that searches little."""
 CONFIG = DenoiserConfig(width=8, dilations=(1, 2))
 
 

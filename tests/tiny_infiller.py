@@ -4,10 +4,14 @@ from pathlib import Path
 
 import torch
 
+from mapctl import kinematics
+from mapctl.inbetweening import PositionImage
+from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.infiller.network import ConvInfiller, InfillerConfig, InfillerNetwork
 
 CONFIG = InfillerConfig(widths=(8, 8, 8, 8, 8))
+TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
 _SPREAD = 0.1  # metres: what one unit of a place is
 
 
@@ -40,3 +44,17 @@ def save_tiny_infiller(path: Path, *, drawn: float = 0.0) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
     return path
+
+
+def shown(motion, known=None, *, present=None, contacts=None):
+    """The image of a canonical motion, of which all is known unless said otherwise."""
+    places, frames = motion.joint_positions()[None], motion.num_frames
+    whole = torch.ones(1, frames, CANONICAL.num_joints, dtype=torch.bool)
+    return PositionImage.of_world(
+        places,
+        kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
+        torch.ones(1, frames, 2).double() if contacts is None else contacts,
+        known=whole if known is None else known,
+        toes=TOES,
+        present=whole[..., 0] if present is None else present,
+    )

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,8 @@ from mapctl.errors import RequestError
 from mapctl.solver.budget import Meter
 
 Vector = NDArray[np.float64]
+Point = NDArray[np.floating[Any]]
+"""In the caller's precision."""
 EnergyAndGradient = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Points (batch, n) to energies (batch,) and gradients (batch, n); row i of a call is always problem i."""
 
@@ -117,21 +120,22 @@ def minimise(
     return _collect_result(problems, x)
 
 
-def _evaluate(function: EnergyAndGradient, points: NDArray, like: Tensor) -> tuple[list[float], NDArray[np.float64]]:
-    energy, gradient = function(torch.from_numpy(points).to(like.device))
+def _evaluate(function: EnergyAndGradient, points: Point, like: Tensor) -> tuple[list[float], Vector]:
+    energy, gradient = function(torch.as_tensor(points).to(like.device))
     if energy.shape != like.shape[:1] or gradient.shape != like.shape:
         raise RequestError(
             f"an objective must answer energies {tuple(like.shape[:1])} and gradients {tuple(like.shape)}, "
             f"got {tuple(energy.shape)} and {tuple(gradient.shape)}"
         )
-    return energy.detach().tolist(), gradient.detach().to("cpu", torch.float64).numpy()
+    energies = [float(each) for each in energy.detach()]
+    return energies, gradient.detach().to("cpu", torch.float64).numpy()
 
 
 def _collect_result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
     count = torch.tensor([[p.evaluations, p.iterations] for p in problems], dtype=torch.int64).reshape(-1, 2)
     points = [p.best.x for p in problems]
     return LbfgsResult(
-        x=torch.from_numpy(np.stack(points)).to(x.device) if points else x.detach().clone(),
+        x=torch.as_tensor(np.stack(points)).to(x.device) if points else x.detach().clone(),
         energy=x.new_tensor([p.best.energy for p in problems]),
         start_energy=x.new_tensor([p.start_energy for p in problems]),
         gradient_norm=x.new_tensor([p.best.gradient_norm for p in problems]),
@@ -146,7 +150,7 @@ class _EvaluatedPoint:
     """An evaluated point of a line search."""
 
     step: float
-    x: NDArray
+    x: Point
     energy: float
     gradient: Vector
     slope: float
@@ -160,14 +164,14 @@ class _EvaluatedPoint:
         return math.isfinite(self.energy) and math.isfinite(self.gradient_norm)
 
 
-Search = Generator[NDArray, tuple[float, Vector]]
+Search = Generator[Point, tuple[float, Vector]]
 """Yields points, is sent energy and gradient."""
 
 
 class _Problem:
     """One problem's search, its best point and its count."""
 
-    def __init__(self, start: NDArray, settings: LbfgsSettings):
+    def __init__(self, start: Point, settings: LbfgsSettings):
         self.settings = settings
         self.evaluations = self.iterations = 0
         self.start_energy = math.inf
@@ -191,7 +195,7 @@ class _Problem:
         except StopIteration as stop:
             self.running, self.status, self.ask = False, stop.value, self.best.x
 
-    def _descend(self, start: NDArray) -> Generator[NDArray, tuple[float, Vector], LbfgsStatus]:
+    def _descend(self, start: Point) -> Generator[Point, tuple[float, Vector], LbfgsStatus]:
         settings, pairs = self.settings, _CurvaturePairs(self.settings.memory)
         energy, gradient = yield start
         here = _EvaluatedPoint(0.0, start, energy, gradient, 0.0)
@@ -241,7 +245,8 @@ class _CurvaturePairs:
 
     def apply(self, gradient: Vector) -> Vector:
         """Inverse Hessian times gradient: the two-loop recursion (Nocedal and Wright, algorithm 7.4)."""
-        result, weights = gradient.copy(), []
+        result = gradient.copy()
+        weights: list[float] = []
         for step, change, product in reversed(self._pairs):
             weights.append(float(step @ result) / product)
             result -= weights[-1] * change
@@ -264,7 +269,7 @@ def _descent_direction(here: _EvaluatedPoint, pairs: _CurvaturePairs, length: fl
 
 def _line_search(
     origin: _EvaluatedPoint, direction: Vector, first: float, settings: LbfgsSettings
-) -> Generator[NDArray, tuple[float, Vector], _EvaluatedPoint | None]:
+) -> Generator[Point, tuple[float, Vector], _EvaluatedPoint | None]:
     """A point with enough decrease and enough curvature for a pair (weak Wolfe); None where no trial gains.
 
     `low` is the best step so far that decreases enough, `high` the shortest known to be too long.

@@ -9,7 +9,7 @@ every object made, and it draws from numpy's global random state.
 import logging.config
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -95,7 +95,7 @@ def run_swarm(
     for iteration in range(settings.iterations):
         if iteration:
             flight.move()
-        energies = track.evaluate(torch.from_numpy(flight.positions).to(start))
+        energies = track.evaluate(torch.as_tensor(flight.positions).to(start))
         if energies is None:
             break
         flight.learn(energies)
@@ -161,12 +161,12 @@ class _ParticleSwarm:
     def __init__(self, points: np.ndarray, settings: SwarmSettings, bounds: Any, random: np.random.RandomState):
         self._random, self._bounds = random, bounds
         with _suppress_logging_config():
-            from pyswarms.backend.handlers import BoundaryHandler, VelocityHandler
-            from pyswarms.backend.swarms import Swarm
-            from pyswarms.backend.topology import Ring, Star
+            from pyswarms.backend.handlers import BoundaryHandler, VelocityHandler  # pyright: ignore[reportMissingTypeStubs]
+            from pyswarms.backend.swarms import Swarm  # pyright: ignore[reportMissingTypeStubs]
+            from pyswarms.backend.topology import Ring, Star  # pyright: ignore[reportMissingTypeStubs]
 
             self._boundary_handler, self._velocity_handler = BoundaryHandler("nearest"), VelocityHandler("unmodified")
-            self._topology = Star() if settings.neighbours is None else Ring(static=False)
+            self._topology: Any = Star() if settings.neighbours is None else Ring(static=False)
         self._topology_options = (
             {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
         )
@@ -182,10 +182,10 @@ class _ParticleSwarm:
 
     def learn(self, energies: np.ndarray):
         """Take the energies at the positions in."""
-        from pyswarms.backend.operators import compute_pbest
+        from pyswarms.backend import operators  # pyright: ignore[reportMissingTypeStubs]
 
         self._swarm.current_cost = energies
-        self._swarm.pbest_pos, self._swarm.pbest_cost = compute_pbest(self._swarm)
+        self._swarm.pbest_pos, self._swarm.pbest_cost = operators.compute_pbest(self._swarm)  # pyright: ignore[reportUnknownMemberType]
         self._swarm.best_pos, self._swarm.best_cost = self._topology.compute_gbest(
             self._swarm, **self._topology_options
         )
@@ -224,7 +224,7 @@ _LOGGING_LOCK = threading.Lock()
 
 
 @contextmanager
-def _suppress_logging_config() -> Iterator[None]:
+def _suppress_logging_config() -> Generator[None, None, None]:
     """While pyswarms is imported or its objects are made, what it configures is not applied."""
     with _LOGGING_LOCK:
         configure = logging.config.dictConfig
@@ -236,7 +236,7 @@ def _suppress_logging_config() -> Iterator[None]:
 
 
 @contextmanager
-def _use_numpy_state(random: np.random.RandomState) -> Iterator[None]:
+def _use_numpy_state(random: np.random.RandomState) -> Generator[None, None, None]:
     """numpy's global draws come from `random` and move it on; afterwards the global state is as it was."""
     before = np.random.get_state()
     np.random.set_state(random.get_state())

@@ -2,22 +2,30 @@
 
 import math
 
+import pytest
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
-from controllers.benchmarks.tweening import TWEEN_FRAMES, benchmark_tweening
+from controllers.benchmarks import tweening
 
 
-def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough():
-    kinds = {"walks": [walk(TWEEN_FRAMES, cadence=1.2)], "short": [walk(60)]}
+@pytest.mark.parametrize("small", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough(monkeypatch, small):
+    if small:
+        sizes = {"TWEEN_FRAMES": 22, "_END_SOURCE_FRAMES": 22, "_INNER_KEYS": 1, "_END_LENGTHS": (4, 8)}
+        for name, size in (sizes | {"_NUM_ALTERNATIVES": 2}).items():
+            monkeypatch.setattr(tweening, name, size)
+    kinds = {"walks": [walk(tweening.TWEEN_FRAMES, cadence=1.2)], "short": [walk(tweening.TWEEN_FRAMES // 3)]}
     seen = []
-    rows = benchmark_tweening(kinds, tiny_infiller(drawn=0.02), [tiny_density()], progress=lambda *at: seen.append(at))
+    rows = tweening.benchmark_tweening(
+        kinds, tiny_infiller(drawn=0.02), [tiny_density()], progress=lambda *at: seen.append(at)
+    )
     assert seen == [(1, 2), (2, 2)]
     assert [(row["kind"], row["what"], row["by"]) for row in rows] == [
         ("walks", "keys", "chosen"),
         ("walks", "keys", "rolled"),
-        ("walks", "keys", "best of 4"),
-        *(("walks", f"end of {count} frames", by) for count in (30, 60) for by in ("infiller", "density")),
+        ("walks", "keys", f"best of {tweening._NUM_ALTERNATIVES}"),
+        *(("walks", f"end of {count} frames", by) for count in tweening._END_LENGTHS for by in ("infiller", "density")),
     ]
     for row in rows[:2]:
         assert row["key_mm"] == 0

@@ -51,9 +51,9 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def tween(tiny):
+def tween(tiny, prior):
     """Runs the command; returns the exit status."""
-    return lambda *words: run("tween", *words, "--infiller", tiny)
+    return lambda *words: run("tween", *words, "--infiller", tiny, "--prior", prior)
 
 
 def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
@@ -122,15 +122,17 @@ def test_a_file_that_keys_name_is_not_written_over(tween, folder, capsys, monkey
     assert (folder / "keys" / "walk.bvh").read_bytes() == before
 
 
-def test_the_example_runs_on_a_clip_of_its_name(tween, folder):
-    """The clip that it names is made by the command that it tells."""
+@pytest.mark.parametrize("bundled", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_example_runs_on_a_clip_of_its_name(tween, tiny, folder, bundled):
+    """The clip that it names is made by the command that it tells; of the bundled densities the default ones roll."""
     text = (DOCS / "keys.toml").read_text()
     (named,) = set(re.findall(r'"([\w/]+\.bvh)"', text))
     clip = folder / "keys" / named
     clip.parent.mkdir(exist_ok=True)
     walk(120).save(clip)
     (folder / "keys" / "example.toml").write_text(text)
-    assert tween(folder / "keys" / "example.toml", "-o", "out.bvh", "--report", "r.json", "--quiet") == 0
+    words = (folder / "keys" / "example.toml", "-o", "out.bvh", "--report", "r.json", "--quiet")
+    assert (run("tween", *words, "--infiller", tiny) if bundled else tween(*words)) == 0
     told = json.loads(Path("r.json").read_text())
     assert {row["what"] for row in told["keys"]} == {"pose", "limbs", "root"}
 

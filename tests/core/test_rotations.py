@@ -38,7 +38,7 @@ def test_rotation_vectors_are_the_short_ones_whatever_the_sign():
     torch.testing.assert_close(rotations.to_rotation_vector(-quats), vectors, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(angle=ANGLE)
 def test_a_turn_about_y_takes_z_toward_x(angle):
     turned = rotations.rotate(
@@ -68,7 +68,7 @@ def test_heading_of_a_turned_tilt_moves_with_the_turn():
     assert turn_between(tilt, same) < 1e-7
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(angle=ANGLE)
 def test_wrapped_angles_are_the_same_angle(angle):
     wrapped = float(rotations.wrap_angle(torch.tensor(angle, dtype=torch.float64)))

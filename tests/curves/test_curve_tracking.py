@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_metrics import walk
+from helpers import walk_through
 
 from mapctl import curves
 from mapctl.metrics import measure, path
@@ -55,7 +55,7 @@ def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
 def test_progress_and_path_error_are_the_walks_own(name):
     curve = CURVES[name]
     arcs, offset, places = made(curve, laps=LAPS.get(name, 1.0))
-    got = measure(walk(places, fps=FPS), curve, speed=1.3)
+    got = measure(walk_through(places, fps=FPS), curve, speed=1.3)
     assert got["travelled_m"] == pytest.approx(float(arcs[-1]), rel=0.02)
     assert got["progress_ratio"] == pytest.approx(1, abs=0.03)
     own = 100 * offset.abs()
@@ -71,7 +71,7 @@ def test_the_way_back_counts_even_nearer_to_the_way_out():
     arcs = torch.linspace(0, curve.length, 200, dtype=torch.float64)
     inward = torch.where(arcs > curve.length / 2 + 0.5, 0.15, 0.0)
     places = curve.point(arcs) - inward[:, None] * torch.tensor([1.0, 0.0])
-    got = measure(walk(places), curve, speed=1.0)
+    got = measure(walk_through(places), curve, speed=1.0)
     assert got["travelled_m"] == pytest.approx(curve.length, rel=0.02)
     assert got["path_error_max_cm"] == pytest.approx(15, abs=0.5)
 
@@ -89,7 +89,7 @@ def test_what_was_left_out_of_a_curve_is_missed():
     out = np.stack([np.zeros(100), np.linspace(0, 3, 100)], axis=1)
     across = np.stack([np.linspace(0, 0.3, 10), np.full(10, 3.0)], axis=1)
     places = np.concatenate([out, across, out[::-1] + np.array([0.3, 0.0])])
-    got = measure(walk(places), curve, speed=1.0)
+    got = measure(walk_through(places), curve, speed=1.0)
     assert got["travelled_m"] == pytest.approx(curve.length, abs=0.1)
     assert 50 < got["path_error_max_cm"] < 115
     assert float(curve.track(torch.tensor(places)).diff().max()) < 1.5  # the nearest place goes on by 2.4 m at once

@@ -106,7 +106,7 @@ def test_an_open_curve_goes_on_straight():
     assert float(curve.nearest(curve.point(-0.3))) == 0.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10_000), st.sampled_from([2, 3]), st.integers(2, 12))
 def test_any_drawing_keeps_its_points_its_length_and_its_nearest_places(seed, dims, count):
     rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from mapctl.errors import RequestError
@@ -33,7 +33,6 @@ def test_look_at_straight_down_has_z_downwards():
     assert view.project(np.array([0.0, 0, 1]))[1] > 50
 
 
-@settings(deadline=None)
 @given(st.integers(0, 1000), st.sampled_from(["fixed", "top"]), st.floats(-180, 180), st.floats(0.4, 3.0))
 def test_fit_sees_everything_and_touches_two_opposite_edges(seed, kind, azimuth, aspect):
     points, fov = cloud(seed), 0.6

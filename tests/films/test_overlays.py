@@ -15,7 +15,7 @@ def area(surface) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.floats(0.5, 4.0), st.floats(0.02, 0.3))
 def test_a_ribbon_has_the_area_of_its_length_times_its_width(radius, width):
     turn = np.linspace(0, 2 * np.pi, 400)

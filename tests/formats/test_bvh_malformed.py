@@ -5,32 +5,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from lossy_files import GOOD
 
 from mapctl import formats
 from mapctl.errors import FileFormatError, MapctlError
-
-GOOD = """HIERARCHY
-ROOT hips
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
-  JOINT leg
-  {
-    OFFSET 10 0 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-      OFFSET 0 0 10
-    }
-  }
-}
-MOTION
-Frames: 3
-Frame Time: 0.0333333
-1 90 3 10 20 30 1 2 3
-2 91 4 11 21 31 2 3 4
-3 92 5 12 22 32 3 4 5
-"""
 
 
 def swap(old, new):

@@ -7,11 +7,10 @@ from pathlib import Path
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from acclaim import Bone, Pair
+from acclaim import Bone, Pair, assert_same_places
 from fuzz_readers import READERS, Specimen, case, main, run_case, specimens
 from hypothesis import given, settings
-from test_acclaim import assert_same_places
-from test_bvh_malformed import GOOD
+from lossy_files import GOOD
 
 import mapctl
 from mapctl.curves.files import read_csv, read_svg
@@ -21,7 +20,7 @@ from mapctl.formats import text as reading
 from mapctl.intent.steering_csv import read_commands
 from mapctl.recording.masks import Mask, load_masks
 
-FEW = settings(max_examples=40, deadline=None, derandomize=True)
+FEW = settings(max_examples=40, derandomize=True)
 
 
 @pytest.fixture(scope="module")

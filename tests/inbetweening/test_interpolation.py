@@ -23,7 +23,7 @@ def guess(motion, known):
     return interpolate_positions(motion.joint_positions()[None], motion.local_quat_xyzw[None], known)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 1000), st.sampled_from([0.05, 0.3, 0.9]))
 def test_what_is_not_known_has_no_part_in_it(seed, share):
     motion, draw = walk(FRAMES, turn_rate=2.0), generator(seed)

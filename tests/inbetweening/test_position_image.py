@@ -7,27 +7,13 @@ import torch
 from helpers import generator, moved, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny_infiller import TOES, shown
 
-from mapctl import kinematics, rotations
+from mapctl import rotations
 from mapctl.inbetweening import PositionImage
 from mapctl.skeleton import CANONICAL
 
-TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
 FRAMES = 40
-
-
-def shown(motion, known=None, *, present=None, contacts=None):
-    """The image of a canonical motion, of which all is known unless said otherwise."""
-    places, frames = motion.joint_positions()[None], motion.num_frames
-    whole = torch.ones(1, frames, CANONICAL.num_joints, dtype=torch.bool)
-    return PositionImage.of_world(
-        places,
-        kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
-        torch.ones(1, frames, 2).double() if contacts is None else contacts,
-        known=whole if known is None else known,
-        toes=TOES,
-        present=whole[..., 0] if present is None else present,
-    )
 
 
 def drawn_masks(seed, share):
@@ -42,7 +28,7 @@ def drawn_masks(seed, share):
 masks = st.builds(drawn_masks, st.integers(0, 1000), st.sampled_from([0.05, 0.3, 0.9]))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(masks)
 def test_known_places_come_back_and_the_way_back_is_the_way_there(known):
     motion = walk(FRAMES, turn_rate=2.0)
@@ -97,7 +83,7 @@ def test_contacts_of_unknown_toes_are_even():
     assert (bits[:10] == 1).all()
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(masks, st.floats(-math.pi, math.pi), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
 def test_it_does_not_matter_where_the_motion_stands_and_faces(known, turn, shift):
     motion = walk(FRAMES, turn_rate=2.0)

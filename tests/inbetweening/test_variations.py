@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -15,7 +16,9 @@ import mapctl
 import priors
 from controllers.inbetweening.canonical_gap import CanonicalGap
 from controllers.inbetweening.infill import infill
+from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps
+from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
 from mapctl.errors import RequestError
@@ -30,13 +33,14 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 
 FRAMES, KEYS = 45, (0, 20, 23, 44)
+FEW = InfillSettings(refinement=replace(INFILL_REFINEMENT, budget=Budget(evaluations=4)))
 QUICK = RolloutSettings(
     ahead=4,
     method=LatentNoiseSolver(
         rounds=1,
-        lbfgs=LbfgsSettings(max_iterations=6),
-        budget=Budget(evaluations=20),
-        proposal=SwarmProposal(SwarmSettings(particles=4, iterations=2)),
+        lbfgs=LbfgsSettings(max_iterations=4),
+        budget=Budget(evaluations=10),
+        proposal=SwarmProposal(SwarmSettings(particles=4, iterations=1)),
     ),
 )
 
@@ -72,6 +76,7 @@ def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
         count,
         rollout_densities=[prior],
         generator=generator(seed),
+        settings=FEW,
         rolling=QUICK,
     )
 
@@ -94,7 +99,7 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
 
 def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prior):
     motion = on_rig("canonical", FRAMES)
-    alone = tween(motion, Keys(KEYS), tiny_infiller(drawn=0.02)).motion
+    alone = tween(motion, Keys(KEYS), tiny_infiller(drawn=0.02), settings=FEW).motion
     two, three = (asked(motion, prior, count=count).each for count in (2, 3))
     assert torch.equal(two[0].infill_result.motion.local_quat_xyzw, alone.local_quat_xyzw)
     for one, other in zip(two, three[:2], strict=True):
@@ -194,6 +199,7 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
         4,
         rollout_densities=[prior],
         generator=generator(0),
+        settings=FEW,
         rolling=QUICK,
     )
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])

@@ -8,10 +8,9 @@ from importlib import import_module
 import pytest
 import torch
 from captures import apart_deg, error_cm, noisy, on_rig, shaken
-from tiny_denoiser import tiny_denoiser
+from tiny_denoiser import QUICK, tiny_denoiser
 
 import mapctl
-from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.denoise import DenoiseSettings, begins_with_tpose, denoise
 from controllers.denoising.result import crossfade, join_segments
 from mapctl import retarget, rotations
@@ -19,13 +18,8 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.solver.budget import Budget
-from mapctl.solver.lbfgs import LbfgsSettings
 
 RIGS = ("canonical", "bandai", "daz")
-QUICK = DenoiseSettings(
-    refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4))
-)
 
 
 def cleaned(motion, **changes):

@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import apart_deg, error_cm, noisy, on_rig, shaken
-from test_denoise import QUICK
-from tiny_denoiser import tiny_denoiser
+from tiny_denoiser import QUICK, tiny_denoiser
 
 from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.causal import CausalDenoiser, CausalSettings, denoise_causal

@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import apart_deg, noisy, on_rig, shaken
-from test_denoise import QUICK
-from tiny_denoiser import tiny_denoiser
+from tiny_denoiser import QUICK, tiny_denoiser
 
 from controllers.denoising.denoise import begins_with_tpose, denoise
 from controllers.denoising.lead_transition import find_lead_transition

@@ -32,7 +32,7 @@ def lengths(motion):
     return (places[:, 1:] - places[:, list(motion.skeleton.parents[1:])]).norm(dim=-1)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.sampled_from(sorted(SKELETONS)), st.integers(0, 10_000))
 def test_any_pose_comes_back_from_its_places_whatever_one_starts_from(rig, seed):
     wanted = random_motion(SKELETONS[rig], 4, seed=seed)
@@ -55,7 +55,7 @@ ARM = inverse.Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "Lo
 LEG = inverse.Limb(*(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 10_000))
 def test_limbs_whose_bones_have_their_lengths_come_back_as_all_do(seed):
     wanted = random_motion(CANONICAL, 4, seed=seed)

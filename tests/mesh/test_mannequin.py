@@ -42,7 +42,7 @@ def one(half, radius, squash=(1, 1, 1), axis=(0, 1, 0)) -> Surface:
 lengths = st.floats(0.05, 1.0)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.tuples(lengths, lengths, lengths), st.floats(0.02, 0.5), st.tuples(lengths, lengths, lengths))
 def test_a_rounded_box_has_the_volume_of_box_plus_ball(half, radius, axis):
     a, b, c = (2 * h for h in half)

@@ -1,42 +1,26 @@
 """Measures against the design's definitions written out anew, and on motions whose measures are known."""
 
 import math
-from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
+from helpers import walk_through
 
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.metrics import body, compute_reference, feet, measure, path
-from mapctl.motion import Motion
 from mapctl.numerics.gaussian import gaussian_kernel, low_pass
-from mapctl.rotations import about_y, from_rotation_vector
 from mapctl.skeleton import CANONICAL
 
 IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
 
 
-def walk(places_xz, *, headings=0.0, fps=30, swing=0.5, wobble=0.0, seed=0):
-    """The canonical body at these places; its legs swing once a second and its joints wobble (radians)."""
-    frames = len(places_xz)
-    time = torch.arange(frames, dtype=torch.float64) / fps
-    vectors = wobble * torch.randn(frames, 21, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    for side, sign in (("left", 1), ("right", -1)):
-        vectors[:, CANONICAL.index(f"{side}UpperLeg"), 0] += sign * swing * torch.sin(2 * math.pi * time)
-    quats = from_rotation_vector(vectors)
-    quats[:, 0] = about_y(torch.as_tensor(headings, dtype=torch.float64).expand(frames))
-    places = torch.as_tensor(places_xz, dtype=torch.float64)
-    root = torch.stack([places[:, 0], torch.full((frames,), 0.87, dtype=torch.float64), places[:, 1]], dim=-1)
-    return Motion(CANONICAL, Fraction(fps), root, quats)
-
-
 def straight(frames, speed=1.2, fps=30, **options):
     """A walk along +Z."""
     z = np.arange(frames) * speed / fps
-    return walk(np.stack([np.zeros(frames), z], axis=1), fps=fps, **options)
+    return walk_through(np.stack([np.zeros(frames), z], axis=1), fps=fps, **options)
 
 
 def definitions(positions, hips, toes, fps):
@@ -73,7 +57,7 @@ def definitions(positions, hips, toes, fps):
 def test_measures_are_those_of_the_design(seed):
     rng = np.random.default_rng(seed)
     places = np.cumsum(rng.normal(size=(120, 2)) * 0.003 + [0.0, 0.004], axis=0)
-    clip = walk(places, swing=0.15, wobble=0.004, seed=seed)
+    clip = walk_through(places, swing=0.15, wobble=0.004, seed=seed)
     expected = definitions(clip.joint_positions().numpy(), 0, TOES, 30)
     assert 0 < expected["planted_share"] < 1
     got = measure(clip)
@@ -96,7 +80,7 @@ def test_sway_of_a_straight_walk_is_its_swing_from_side_to_side():
     time = np.arange(400) / 30
     places = np.stack([0.03 * np.sin(2 * np.pi * time), 1.2 * time], axis=1)
     gain = 1 - math.exp(-0.5 * (2 * math.pi * 0.35) ** 2)  # of one hertz after the slow part is gone
-    assert measure(walk(places))["sway_cm"] == pytest.approx(3 / math.sqrt(2) * gain, rel=0.03)
+    assert measure(walk_through(places))["sway_cm"] == pytest.approx(3 / math.sqrt(2) * gain, rel=0.03)
     assert measure(straight(400))["sway_cm"] == pytest.approx(0, abs=1e-9)
 
 
@@ -109,7 +93,7 @@ def test_path_error_is_the_distance_to_the_curve():
     angle = np.linspace(0, 3, 200)
     radius = 2 + 0.05 * np.cos(3 * angle)
     places = np.stack([2 - radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    got = measure(walk(places, headings=angle), curves.circle(radius=2.0))
+    got = measure(walk_through(places, headings=angle), curves.circle(radius=2.0))
     expected = 100 * np.abs(radius - 2)
     assert got["path_error_mean_cm"] == pytest.approx(expected.mean(), abs=0.001)
     assert got["path_error_p95_cm"] == pytest.approx(np.percentile(expected, 95), abs=0.001)
@@ -120,7 +104,7 @@ def test_the_low_pass_takes_sway_out_and_leaves_drift():
     time = np.arange(600) / 30
     for hertz, kept in ((2.0, 0.0), (0.0, 1.0)):
         x = 0.03 * np.cos(2 * np.pi * hertz * time)
-        got = measure(walk(np.stack([x, time], axis=1)), curves.line(length=30.0))
+        got = measure(walk_through(np.stack([x, time], axis=1)), curves.line(length=30.0))
         assert got["path_error_low_passed_mean_cm"] == pytest.approx(3 * kept, abs=0.1)
         assert got["path_error_max_cm"] == pytest.approx(3, abs=0.01)
 
@@ -129,7 +113,7 @@ def test_the_low_pass_takes_sway_out_and_leaves_drift():
 def test_progress_is_measured_along_the_arc(fps):
     curve = curves.figure8(radius=1.0)
     arcs = torch.linspace(0, 1.5 * curve.length, 12 * fps + 1, dtype=torch.float64)
-    got = measure(walk(curve.point(arcs), fps=fps), curve, speed=2.0)
+    got = measure(walk_through(curve.point(arcs), fps=fps), curve, speed=2.0)
     assert got["travelled_m"] == pytest.approx(6 * math.pi, rel=1e-3)
     assert got["wanted_m"] == pytest.approx(24.0)
     assert got["progress_ratio"] == pytest.approx(6 * math.pi / 24, rel=1e-3)
@@ -139,7 +123,7 @@ def test_progress_is_measured_along_the_arc(fps):
 
 def test_the_walk_back_is_negative_progress():
     z = np.linspace(8, 2, 200)
-    got = measure(walk(np.stack([0 * z, z], axis=1)), curves.line(length=10.0))
+    got = measure(walk_through(np.stack([0 * z, z], axis=1)), curves.line(length=10.0))
     assert got["travelled_m"] == pytest.approx(-6)
 
 
@@ -154,15 +138,15 @@ def test_another_joint_may_follow_in_space():
 def test_measures_do_not_depend_on_place_and_direction():
     rng = np.random.default_rng(5)
     places = np.cumsum(rng.normal(size=(150, 2)) * 0.004 + [0.0, 0.004], axis=0)
-    here = measure(walk(places, swing=0.15, wobble=0.004))
+    here = measure(walk_through(places, swing=0.15, wobble=0.004))
     turned = np.stack([places[:, 1], -places[:, 0]], axis=1) + np.array([5.0, -3.0])
-    there = measure(walk(turned, headings=math.pi / 2, swing=0.15, wobble=0.004))
+    there = measure(walk_through(turned, headings=math.pi / 2, swing=0.15, wobble=0.004))
     assert here == pytest.approx(there, rel=1e-9)
 
 
 def test_facing_and_turning():
     angle = np.linspace(0, 7, 300)
-    clip = walk(np.zeros((300, 2)), headings=angle)
+    clip = walk_through(np.zeros((300, 2)), headings=angle)
     got = measure(clip)
     assert got["turned_deg"] == pytest.approx(math.degrees(7))
     assert got["turn_rate_deg_s"] == pytest.approx(math.degrees(7 / (299 / 30)), rel=0.06)
@@ -174,7 +158,7 @@ def test_facing_and_turning():
 def test_pose_variation_sees_poses_only():
     frames = 200
     circling = np.stack([np.cos(np.arange(frames) / 20), np.sin(np.arange(frames) / 20)], axis=1)
-    frozen = walk(circling, headings=np.arange(frames) / 20, swing=0.0)
+    frozen = walk_through(circling, headings=np.arange(frames) / 20, swing=0.0)
     assert measure(frozen)["pose_variation_cm"] == pytest.approx(0, abs=1e-9)
     little, much = (measure(straight(frames, swing=swing))["pose_variation_cm"] for swing in (0.2, 0.4))
     assert much == pytest.approx(2 * little, rel=0.1)

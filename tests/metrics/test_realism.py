@@ -21,7 +21,7 @@ from mapctl.metrics.realism.diversity import align_to_start, average_pairwise_di
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
-QUICK = realism.RealismSettings(classifier=realism.ClassifierSettings(steps=100, width=16, batch=32), dims=8)
+QUICK = realism.RealismSettings(classifier=realism.ClassifierSettings(steps=60, width=8, batch=32), dims=8)
 SMALL = QUICK.classifier
 
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import generator, moved, tiny_density, walk
-from test_position_image import shown
 from tiny_denoiser import save_tiny_denoiser
-from tiny_infiller import CONFIG, card, network, save_tiny_infiller, tiny_infiller
+from tiny_infiller import CONFIG, card, network, save_tiny_infiller, shown, tiny_infiller
 
 import priors
 from mapctl.errors import CheckpointError, RequestError

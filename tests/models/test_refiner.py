@@ -63,7 +63,7 @@ def test_the_networks_bits_are_probabilities_with_a_slope():
 
 
 @given(st.lists(st.integers(0, 13), min_size=1, max_size=12), st.integers(0, 4), st.integers(1, 9))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_pieces_of_any_sizes_give_the_whole(sizes, lookahead, piece):
     """Whatever is given at once, and whatever is refined at once."""
     refiner = refiner_of(replace(TINY, lookahead=lookahead))

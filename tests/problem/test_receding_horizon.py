@@ -6,57 +6,26 @@ from typing import ClassVar
 
 import pytest
 import torch
-from helpers import corpus, generator, tiny_density
+from helpers import corpus, generator
+from tiny_horizon import ARCS, BEGUN, CURVE, DENSITY, METHOD, SHORT, context, solver, terms_of
 
-from controllers.common.initial_state import select_initial_state
-from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, integrate_root
-from mapctl.problem.context import WindowContext
 from mapctl.problem.feature_states import FeatureStateSolver
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
-from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver, replay
+from mapctl.problem.receding_horizon import HorizonSettings, replay
 from mapctl.problem.solution import Outcome
 from mapctl.problem.warm_start import BestOfSamples, SteeringKnots, SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
-from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
-from mapctl.terms import FootContact, LatentPrior, Likelihood, Path
-
-DENSITY = tiny_density()
-CURVE = curves.circle(radius=2.0)
-SHORT = HorizonSettings(frames=10, overlap=4, past=12)
-METHOD = LatentNoiseSolver(rounds=2, budget=Budget(evaluations=12))
-ARCS = 0.04 * torch.arange(80, dtype=torch.float64)
-
-
-def terms_of(first, frames):
-    return LatentPrior(), Path(CURVE, ARCS[first : first + frames]), FootContact()
-
-
-def start(seed=0):
-    found = select_initial_state(
-        DENSITY, CURVE, ARCS, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator(seed)
-    )
-    return found.committed
-
-
-BEGUN = start()
-
-
-def solver(method=METHOD, density=DENSITY, settings=SHORT):
-    return RecedingHorizonSolver(density, settings, method=method)
+from mapctl.terms import LatentPrior, Likelihood
 
 
 def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
     return solver(method, density).solve(BEGUN, terms_of, frames, generator=generator(seed), **limits)
-
-
-def context(committed):
-    return WindowContext(DENSITY, committed.state, committed.place, committed.joints_world, SHORT.frames)
 
 
 METHODS = {

@@ -6,55 +6,14 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from source_files import FILES, MAY_IMPORT, PACKAGE_FILES, ROOT, imports, tree_of
 
-ROOT = Path(__file__).resolve().parents[2]
-# `mapctl` is the core; the other three know it and never each other.
-MAY_IMPORT = {
-    "mapctl": {"mapctl"},
-    "priors": {"priors", "mapctl"},
-    "controllers": {"controllers", "mapctl"},
-    "scenes": {"scenes", "mapctl"},
-}
 CLI = Path("mapctl/cli.py")
 START = Path("mapctl/__main__.py")  # of the command line, before anything is imported
 COMMANDS = Path("mapctl/commands")  # one file a sub-command: the rest of the command line
-FOLDERS = (*MAY_IMPORT, "tests")
-FILES = sorted(file.relative_to(ROOT) for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
-PACKAGE_FILES = [file for file in FILES if file.parts[0] in MAY_IMPORT]
 UNPICKLERS = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal", "joblib"}
 PROCESSES = {"joblib", "joblib.Parallel", "joblib.delayed"}  # of an unpickler, what reads no files
-LATE_IMPORTERS = {"import_module", "__import__", "find_spec"}
 MAX_LINES = 400
-
-
-def tree_of(file: Path) -> ast.Module:
-    return ast.parse((ROOT / file).read_text("utf-8"), str(file))
-
-
-def absolute(file: Path, node: ast.ImportFrom) -> str:
-    """The module a `from` import names, dots resolved."""
-    if not node.level:
-        return node.module or ""
-    package = file.with_suffix("").parts[: -node.level]
-    return ".".join([*package, *filter(None, [node.module])])
-
-
-def called_name(node: ast.Call) -> str:
-    return ast.unparse(node.func).rpartition(".")[2]
-
-
-def imports(file: Path, tree: ast.Module) -> set[str]:
-    """Every dotted name the file imports, at its top or late, by statement or by name."""
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            module = absolute(file, node)
-            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Call) and called_name(node) in LATE_IMPORTERS:
-            found |= {arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)}
-    return found
 
 
 def direction_faults(file: Path, tree: ast.Module) -> set[str]:

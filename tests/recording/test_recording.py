@@ -16,7 +16,7 @@ from mapctl.skeleton import CANONICAL
 masks = st.lists(st.lists(st.booleans(), min_size=9, max_size=9), min_size=1, max_size=3).map(torch.tensor)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(masks)
 def test_the_nearest_seen_frames_are_those_that_a_loop_finds(seen):
     before, after = last_observed(seen), next_observed(seen)
@@ -29,7 +29,7 @@ def test_the_nearest_seen_frames_are_those_that_a_loop_finds(seen):
                 assert after[row, frame] == (later[0] if later else known[-1])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(masks)
 def test_gaps_are_filled_straight_as_a_loop_fills_them(seen):
     values = torch.randn(len(seen), 9, 2, generator=generator(), dtype=torch.float64)

@@ -217,7 +217,7 @@ def test_surrounded_by_walls_the_start_is_kept():
     assert result.energy.tolist() == result.start_energy.tolist() == [5.0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**16), limit=st.integers(1, 40), single=st.booleans())
 def test_rugged_ground_never_ends_worse_and_names_the_energy_of_its_point(seed: int, limit: int, single: bool):
     dtype = torch.float32 if single else torch.float64

@@ -18,28 +18,8 @@ from mapctl.runtime.live_protocol import LiveCharacter
 from mapctl.skeleton import CANONICAL
 from scenes.live import ground
 from scenes.live.app import LiveApp
-from scenes.live.inputs import SteeringInputs
 from scenes.live.readouts import Readouts
 from scenes.live.recording import Recording, encode_motion
-
-
-@pytest.fixture
-def actors():
-    return [Actor(), Actor()]
-
-
-@pytest.fixture
-def show(actors):
-    made = LiveApp(
-        actors,
-        [SteeringInputs(), SteeringInputs()],
-        port=8090,
-        fastest=3.8,
-        labels={"gait": ["run", "walk"], "style": ["old"]},
-    )
-    yield made
-    made.close()
-    assert all(actor.heard[-1] == ("close",) for actor in actors)
 
 
 def test_it_listens_on_this_machine_only(show):

@@ -7,36 +7,16 @@ import msgspec
 import pytest
 import viser
 from helpers import walk
-from stage import Actor, delivered, run
+from stage import delivered, run
 from websockets.sync.client import connect
 
 from mapctl import formats
 from mapctl.errors import MapctlError
 from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL
+from scenes.live import ground
 from scenes.live import recording as recording_module
-from scenes.live.app import LiveApp
-from scenes.live.inputs import SteeringInputs
 from scenes.live.recording import Recording, encode_with_fallback, save_without_replacing
-
-
-@pytest.fixture
-def actors():
-    return [Actor(), Actor()]
-
-
-@pytest.fixture
-def show(actors):
-    made = LiveApp(
-        actors,
-        [SteeringInputs(), SteeringInputs()],
-        port=8090,
-        fastest=3.8,
-        labels={"gait": ["run", "walk"], "style": ["old"]},
-    )
-    yield made
-    made.close()
-    assert all(actor.heard[-1] == ("close",) for actor in actors)
 
 
 @pytest.fixture
@@ -183,7 +163,8 @@ def test_a_recording_for_somebody_who_left_is_written_here_where_nobody_else_is(
     assert "Nothing saved: RequestError: nothing was recorded" in said()[1]
 
 
-def test_drawn_points_are_few_and_near(show):
+def test_drawn_points_are_few_and_near(show, monkeypatch):
+    monkeypatch.setattr(ground, "_MAX_DRAWN_POINTS", 12)
     show._panel.draw.value = True
     down = (0.0, -1.0, 0.0)
     for ray in (None, [1.0], [math.nan] * 3, [1e300, 1, 0], "abc"):
@@ -191,10 +172,10 @@ def test_drawn_points_are_few_and_near(show):
         show._draw_at((0.0, 1.0, 0.0), ray)
     run(show, 2)
     assert show._path.points == []
-    for number in range(300):
+    for number in range(20):
         show._draw_at((number % 20, 1.0, number % 7), down)
     run(show, 2)
-    assert len(show._path.points) == 200
+    assert len(show._path.points) == 12
 
 
 VALUES = (

@@ -16,7 +16,7 @@ ANYTHING = st.one_of(
 CHANGES = st.dictionaries(st.sampled_from(["speed", "heading", "facing", "step_length"]), ANYTHING)
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)  # on a starved core
+@settings(suppress_health_check=[HealthCheck.too_slow])  # on a starved core
 @given(CHANGES, CHANGES)
 def test_whatever_is_asked_the_orders_are_a_command_within_bounds(first, second):
     orders = SteeringInputs()

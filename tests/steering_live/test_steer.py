@@ -5,26 +5,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import generator, tiny_density
+from helpers import generator
 from tiny_prior import save_tiny_prior
+from tiny_steering import AHEAD, DENSITY, QUICK, begun
 
 import priors
 from controllers.benchmarks.steering import SteeringBenchmarkSettings, benchmark_steering
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
 from controllers.steering.pure_pursuit import PurePursuit
-from controllers.steering.steer import SteerSettings
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command, CommandTrack
-
-DENSITY = tiny_density()
-QUICK = SteerSettings(horizon=8, commit=3, evaluations=4, least_evaluations=2)
-AHEAD = Command(1.2, 0.0)
-
-
-def begun(command=AHEAD, *, seed=0, settings=QUICK):
-    return steer.begin(DENSITY, command, generator=generator(seed), settings=settings)
 
 
 def steered(steps, command=AHEAD, **how):

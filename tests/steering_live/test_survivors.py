@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from catalogue import trial
 from helpers import generator
-from test_receding_horizon import BEGUN, METHOD, SHORT, context, solver, terms_of
-from test_steer import AHEAD, QUICK, begun
-from test_terms_contract import trial
+from tiny_horizon import BEGUN, METHOD, SHORT, context, solver, terms_of
+from tiny_steering import AHEAD, QUICK, begun
 
 from controllers.steering import loop, steer
 from controllers.steering.loop import LoopSettings

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from test_terms_contract import trial
+from catalogue import trial
 
 from mapctl.errors import RequestError
 from mapctl.problem.objective import Objective

@@ -5,43 +5,18 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 import torch
-from catalogue import FRAMES, TERMS, moved_curve
+from catalogue import FRAMES, PAST, TERMS, moved_curve, trial
 from helpers import generator, walk
 
 from mapctl import terms
 from mapctl.curves import line
-from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
+from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.rotations import rotate_ground
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood, Path
-from mapctl.terms.trial import Trial
 
-PAST = 8
 each_term = pytest.mark.parametrize("name", TERMS)
 EXACT = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-
-
-def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
-    """Windows of a walk, each disturbed on its own, with the frames of the walk before it."""
-    motion = walk(PAST + FRAMES, turn_rate=0.2)
-    vectors, start = encode(motion)
-    ground, heading = integrate_root(vectors[:PAST], start)
-    scale = disturbed * vectors.std(0)
-    features = vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
-    draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
-    bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
-    place = GroundPose(ground[-1].to(dtype), heading[-1].to(dtype))
-    before = motion.joint_positions()[PAST - past : PAST].to(dtype)
-    planted = torch.tensor([True, False])
-    return Trial(
-        features.to(dtype),
-        place,
-        contacts=bits,
-        noise=draw[..., 1:].to(dtype),
-        log_density=30 * draw[..., 0].to(dtype),
-        before=before,
-        contacts_before=planted,
-    )
 
 
 def rows(whole, picked):

@@ -103,7 +103,7 @@ def test_windows_are_of_the_three_kinds_by_their_shares(keys, joints):
     assert is_keys.double().mean() == pytest.approx(keys, abs=0.08)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.sampled_from([GapSettings(), GAPS, KEYS, JOINTS]),
     st.floats(0, 1),
