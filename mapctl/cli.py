@@ -10,7 +10,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from functools import reduce
 from operator import or_
@@ -19,12 +19,11 @@ from typing import Annotated, Any
 import tyro
 
 from mapctl import __version__
-from mapctl.commands import COMMANDS, Command
-from mapctl.commands.shared.path_walk import EXIT_INTERRUPTED
+from mapctl.commands import COMMANDS, SUBCOMMANDS, Runnable
+from mapctl.commands.shared import exit_status
 from mapctl.errors import MapctlError, RequestError
 from mapctl.runtime import interruption
 
-_EXIT_INVALID, _EXIT_UNREAD_OUTPUT, _EXIT_SIGNAL_BASE = 2, 1, 128
 _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
     "live": {"viser"},
@@ -42,6 +41,9 @@ _MESSAGE_REWRITES = (
     (r"expected \{None\}\|FLOAT", "expected a number"),
     (r"expected \{None\}\|INT", "expected a whole number"),
     (r" \(required\)", ""),
+    (r" \(applied to [\w -]+\)", ""),
+    (r" Arguments are applied to .*", ""),
+    (r" or misplaced options", " options"),
 )
 """What Python and tyro say, and what people understand."""
 _STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
@@ -54,34 +56,44 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         status = _print_version() if words == ["--version"] else parse(words).run()
         sys.stdout.flush()
-        if status == EXIT_INTERRUPTED:
+        if status == exit_status.INTERRUPTED:
             status = _report_interruption(received, "what was solved until then is written")
     except MapctlError as error:
-        status = _print_error(str(error), _EXIT_INVALID)
+        status = _print_error(str(error), exit_status.INVALID)
     except KeyboardInterrupt as stop:
         status = _report_interruption(received, str(stop))
     except ModuleNotFoundError as error:
-        status = _print_error(_describe_missing_package(error.name or str(error)), _EXIT_INVALID)
+        status = _print_error(_describe_missing_package(error.name or str(error)), exit_status.INVALID)
     except BrokenPipeError:
         _discard_output()
-        status = _EXIT_UNREAD_OUTPUT
+        status = exit_status.UNREAD
     except OSError as error:
         _discard_output()
-        status = _print_error(f"{error.filename or 'input or output'}: {error.strerror or error}", _EXIT_INVALID)
+        status = _print_error(f"{error.filename or 'input or output'}: {error.strerror or error}", exit_status.INVALID)
     return status
 
 
-def parse(words: Sequence[str]) -> Command:
+def parse(words: Sequence[str]) -> Runnable:
     """The command that the words ask for. RequestError where there is none; SystemExit after --help."""
-    choices: Any = reduce(or_, (_subcommand(name, kind) for name, kind in COMMANDS.items()))
+    name, *others = words or [""]
+    if name not in SUBCOMMANDS:
+        return _choose(COMMANDS, words, prog="mapctl", description=_DESCRIPTION)
+    if not others or (others[0].startswith("-") and others[0] not in ("-h", "--help")):
+        others = [next(iter(SUBCOMMANDS[name])), *others]
+    return _choose(SUBCOMMANDS[name], others, prog=f"mapctl {name}", description=COMMANDS[name].__doc__ or "")
+
+
+def _choose(kinds: Mapping[str, type[Runnable]], words: Sequence[str], *, prog: str, description: str) -> Runnable:
+    choices: Any = reduce(or_, (_subcommand(name, kind) for name, kind in kinds.items()))
     explained = io.StringIO()
     try:
         with redirect_stderr(explained):
-            return tyro.cli(choices, prog="mapctl", description=_DESCRIPTION, args=list(words), config=_STYLE)
+            return tyro.cli(choices, prog=prog, description=description, args=list(words), config=_STYLE)
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        raise RequestError(f"{_shorten_usage_error(explained.getvalue())} (see {_help_command(words)})") from None
+        helped = " ".join([prog, *(word for word in words[:1] if word in kinds), "--help"])
+        raise RequestError(f"{_shorten_usage_error(explained.getvalue())} (see {helped})") from None
 
 
 _DESCRIPTION = (
@@ -95,7 +107,7 @@ def _print_version() -> int:
     return 0
 
 
-def _subcommand(name: str, kind: type[Command]) -> Any:
+def _subcommand(name: str, kind: type[Runnable]) -> Any:
     return Annotated[kind, tyro.conf.subcommand(name, prefix_name=False)]
 
 
@@ -115,11 +127,9 @@ def _shorten_usage_error(box: str) -> str:
     hints = filter(None, (_HINT.match(paragraph) for paragraph in others))
     for pattern, plainer in _MESSAGE_REWRITES:
         first = re.sub(pattern, plainer, first)
-    return ". ".join([first.strip().rstrip("."), *(hint.group() for hint in hints)])
-
-
-def _help_command(words: Sequence[str]) -> str:
-    return f"mapctl {words[0]} --help" if words and words[0] in COMMANDS else "mapctl --help"
+    # An option that is another command's is like itself.
+    told = (hint.group() for hint in hints if hint.group().rpartition(" ")[2] not in first.split())
+    return ". ".join([first.strip().rstrip("."), *told])
 
 
 def _describe_missing_package(module: str) -> str:
@@ -139,7 +149,7 @@ def _report_interruption(received: Sequence[int], kept: str) -> int:
     """Say that work was ended, and what there is of it; without a signal it was Ctrl-C."""
     number = received[-1] if received else signal.SIGINT
     how = "interrupted" if number == signal.SIGINT else "terminated"
-    return _print_error("; ".join(filter(None, (how, kept))), _EXIT_SIGNAL_BASE + number)
+    return _print_error("; ".join(filter(None, (how, kept))), exit_status.SIGNALLED + number)
 
 
 def _discard_output() -> None:

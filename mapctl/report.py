@@ -18,6 +18,11 @@ from mapctl.formats.atomic import write_text
 from mapctl.motion import Motion
 from mapctl.problem.solution import Solution, WindowRecord
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 _PACKAGES = ("torch", "numpy", "scipy", "numba")
 
 
@@ -105,9 +110,7 @@ def summarise_timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict
 
 def peak_memory_mb() -> float | None:
     """Most memory the process ever held, MiB; None where the system does not tell (Windows)."""
-    try:
-        import resource
-    except ImportError:
+    if resource is None:
         return None
     unit = 1 if platform.system() == "Darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20

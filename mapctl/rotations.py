@@ -6,10 +6,11 @@ is here: the split of a rotation into a turn about the vertical and what remains
 
 from functools import partial
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from mapctl.numerics.light_roma import roma
 
 multiply = roma.quat_product
 inverse = roma.quat_conjugation

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import MapctlError
+from mapctl.joint_names import describe_nearest
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +43,6 @@ class Skeleton:
         try:
             return self.names.index(name)
         except ValueError:
-            from mapctl.joint_names import describe_nearest  # late: it knows skeletons
-
             raise MapctlError(f"no joint {name!r}; {describe_nearest(name, self.names)}") from None
 
     def matches(self, other: "Skeleton", tolerance: float = 1e-6) -> bool:

@@ -1,56 +1,48 @@
 """Learned models: what motion is natural."""
 
-from typing import TYPE_CHECKING
+from priors import checkpoints
+from priors.denoiser import network as denoiser_network
+from priors.denoiser.network import ConvDenoiser
+from priors.infiller import network as infiller_network
+from priors.infiller.network import ConvInfiller
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.refiner import network as refiner_network
+from priors.refiner.network import LstmRefiner
 
 AUTO = ("locomotion", "general")
 """Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection)."""
 
-if TYPE_CHECKING:
-    from priors.denoiser.network import ConvDenoiser
-    from priors.infiller.network import ConvInfiller
-    from priors.lstm_gmm.density import LstmGmmDensity
-    from priors.refiner.network import LstmRefiner
 
-
-def load(name: str) -> "LstmGmmDensity":
+def load(name: str) -> LstmGmmDensity:
     """A bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
-    from priors.lstm_gmm import density
-
     return density.load(name)
 
 
-def load_choice(name: str | None) -> "list[LstmGmmDensity]":
+def load_choice(name: str | None) -> list[LstmGmmDensity]:
     """The densities that a --prior leaves to choose from: for `auto` the bundled ones, else the named one, or none."""
     if name is None:
         return []
     return [load(each) for each in (AUTO if name == "auto" else (name,))]
 
 
-def load_refiner(name: str) -> "LstmRefiner":
+def load_refiner(name: str) -> LstmRefiner:
     """A bundled refiner by name (`locomotion-refiner`), or a trained one by its file or run folder."""
-    from priors.refiner import network
-
-    return network.load(name)
+    return refiner_network.load(name)
 
 
-def load_denoiser(name: str = "denoiser") -> "ConvDenoiser":
+def load_denoiser(name: str = "denoiser") -> ConvDenoiser:
     """The bundled denoiser, or a trained one by its file or run folder."""
-    from priors.denoiser import network
-
-    return network.load(name)
+    return denoiser_network.load(name)
 
 
-def load_infiller(name: str = "infiller") -> "ConvInfiller":
+def load_infiller(name: str = "infiller") -> ConvInfiller:
     """The bundled infiller, or a trained one by its file or run folder."""
-    from priors.infiller import network
-
-    return network.load(name)
+    return infiller_network.load(name)
 
 
-def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":
+def refiner_of(prior: str, name: str = "auto") -> LstmRefiner | None:
     """The refiner of that name; for `auto` the bundled one of a bundled prior, if it has one."""
-    from priors import checkpoints
-
     if name != "auto":
         return load_refiner(name)
     own = f"{prior}-refiner"

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -104,8 +105,6 @@ def save_png(path: Path, picture: Array) -> None:
 
 
 def _import_package(name: str):
-    from importlib import import_module
-
     try:
         return import_module(name)
     except ImportError as error:

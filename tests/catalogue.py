@@ -9,8 +9,8 @@ from toy_density import toy_density
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.protocols import Density, Refiner
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
+from mapctl.protocols import Density, Refiner
 from mapctl.terms import (
     Clearance,
     FootContact,
@@ -25,8 +25,8 @@ from mapctl.terms import (
     Support,
     Term,
 )
-from priors.lstm_gmm.density import LstmGmmDensity
 from mapctl.terms.trial import Trial
+from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm
 
 FRAMES = 12

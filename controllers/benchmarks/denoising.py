@@ -1,9 +1,8 @@
 """What denoising is worth: clips that no training saw, spoilt in known ways, beside filters tuned on the truth."""
 
-import re
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,8 @@ from scipy.signal import butter, savgol_filter, sosfiltfilt
 from torch import Tensor
 
 from controllers.benchmarks.corruptions import CONDITIONS, CorruptedClip, detect_true_contacts
+from controllers.benchmarks.held_out import CleanClip
+from controllers.benchmarks.tables import Row, average_rows
 from controllers.denoising.denoise import denoise
 from controllers.denoising.result import DenoiseResult
 from controllers.inbetweening.infill import infill
@@ -21,42 +22,10 @@ from mapctl.motion import Motion
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording.inspection import Inspection, inspect_recording
 
-Row = dict[str, Any]
-
-CLIP_KINDS: Mapping[str, str] = {
-    "walks": r"bandai.*_walk_",
-    "turning walks": r"bandai.*_walk-turn",
-    "runs": r"bandai.*_(run|dash)_",
-    "gestures, dance, fights": r"bandai",
-    "CMU, 120 fps": r"cmu",
-}
-"""Clips by the first pattern that their path holds."""
 STANDARD_CONDITION = "5 degrees, 2 cm, 1 % spikes"
 """The condition of the table by kind."""
 _CUTOFFS = (1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12)  # Hz
 _SPANS = (0.1, 0.17, 0.23, 0.3, 0.4, 0.5, 0.7, 1.0)  # seconds of a Savitzky-Golay window
-_MAX_CLIP_SECONDS = 20.0  # seconds of a clip that are used
-
-
-@dataclass(frozen=True, eq=False)
-class CleanClip:
-    """A clean clip."""
-
-    kind: str
-    """Of KINDS."""
-    motion: Motion
-    """On its rig, without a T-pose in front."""
-
-
-def classify_clip(name: str) -> str:
-    """By the first pattern that fits; `other` if none does."""
-    return next((kind for kind, pattern in CLIP_KINDS.items() if re.search(pattern, name)), "other")
-
-
-def trim_clip(motion: Motion, *, skip_first: bool) -> Motion:
-    """The first seconds of a clip, without its frame 0 if that is a T-pose."""
-    first = 1 if skip_first else 0
-    return motion.slice(first, min(motion.num_frames, first + round(_MAX_CLIP_SECONDS * float(motion.fps))))
 
 
 def benchmark_denoising(
@@ -80,9 +49,9 @@ def benchmark_denoising(
             done += 1
             if progress is not None:
                 progress(done, len(clips) * (len(conditions) + 1))
-        rows.append({"what": name, "clips": len(clips), **_average_rows(found)})
+        rows.append({"what": name, "clips": len(clips), **average_rows(found)})
     rows += [
-        {"what": f"{kind}, {STANDARD_CONDITION}", "clips": len(found), **_average_rows(found)}
+        {"what": f"{kind}, {STANDARD_CONDITION}", "clips": len(found), **average_rows(found)}
         for kind, found in by_kind.items()
     ]
     clean = []
@@ -93,7 +62,7 @@ def benchmark_denoising(
         done += 1
         if progress is not None:
             progress(done, len(clips) * (len(conditions) + 1))
-    return [*rows, {"what": "clean, change", "clips": len(clips), **_average_rows(clean)}]
+    return [*rows, {"what": "clean, change", "clips": len(clips), **average_rows(clean)}]
 
 
 def evaluate_clip(
@@ -182,12 +151,3 @@ def _apply_filter(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion
 def _mean_joint_error_cm(truth: Motion, other: Motion) -> float:
     """Mean distance of the joints, cm."""
     return 100 * float((truth.joint_positions() - other.joint_positions()).norm(dim=-1).mean())
-
-
-def _average_rows(rows: Sequence[Row]) -> Row:
-    """NaN, where a clip cannot give a figure, is left out; of none it stays."""
-    means = {}
-    for name in rows[0]:
-        column = np.array([row[name] for row in rows])
-        means[name] = float(np.nanmean(column)) if np.isfinite(column).any() else float("nan")
-    return means

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import torch
 
+from controllers.benchmarks.tables import Row
 from controllers.inbetweening.error_estimates import is_travelling
 from controllers.inbetweening.pipeline import InfillResult, fill
 from controllers.inbetweening.proposers.selection import choose_proposals
@@ -20,7 +20,6 @@ from mapctl.terms.foot_contact import TOES
 GAP_LENGTHS = (15, 30, 60, 90, 120, 180)
 """Frames of the gaps."""
 _CONTEXT_LENGTHS = (1, 10)  # known frames on either side
-Row = dict[str, Any]
 
 
 def benchmark_gaps(

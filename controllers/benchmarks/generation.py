@@ -3,10 +3,10 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 
+from controllers.benchmarks.tables import Row, average_rows
 from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import GenerateSettings, generate, sample_stratified_starts
 from mapctl.errors import RequestError
@@ -21,8 +21,6 @@ from mapctl.metrics.realism import (
 )
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Refiner
-
-Row = dict[str, Any]
 
 _MEASURES = ("contact_speed_cm_s", "skate_cm_s", "jitter_m_s3", "penetration_cm", "float_cm", "speed_m_s")
 
@@ -160,7 +158,4 @@ def _split_by_kind(clips: Sequence[Motion], settings: GenerationBenchmarkSetting
 
 
 def _mean_measures(clips: Sequence[Motion]) -> Row:
-    if not clips:
-        return {}
-    rows = [measure(clip) for clip in clips]
-    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in _MEASURES}
+    return average_rows([measure(clip) for clip in clips], _MEASURES) if clips else {}

@@ -4,12 +4,12 @@ training saw, with pieces taken out, filled by networks as they are, on rigid bo
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controllers.benchmarks.tables import Row
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillMethod, InfillSettings
 from mapctl import contacts
@@ -22,8 +22,6 @@ from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.skeleton import CANONICAL, leg_length
 from mapctl.terms.foot_contact import TOES
-
-Row = dict[str, Any]
 
 WINDOW_FRAMES = 120
 """Frames of a clip that are looked at: the paper's 4 s."""

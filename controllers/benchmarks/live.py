@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from controllers.benchmarks.tables import Row
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import FrameChunk
-
-Row = dict[str, Any]
 
 _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
 _COMMAND_SECONDS = (4.5, 7.0)  # seconds for which a command holds

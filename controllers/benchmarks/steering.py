@@ -4,10 +4,10 @@ import math
 import statistics
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import torch
 
+from controllers.benchmarks.tables import Row
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, drive, summarise_step_timing
 from controllers.steering.pure_pursuit import PurePursuit
@@ -17,8 +17,6 @@ from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics import measure
 from mapctl.metrics.travel import measure_commands
 from mapctl.protocols import Density
-
-Row = dict[str, Any]
 
 _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from controllers.benchmarks.tables import Row, average_rows
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.proposers.rollout import roll_through_gaps, select_likeliest_density
 from controllers.inbetweening.tween import tween
@@ -25,16 +26,14 @@ from mapctl.terms.foot_contact import TOES
 TWEEN_FRAMES = 6 * PRIOR_FPS
 """Of a clip that are looked at."""
 _INNER_KEYS = 5  # keys, beside the first and the last
-_END_SOURCE_FRAMES = 4 * PRIOR_FPS  # of a clip, the end of which is taken away
 _END_LENGTHS = (30, 60)  # frames
 _NUM_ALTERNATIVES = 4  # answers
-Row = dict[str, Any]
 
 
 def benchmark_tweening(
     kinds: Mapping[str, Sequence[Motion]],
     infiller: Inbetweener,
-    densities: Sequence[Density],
+    densities: Sequence[Any],
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
@@ -57,27 +56,17 @@ def benchmark_tweening(
                 made = way(clip, keys, infiller).motion
                 told[method].append(_evaluate_tween(made, clip, keys.frames, time.perf_counter() - began))
         rows += [
-            {"kind": kind, "what": "keys", "by": method, "clips": len(each), **_average_columns(each)}
+            {"kind": kind, "what": "keys", "by": method, "clips": len(each), **average_rows(each)}
             for method, each in told.items()
             if each
         ]
-        shown = [clip.slice(0, _END_SOURCE_FRAMES) for clip in clips if clip.num_frames >= _END_SOURCE_FRAMES]
+        shown = [clip.slice(0, 4 * PRIOR_FPS) for clip in clips if clip.num_frames >= 4 * PRIOR_FPS]
         for count in _END_LENGTHS:
             for by, rollout_densities in (("infiller", ()), ("density", densities)):
                 each = [_evaluate_end(clip, count, infiller, rollout_densities) for clip in shown]
-                rows += (
-                    [
-                        {
-                            "kind": kind,
-                            "what": f"end of {count} frames",
-                            "by": by,
-                            "clips": len(each),
-                            **_average_columns(each),
-                        }
-                    ]
-                    if each
-                    else []
-                )
+                if each:
+                    told_end = {"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each)}
+                    rows.append({**told_end, **average_rows(each)})
         if progress is not None:
             progress(number + 1, len(kinds))
     return rows
@@ -131,8 +120,3 @@ def _compare_feet(made: Motion, clip: Motion) -> Row:
         "mocap_planted": theirs["contact_speed_cm_s"],
         "jitter": ours["jitter_m_s3"] / theirs["jitter_m_s3"],
     }
-
-
-def _average_columns(rows: Sequence[Row]) -> Row:
-    """Of each column; clips in which no toe stands have no planted ones."""
-    return {name: float(torch.tensor([row[name] for row in rows]).nanmean()) for name in rows[0]}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from joblib import Parallel, delayed
 
 from controllers.denoising.denoise import denoise
 from controllers.denoising.result import DenoiseResult
@@ -96,8 +97,6 @@ def run_over_processes(jobs: Sequence[FileJob], cleaner: FileDenoiser, *, proces
     if processes == 1:
         yield from map(cleaner, jobs)
         return
-    from joblib import Parallel, delayed
-
     ended: Any = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(cleaner)(job) for job in jobs)
     yield from ended
 

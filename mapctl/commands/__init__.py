@@ -1,12 +1,14 @@
-"""The sub-commands, one file each. Part of the command line: like `mapctl.cli` they may import every package,
+"""The sub-commands, a package each. Part of the command line: like `mapctl.cli` they may import every package,
 and nothing else imports them.
 
-Each is a frozen dataclass of options with a `run`; heavy imports wait until it is called.
+A package holds a frozen dataclass of options, which imports nothing heavy; the work is in its module `run`, imported
+when it is asked for, in one place (`mapctl.commands.shared.command`).
 """
 
+from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
-from mapctl.commands.bench import Bench
+from mapctl.commands.bench import TABLES, Bench
 from mapctl.commands.blend import Blend
 from mapctl.commands.chain import Chain
 from mapctl.commands.convert import Convert
@@ -26,7 +28,7 @@ from mapctl.commands.tween import Tween
 
 
 @runtime_checkable
-class Command(Protocol):
+class Runnable(Protocol):
     """What every sub-command can do."""
 
     def run(self) -> int:
@@ -34,7 +36,7 @@ class Command(Protocol):
         ...
 
 
-COMMANDS: dict[str, type[Command]] = {
+COMMANDS: dict[str, type[Runnable]] = {
     "demo": Demo,
     "follow": FollowCurve,
     "run": RunScene,
@@ -54,3 +56,5 @@ COMMANDS: dict[str, type[Command]] = {
     "bench": Bench,
 }
 """By the name the user types, in the order of the help."""
+SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES}
+"""Of the commands that have sub-commands of their own; the first is meant where none is named."""

@@ -11,6 +11,7 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from mapctl.curves import files
 from mapctl.curves.curve import Curve
 from mapctl.curves.polyline import build_dense_polyline
 from mapctl.curves.shapes import SHAPES, parse_shape, sample_shape
@@ -93,8 +94,6 @@ def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -
 
 
 def _read_file(path: str, metres_per_unit: float | None) -> Curve:
-    from mapctl.curves import files  # file readers and the SVG parser are not needed for a shape
-
     if path.lower().endswith(".svg"):
         points = files.read_svg(path, metres_per_unit or files.SVG_METRES_PER_UNIT)
     else:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
+from svgpathtools import Line
+from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document
 
 from mapctl.curves.polyline import MAX_LENGTH, MAX_POINTS
 from mapctl.errors import FileFormatError
@@ -139,8 +141,6 @@ def _read_segments(path: str | PathLike[str], metres_per_unit: float) -> list:
 
 
 def _read_svg_paths(path: str | PathLike[str]) -> list:
-    from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document
-
     text = _read_text(path, MAX_SVG_BYTES)
     try:
         document = Document.from_svg_string(text)
@@ -158,7 +158,6 @@ def _read_svg_paths(path: str | PathLike[str]) -> list:
 
 def _sample_segment(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
     """A straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
-    from svgpathtools import Line
 
     def places(count: int) -> ndarray:
         with np.errstate(all="ignore"):

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.curves import Curve
+from mapctl.curves import Curve, local_frame_kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,6 @@ def find_local_frames(
 
     Points have the curve's dimensions. Arcs that are not finite give NaN.
     """
-    from mapctl.curves import local_frame_kernels  # late: needs the compiler
-
     arcs = around.detach().double().contiguous().numpy()
     known = points.detach().contiguous()
     near = LocalFrame(torch.empty_like(known), known.new_empty(*known.shape, curve.dims), torch.empty_like(known))

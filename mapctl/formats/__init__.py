@@ -4,6 +4,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from os import PathLike
 from pathlib import PurePath
+from types import ModuleType
 
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import acclaim, bvh, npz
@@ -11,16 +12,19 @@ from mapctl.formats.missing import MissingValues
 from mapctl.motion import Motion
 
 
-def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
-    from mapctl.formats import gltf  # late: it draws a body, which the other formats need not load
+def _import_skinned_writers() -> tuple[ModuleType, ModuleType]:
+    """glTF and USD; late, since they draw a body, which the other formats need not load."""
+    from mapctl.formats import gltf, usd
 
-    gltf.save(motion, path)
+    return gltf, usd
+
+
+def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
+    _import_skinned_writers()[0].save(motion, path)
 
 
 def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
-    from mapctl.formats import usd  # late, likewise
-
-    usd.save(motion, path)
+    _import_skinned_writers()[1].save(motion, path)
 
 
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load}
@@ -94,6 +98,4 @@ def check_ending(path: str | PathLike[str]) -> None:
     if ending not in WRITERS:
         raise RequestError(f"cannot write {path}: unknown ending {ending!r}; allowed: {', '.join(WRITERS)}")
     if ending in _USD:
-        from mapctl.formats import usd
-
-        usd.check_installed(path)
+        _import_skinned_writers()[1].check_installed(path)

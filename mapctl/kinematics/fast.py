@@ -4,8 +4,6 @@ Same mathematics as `features.root_places` and `kinematics.positions_from_matric
 and serve every case but float32 on the CPU. Each is one node of torch's graph, differentiable once.
 """
 
-from functools import cache
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mapctl.features import LAYOUT, GroundPose
+from mapctl.kinematics import fast_kernels
 from mapctl.skeleton import Skeleton
 
 
@@ -72,14 +71,6 @@ def compute_joints_world(
     return _Body.apply(features, root_xz_world, heading, skeleton)
 
 
-@cache
-def _load_kernels() -> ModuleType:
-    """Late: the compiler takes a while to import, and what never solves does not need it."""
-    from mapctl.kinematics import fast_kernels
-
-    return fast_kernels
-
-
 def _contiguous_array(tensor: Tensor) -> np.ndarray:
     """Contiguous, so that every kernel is compiled once."""
     return tensor.detach().contiguous().numpy()
@@ -90,7 +81,7 @@ class _Root(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, start_xz: Tensor, start_heading: Tensor):
         ground, heading = features.new_empty(*features.shape[:2], 2), features.new_empty(features.shape[:2])
         known, at = _contiguous_array(features), start_heading.numpy()
-        _load_kernels().root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
+        fast_kernels.root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
         ctx.known = known, at
         return ground, heading
 
@@ -99,7 +90,7 @@ class _Root(torch.autograd.Function):
     def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         features, start_heading = ctx.known
         gradient = np.zeros(features.shape, np.float32)
-        _load_kernels().root_backward(features, _COLUMNS, start_heading, *map(_contiguous_array, pulled), gradient)
+        fast_kernels.root_backward(features, _COLUMNS, start_heading, *map(_contiguous_array, pulled), gradient)
         return torch.from_numpy(gradient), None, None
 
 
@@ -110,7 +101,7 @@ class _Body(torch.autograd.Function):
         places = features.new_empty(*features.shape[:2], len(parents), 3)
         world = np.empty((*places.shape, 3), np.float32)
         known = _contiguous_array(features)
-        _load_kernels().body_forward(
+        fast_kernels.body_forward(
             known,
             _COLUMNS,
             _contiguous_array(ground),
@@ -129,7 +120,7 @@ class _Body(torch.autograd.Function):
         features, parents, offsets, world = ctx.known
         gradient, shape = np.zeros(features.shape, np.float32), features.shape[:2]
         ground, heading = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
-        _load_kernels().body_backward(
+        fast_kernels.body_backward(
             features, _COLUMNS, parents, offsets, world, _contiguous_array(pulled), gradient, ground, heading
         )
         return *map(torch.from_numpy, (gradient, ground, heading)), None

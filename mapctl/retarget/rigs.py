@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.text import read_bytes
 from mapctl.joint_names import describe_nearest
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -113,8 +114,6 @@ def load_rig(name_or_path: str | PathLike[str]) -> Rig:
 
 
 def _read_toml(path: Path) -> Rig:
-    from mapctl.formats.text import read_bytes
-
     try:
         return _rig_from_table({"name": path.stem, **tomllib.loads(read_bytes(path).decode("utf-8"))})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

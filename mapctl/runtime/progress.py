@@ -1,23 +1,6 @@
-"""Progress of long work: a bar on a terminal, nothing in a pipe."""
+"""Progress of long work, as a function that is told of it."""
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is in all."""
-
-
-@contextmanager
-def show_progress(label: str, *, quiet: bool = False) -> Iterator[Progress | None]:
-    """A function that moves a bar on standard error; None where there is no terminal, or with `quiet`."""
-    if quiet or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(label, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)

@@ -15,6 +15,7 @@ from mapctl.rotations import make_sign_continuous
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import spawn
 from mapctl.skeleton import Skeleton
+from scenes.film import film
 
 FORMATS = ("bvh", "glb", "mp4")
 
@@ -93,6 +94,4 @@ def encode_motion(motion: Motion, ending: str) -> bytes:
 
 
 def _render_film(source: Path, out: Path) -> None:
-    from scenes.film import film
-
     film([(formats.load(source), None)], out)

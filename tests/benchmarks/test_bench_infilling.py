@@ -176,7 +176,7 @@ def test_the_command_compares_networks_on_the_clips_kept_from_training(folder, c
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (None, "bench infill compares with mocap: name the training data's folder with --data"),
+        (None, "Missing from mapctl bench infill: --data DIR The folder that was trained on"),
         ("empty", "does not hold the clips kept from training"),
     ],
 )

@@ -208,8 +208,8 @@ def test_run_plays_a_scene(prior, tmp_path, monkeypatch):
 
 def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
-    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
+    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo.run._SIZE", (96, 64))
     assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 0
     assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
 

@@ -6,7 +6,7 @@ import pytest
 from helpers import bandai_skeleton, walk
 
 from mapctl import cli, metrics, retarget
-from mapctl.commands.shared import clip_sets
+from mapctl.commands.measure import clip_sets
 from mapctl.metrics import realism
 from mapctl.metrics.realism import ClassifierSettings
 

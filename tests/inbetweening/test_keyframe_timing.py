@@ -155,4 +155,4 @@ def test_the_bench_takes_clips_that_were_kept_from_training(tmp_path, capsys):
     assert run("bench", "timing", *words) == 0
     assert {row["method"] for row in json.loads(capsys.readouterr().out)["rows"]} >= {"suggested"}
     assert run("bench", "timing", "--infiller", tmp_path / "ours.safetensors") == 2
-    assert "bench timing compares with mocap" in capsys.readouterr().err
+    assert "Missing from mapctl bench timing: --data DIR" in capsys.readouterr().err

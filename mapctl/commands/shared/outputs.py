@@ -8,12 +8,12 @@ from os import PathLike
 from pathlib import Path
 
 from mapctl.errors import RequestError
+from mapctl.formats import atomic
+from scenes.film import check_outputs
 
 
 def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
     """RequestError unless every file can be written, no two are the same and none is a given one; leaves no trace."""
-    from mapctl.formats import atomic
-
     seen: set[str] = set()
     sources = {os.path.realpath(path) for path in given}
     for path in paths:
@@ -28,8 +28,6 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
 
 def check_film(path: Path, size: tuple[int, int]) -> None:
     """RequestError where a film of this ending or size cannot be made, or its package is missing."""
-    from scenes.film import check_outputs
-
     check_outputs([path], size)
     require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
 
@@ -51,8 +49,6 @@ def require_render(package: str) -> None:
 
 def check_folder(folder: str | PathLike[str]) -> None:
     """RequestError unless the folder is there and can be written in, or can be made; leaves no trace."""
-    from mapctl.formats import atomic
-
     atomic.check_folder(folder)
 
 

@@ -4,42 +4,43 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mapctl.commands.shared.character import Character
+import torch
+
+from controllers.following.follow import FollowSettings, follow
+from mapctl import report
+from mapctl.commands.shared.character import OutputCharacter
+from mapctl.curves.curve import Curve
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.path import PathRequest, SpeedProfile
+from mapctl.motion import Motion
+from mapctl.problem.solution import Outcome, Solution
 from mapctl.runtime.progress import Progress
-
-if TYPE_CHECKING:
-    from mapctl.curves.curve import Curve
-    from mapctl.intent.path import PathRequest
-    from mapctl.motion import Motion
-    from mapctl.problem.solution import Solution
-    from priors.lstm_gmm.density import LstmGmmDensity
-
-
-EXIT_INTERRUPTED = 130
-"""Exit status after Ctrl-C; what was solved until then is written, films are not."""
+from mapctl.skeleton import CANONICAL
+from mapctl.terms import FootContact
+from priors.lstm_gmm.density import LstmGmmDensity
 
 
 @dataclass(frozen=True, eq=False)
 class Walk:
     """A solved walk."""
 
-    request: "PathRequest"
+    request: PathRequest
     """What was asked for."""
-    prior: "LstmGmmDensity"
+    prior: LstmGmmDensity
     """What moved the character."""
     seed: int
     """Of everything random."""
-    solution: "Solution"
+    solution: Solution
     """What came out."""
     seconds: float
     """Wall clock of the solve."""
-    person: Character | None = None
+    person: OutputCharacter | None = None
     """Who walks, where that is not the canonical body."""
 
     @property
-    def on_rig(self) -> "Motion":
+    def on_rig(self) -> Motion:
         """The motion on the rig it was asked for."""
         motion = self.solution.motion
         return motion if self.person is None else self.person.on_rig(motion)
@@ -47,23 +48,17 @@ class Walk:
     @property
     def interrupted(self) -> bool:
         """Whether Ctrl-C ended the solve, so that this is the first part of the walk."""
-        from mapctl.problem.solution import Outcome
-
         return self.solution.status.outcome is Outcome.INTERRUPTED
 
     @cached_property
     def measures(self) -> Mapping[str, float]:
         """Of the motion, against the curve and the wanted way along it."""
-        from mapctl import report
-
         motion = self.solution.motion
         wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
         return report.measure_path(motion, self.request.curve, wanted_m=wanted)
 
     def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """The report of this walk; `request` is what the user wrote."""
-        from mapctl import report
-
         card = self.prior.card
         prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
         return report.build_report(
@@ -72,8 +67,6 @@ class Walk:
 
     def summary(self) -> list[str]:
         """A few lines for people."""
-        from mapctl import report
-
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
         cost = report.summarise_timing(self.solution.windows, seconds=self.seconds)
         motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
@@ -89,20 +82,14 @@ class Walk:
 
 
 def walk(
-    prior: "LstmGmmDensity",
-    request: "PathRequest",
+    prior: LstmGmmDensity,
+    request: PathRequest,
     *,
     seed: int,
     progress: Progress | None = None,
-    person: Character | None = None,
+    person: OutputCharacter | None = None,
 ) -> Walk:
     """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
-    import torch
-
-    from controllers.following.follow import FollowSettings, follow
-    from mapctl.skeleton import CANONICAL
-    from mapctl.terms import FootContact
-
     prior.warm_up()
     bones = CANONICAL if person is None else person.skeleton
     settings = None if person is None else FollowSettings(footing=FootContact(rest_height=person.toe_rest_height))
@@ -120,11 +107,8 @@ def walk(
     return Walk(request, prior, seed, solution, time.perf_counter() - began, person)
 
 
-def parse_follow(curve: "Curve", speed: str | float | None, seconds: float | None) -> "PathRequest":
+def parse_follow(curve: Curve, speed: str | float | None, seconds: float | None) -> PathRequest:
     """The wish, checked: RequestError for speeds and durations that make no sense or take too long."""
-    from mapctl.features import PRIOR_FPS
-    from mapctl.intent.path import PathRequest, SpeedProfile
-
     profile = SpeedProfile.parse(str(1.2 if speed is None else speed))
     request = PathRequest(curve, profile, seconds)
     request.frames(PRIOR_FPS)

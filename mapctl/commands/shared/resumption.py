@@ -4,16 +4,14 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
 
+from mapctl.commands.train import Train
 from mapctl.errors import WriteError
-
-if TYPE_CHECKING:
-    from mapctl.commands.train import Train
+from priors.training.run_files import read_last_step
 
 
 @contextmanager
-def explain_resumption(given: "Train") -> Iterator[None]:
+def explain_resumption(given: Train) -> Iterator[None]:
     """What Ctrl-C, SIGTERM or a full disk ends within says what is saved, and what to type."""
     try:
         yield
@@ -45,7 +43,7 @@ def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable
         raise WriteError(_join_sentences(str(error), *kept())) from error
 
 
-def format_command(given: "Train") -> list[str]:
+def format_command(given: Train) -> list[str]:
     """What to type for a command; options that are the defaults are left out."""
     typed = ["mapctl", "train", given.model]
     for option in fields(given):
@@ -65,10 +63,8 @@ def _join_sentences(*parts: str) -> str:
     return "; ".join(filter(None, parts))
 
 
-def _describe_resumption(given: "Train") -> str:
+def _describe_resumption(given: Train) -> str:
     """Empty where the run folder holds no checkpoint."""
-    from priors.training.run_files import read_last_step
-
     step = read_last_step(given.out)
     typed = shlex.join([*format_command(replace(given, resume=False)), "--resume"])
     return "" if step is None else f"step {step} is saved; go on with: {typed}"

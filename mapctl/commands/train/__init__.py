@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mapctl.commands.shared import options, outputs
+from mapctl.commands.shared import options
 from mapctl.commands.train import checks
 from mapctl.errors import RequestError
 
@@ -97,8 +97,10 @@ class Train:
 
             return windows.train_on_windows(self, say), f"--{self.model}"
         request = self.request()
-        outputs.check_folder(self.out)
+        from mapctl.commands.shared import outputs
         from priors.training import run
+
+        outputs.check_folder(self.out)
 
         return run.train(request, say, warn=checks.warn), "--prior"
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mapctl.protocols import DiscreteChoices
-from priors.lstm_gmm.fast import layout
+from priors.lstm_gmm.fast import kernels, layout
 from priors.lstm_gmm.fast.layout import Array, ChoiceBuffers, Tape
 from priors.lstm_gmm.network import LstmGmm, LstmState
 
@@ -40,9 +40,6 @@ class FastRollout:
     """
 
     def __init__(self, model: LstmGmm):
-        # Late: the compiler takes a while to import, and commands that never solve do not need it.
-        from priors.lstm_gmm.fast import kernels
-
         self._config, self._layout, self._kernels = model.config, model.layout, kernels
         self._settings = layout.pack_constants(model)
         self._weights, self._biases = layout.pack_weights(model)

@@ -1,0 +1,76 @@
+"""Clips that no training saw, by kind."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from controllers.denoising.denoise import begins_with_tpose
+from mapctl import formats, retarget
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+
+HeldOut = Mapping[str, Sequence[str]]
+"""Names of clips by the part of the data that they are in, as a model's card tells them."""
+
+CLIP_KINDS: Mapping[str, str] = {
+    "walks": r"bandai.*_walk_",
+    "turning walks": r"bandai.*_walk-turn",
+    "runs": r"bandai.*_(run|dash)_",
+    "gestures, dance, fights": r"bandai",
+    "CMU, 120 fps": r"cmu",
+}
+"""Clips by the first pattern that their path holds."""
+_MAX_CLIP_SECONDS = 20.0  # seconds of a clip that are used
+
+
+@dataclass(frozen=True, eq=False)
+class CleanClip:
+    """A clean clip."""
+
+    kind: str
+    """Of CLIP_KINDS."""
+    motion: Motion
+    """On its rig, without a T-pose in front."""
+
+
+def find_held_out(data: Path, held_out: HeldOut) -> list[Path]:
+    """The clips below the data folder that were kept from training; RequestError where they are not all there."""
+    paths = [data / name for part in ("validation", "test") for name in held_out.get(part, ())]
+    if not paths or not all(path.is_file() for path in paths):
+        lost = next((path for path in paths if not path.is_file()), "no clip at all")
+        raise RequestError(f"{data} does not hold the clips kept from training: {lost}")
+    return paths
+
+
+def load_clean_clips(data: Path, held_out: HeldOut, count: int) -> list[CleanClip]:
+    """About so many, as many of each kind, without their T-poses."""
+    paths: dict[str, list[Path]] = {}
+    for path in find_held_out(data, held_out):
+        paths.setdefault(classify_clip(path.relative_to(data).as_posix()), []).append(path)
+    clips = []
+    for kind in CLIP_KINDS:
+        for path in paths.get(kind, [])[: max(1, count // len(CLIP_KINDS))]:
+            motion = formats.load(path)
+            clips.append(CleanClip(kind, trim_clip(motion, skip_first=begins_with_tpose(motion))))
+    return clips
+
+
+def load_canonical(data: Path, held_out: HeldOut, count: int, *, fps: int | None = None) -> dict[str, list[Motion]]:
+    """The same on canonical joints, by kind; at that frame rate if one is named."""
+    kinds: dict[str, list[Motion]] = {}
+    for clip in load_clean_clips(data, held_out, count):
+        motion = retarget.to_canonical(clip.motion)[0]
+        kinds.setdefault(clip.kind, []).append(motion if fps is None else motion.resample(fps))
+    return kinds
+
+
+def classify_clip(name: str) -> str:
+    """By the first pattern that fits; `other` if none does."""
+    return next((kind for kind, pattern in CLIP_KINDS.items() if re.search(pattern, name)), "other")
+
+
+def trim_clip(motion: Motion, *, skip_first: bool) -> Motion:
+    """The first seconds of a clip, without its frame 0 if that is a T-pose."""
+    first = 1 if skip_first else 0
+    return motion.slice(first, min(motion.num_frames, first + round(_MAX_CLIP_SECONDS * float(motion.fps))))

@@ -1,0 +1,21 @@
+"""What the tables of all benchmarks are made of."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+"""Figures by column."""
+
+
+def average_rows(rows: Sequence[Row], columns: Sequence[str] | None = None) -> Row:
+    """The mean of each column, of those of the first row if none are named.
+
+    NaN, where a clip cannot give a figure, is left out; of none it stays.
+    """
+    means = {}
+    for name in rows[0] if columns is None else columns:
+        column = np.array([row[name] for row in rows])
+        means[name] = float(np.nanmean(column)) if np.isfinite(column).any() else float("nan")
+    return means

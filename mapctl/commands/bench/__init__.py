@@ -1,0 +1,167 @@
+"""`mapctl bench TABLE`: what the solver costs on this machine, and what each job is worth; a sub-command a table."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table(Command):
+    """What every table is asked."""
+
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorTable(Table):
+    """A table of one density."""
+
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MocapTable(Table):
+    """A table over clips that were kept from training."""
+
+    data: options.DataFolder
+    """The folder that was trained on, for the clips that were held out."""
+    count: options.Count = 48
+    """Clips, spread over the kinds."""
+    infiller: options.Name = "infiller"
+    """The bundled infiller, or the file or run folder of a trained one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speed(PriorTable):
+    """Milliseconds a frame, fast path and reference."""
+
+    work = "mapctl.commands.bench.speed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablation(PriorTable):
+    """Starts and unknowns of the solver compared."""
+
+    work = "mapctl.commands.bench.ablation"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeRun(PriorTable):
+    """8 random motions of 10,000 frames beside the training data."""
+
+    work = "mapctl.commands.bench.free_run"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generation(PriorTable):
+    """Raw, refined and finished motion beside mocap that training did not see."""
+
+    work = "mapctl.commands.bench.generation"
+
+    data: options.DataFolder
+    """The folder that was trained on, for the clips that were held out."""
+    count: options.Count = 48
+    """Clips of 10 s to draw."""
+    refiner: options.Name = "auto"
+    """A bundled refiner, or the file or run folder of a trained one; auto is the prior's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steer(PriorTable):
+    """Random commands: which are reached, and how soon."""
+
+    work = "mapctl.commands.bench.steer"
+
+    prior: options.Name = "locomotion-live"
+    """A bundled prior, or the file or run folder of a trained one."""
+    count: options.Count = 48
+    """Commands to give."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Live(PriorTable):
+    """Random commands against the wall clock, for several characters at once."""
+
+    work = "mapctl.commands.bench.live"
+
+    prior: options.Name = "locomotion-live"
+    """A bundled prior, or the file or run folder of a trained one."""
+    minutes: options.Number = 0.5
+    """How long each number of characters is steered."""
+    characters: Annotated[str, arg(metavar="N,N,...")] = "1,2,4"
+    """How many at once, one number after the other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Denoise(MocapTable):
+    """Clips that training did not see, corrupted in several ways, beside filters tuned on the truth."""
+
+    work = "mapctl.commands.bench.denoise"
+
+    denoiser: options.Name = "denoiser"
+    """The bundled denoiser, or the file or run folder of a trained one."""
+    infiller: options.Name = "infiller"
+    """For joints that are lost: the bundled infiller, or the file or run folder of a trained one."""
+    prior: options.MaybeName = None
+    """As `mapctl denoise` takes it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Infill(MocapTable):
+    """Clips that training did not see, with pieces taken out."""
+
+    work = "mapctl.commands.bench.infill"
+
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
+    """Other trained infillers, to compare as they are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tween(MocapTable):
+    """Clips that training did not see, of which keys are left, and such clips without their ends."""
+
+    work = "mapctl.commands.bench.tween"
+
+    prior: options.Name = "auto"
+    """What rollouts are drawn from: a bundled prior, the file or run folder of a trained one, or auto."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaps(Tween):
+    """Such clips without frames in their middle: how far the answers are from the truth, by who gave them."""
+
+    work = "mapctl.commands.bench.gaps"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing(MocapTable):
+    """Pairs of poses of such clips, and the time between them that `mapctl tween --suggest-timing` would suggest."""
+
+    work = "mapctl.commands.bench.timing"
+
+
+@dataclass(frozen=True)
+class Bench(Command):
+    """Cost of the solver on this machine (`mapctl bench` alone), and what the jobs are worth: a table each."""
+
+
+TABLES: dict[str, type[Table]] = {
+    "speed": Speed,
+    "ablation": Ablation,
+    "free-run": FreeRun,
+    "generation": Generation,
+    "steer": Steer,
+    "live": Live,
+    "denoise": Denoise,
+    "infill": Infill,
+    "tween": Tween,
+    "gaps": Gaps,
+    "timing": Timing,
+}
+"""By the name the user types; the first is what `mapctl bench` alone measures."""

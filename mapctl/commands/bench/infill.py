@@ -1,0 +1,27 @@
+"""`mapctl bench infill`: clips with pieces taken out."""
+
+import priors
+from controllers.benchmarks.held_out import load_canonical
+from controllers.benchmarks.infilling import benchmark_infilling, benchmark_infilling_by_kind
+from controllers.benchmarks.lost_joints import benchmark_missing_joints
+from mapctl.commands.bench import Infill
+from mapctl.commands.bench.output import print_rows
+from mapctl.commands.shared.progress_bar import show_progress
+
+
+def run(table: Infill) -> int:
+    """Measure and print."""
+    infiller = priors.load_infiller(table.infiller)
+    ours = infiller.card.config["architecture"]
+    networks = {ours: infiller}
+    for name in filter(None, table.baselines.split(",")):
+        other = priors.load_infiller(name)
+        architecture = other.card.config["architecture"]
+        # Two of one kind are told apart by their names.
+        networks[f"{architecture} {name}" if architecture in networks else architecture] = other
+    kinds = load_canonical(table.data, infiller.card.data.get("held_out", {}), table.count)
+    clips = [clip for found in kinds.values() for clip in found]
+    with show_progress("filling") as progress:
+        rows = benchmark_infilling(clips, networks, ours=ours, progress=progress)
+    by_kind = benchmark_infilling_by_kind(kinds, infiller)
+    return print_rows(table, [*rows, *by_kind, *benchmark_missing_joints(kinds, infiller)])

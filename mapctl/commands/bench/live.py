@@ -1,0 +1,30 @@
+"""`mapctl bench live`: random commands against the wall clock."""
+
+import functools
+
+import priors
+from controllers.benchmarks.live import benchmark_live
+from mapctl.commands.bench import Live
+from mapctl.commands.bench.output import print_rows
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.errors import RequestError
+
+_MAX_MINUTES, _MAX_CHARACTERS = 24 * 60, 64
+
+
+def run(table: Live) -> int:
+    """Measure and print."""
+    if not 0 < table.minutes <= _MAX_MINUTES:
+        raise RequestError(f"--minutes must be more than 0 and at most a day, got {table.minutes:g}")
+    rows, load = [], functools.partial(priors.load, table.prior)
+    for count in _parse_counts(table.characters):
+        with show_progress(f"{count} at once") as progress:
+            rows.append(benchmark_live(load, characters=count, minutes=table.minutes, progress=progress))
+    return print_rows(table, rows)
+
+
+def _parse_counts(text: str) -> list[int]:
+    words = [word.strip() for word in text.split(",")]
+    if not all(word.isdecimal() and 1 <= int(word) <= _MAX_CHARACTERS for word in words):
+        raise RequestError(f"--characters must be numbers from 1 to {_MAX_CHARACTERS}, as 1,2,4; got {text!r}")
+    return [int(word) for word in words]

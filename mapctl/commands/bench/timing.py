@@ -1,0 +1,14 @@
+"""`mapctl bench timing`: suggested times between poses beside the true ones."""
+
+import priors
+from controllers.benchmarks.held_out import load_canonical
+from controllers.benchmarks.keyframe_timing import benchmark_keyframe_timing
+from mapctl.commands.bench import Timing
+from mapctl.commands.bench.output import print_rows
+
+
+def run(table: Timing) -> int:
+    """Measure and print."""
+    held_out = priors.load_infiller(table.infiller).card.data.get("held_out", {})
+    kinds = load_canonical(table.data, held_out, table.count)
+    return print_rows(table, benchmark_keyframe_timing([clip for clips in kinds.values() for clip in clips]))

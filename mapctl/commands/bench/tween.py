@@ -1,0 +1,18 @@
+"""`mapctl bench tween`: motion through a few keys, and ends extended."""
+
+import priors
+from controllers.benchmarks.held_out import load_canonical
+from controllers.benchmarks.tweening import benchmark_tweening
+from mapctl.commands.bench import Tween
+from mapctl.commands.bench.output import print_rows
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.features import PRIOR_FPS
+
+
+def run(table: Tween) -> int:
+    """Measure and print."""
+    infiller = priors.load_infiller(table.infiller)
+    kinds = load_canonical(table.data, infiller.card.data.get("held_out", {}), table.count, fps=PRIOR_FPS)
+    with show_progress("tween") as progress:
+        rows = benchmark_tweening(kinds, infiller, priors.load_choice(table.prior), progress=progress)
+    return print_rows(table, rows)

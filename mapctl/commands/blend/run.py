@@ -1,0 +1,26 @@
+"""`mapctl blend`: a hand or foot of one clip does for a while what it does in another."""
+
+import priors
+from controllers.inbetweening.blend import LimbTransfer, blend
+from controllers.inbetweening.pipeline import InfillSettings
+from mapctl import formats
+from mapctl.commands.blend import Blend
+from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
+
+
+def run(command: Blend) -> int:
+    """Check everything, blend, write, tell."""
+    results.check_destinations(command.out, command.video, given=(command.source, command.other))
+    rig = inputs.read_rig(command.rig)
+    motion, other = inputs.read_motion(command.source, rig), inputs.read_motion(command.other, None)
+    start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
+    names = tuple(name.strip() for name in command.joints.split(","))
+    borrowed = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
+    settings = InfillSettings(method=command.method)
+    done = blend(motion, other, borrowed, priors.load_infiller(command.infiller), settings=settings, rig=rig)
+    formats.save(done.motion, command.out)
+    results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
+    if not command.quiet:
+        print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))
+    return 0

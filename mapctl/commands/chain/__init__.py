@@ -1,0 +1,35 @@
+"""`mapctl chain`: one long motion through pieces of many clips."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class Chain(Command):
+    """One long motion through short pieces of many clips, the gaps between them filled in; on the first clip's rig."""
+
+    clips: tyro.conf.Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP CLIP ...")]]
+    """Motion files, of any known rigs."""
+    out: options.OutFile
+    """Where the motion goes, at 30 frames a second."""
+    piece: options.Count = 40
+    """Frames that are taken from the middle of every clip."""
+    gap: Annotated[str, arg(metavar="A:B")] = "50:100"
+    """Frames between two pieces: drawn from A to B."""
+    seed: options.Count = 0
+    """Of the gaps' lengths."""
+    method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
+    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
+    infiller: options.MaybeName = None
+    """The file or run folder of a trained infiller; the bundled one if not given."""
+    video: options.MaybeFile = None
+    """Film of the motion: .mp4, .gif or .png."""
+    quiet: bool = False
+    """No summary and no progress bar."""

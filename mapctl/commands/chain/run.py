@@ -1,0 +1,51 @@
+"""`mapctl chain`: one long motion through pieces of many clips."""
+
+import torch
+
+import priors
+from controllers.inbetweening.chain import ChainSettings, chain
+from controllers.inbetweening.pipeline import InfillSettings
+from mapctl import formats
+from mapctl.commands.chain import Chain
+from mapctl.commands.shared import inputs, options, results
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.errors import RequestError
+from mapctl.retarget import to_canonical
+from scenes.film import film
+
+
+def run(command: Chain) -> int:
+    """Check everything, chain, write, tell."""
+    options.check_seed(command.seed)
+    results.check_method(command.method, infiller=command.infiller)
+    results.check_destinations(command.out, command.video, given=command.clips)
+    settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
+    infiller = None if command.method == "linear" else priors.load_infiller(command.infiller or "infiller")
+    done = chain(
+        [inputs.read_motion(path, None) for path in command.clips],
+        infiller,
+        settings=settings,
+        filling=InfillSettings(method=command.method),
+        rollout_densities=priors.load_choice("auto") if command.method == "map" else (),
+        generator=torch.Generator().manual_seed(command.seed),
+    )
+    formats.save(done.motion, command.out)
+    if command.video is not None:
+        with show_progress("filming", quiet=command.quiet) as progress:
+            film([(to_canonical(done.motion)[0], None)], command.video, progress=progress)
+    if not command.quiet:
+        filled = int(done.lost.frames.sum())
+        print(
+            f"{command.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(command.clips)}"
+            f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame"
+        )
+        for note in (*done.notes, *done.gap_notes):
+            print(note)
+    return 0
+
+
+def _parse_gap(command: Chain) -> tuple[int, int]:
+    low, colon, high = command.gap.partition(":")
+    if not (colon and low.isdecimal() and high.isdecimal()):
+        raise RequestError(f"--gap is A:B, frames as in 50:100; got {command.gap!r}")
+    return int(low), int(high)

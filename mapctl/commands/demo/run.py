@@ -1,0 +1,48 @@
+"""`mapctl demo`: path following on the bundled prior, from nothing to a film."""
+
+from pathlib import Path
+
+import priors
+from mapctl import report
+from mapctl.commands.demo import Demo
+from mapctl.commands.shared import exit_status, inputs, options, outputs
+from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
+from mapctl.commands.shared.progress_bar import show_progress
+from scenes.cameras import CameraSettings
+from scenes.film import film
+
+CURVE, SPEED = "figure8:2", "1.2"
+_SIZE = (960, 540)
+
+
+def run(command: Demo) -> int:
+    """Walk, write, film, tell. Without OpenGL the film shows stick figures and says what is missing.
+
+    Ctrl-C ends the walk; what there is of it is written, without a film.
+    """
+    options.check_seed(command.seed)
+    outputs.check_folder(command.out)
+    outputs.require_render("av")
+    request = parse_follow(inputs.read_curve(CURVE, None), SPEED, None)
+    prior = priors.load(command.prior)
+    with show_progress("walking", quiet=command.quiet) as progress:
+        done = walk(prior, request, seed=command.seed, progress=progress)
+    with outputs.make_folder(command.out) as folder:
+        endings = ("bvh", "json") if done.interrupted else ("bvh", "json", "mp4", "png")
+        files = {ending: folder / f"figure8.{ending}" for ending in endings}
+        _write(command, done, files)
+    if not command.quiet:
+        print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
+    return exit_status.INTERRUPTED if done.interrupted else 0
+
+
+def _write(command: Demo, done: Walk, files: dict[str, Path]) -> None:
+    done.solution.motion.save(files["bvh"])
+    request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
+    report.write_report(done.report(request), files["json"])
+    films = [files[ending] for ending in ("mp4", "png") if ending in files]
+    if not films:
+        return
+    with show_progress("filming", quiet=command.quiet) as progress:
+        actors = [(done.solution.motion, done.request.curve)]
+        film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)

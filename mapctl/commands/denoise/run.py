@@ -1,0 +1,131 @@
+"""`mapctl denoise`: a noisy capture comes back clean, on its own rig."""
+
+import priors
+from controllers.denoising.causal import denoise_causal
+from controllers.denoising.denoise import DenoiseSettings, denoise
+from controllers.denoising.result import DenoiseResult
+from mapctl import formats, report
+from mapctl.commands.denoise import Denoise, folder
+from mapctl.commands.shared import exit_status, inputs, outputs, results
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.errors import RequestError
+from mapctl.recording.masks import load_masks
+from scenes.plots.denoising import plot
+
+_MAX_NAMED = 6
+_LOW_WEIGHT = 0.5  # of a density's weight
+_DEFAULT_DELAY = 0.2  # seconds
+
+
+def run(command: Denoise) -> int:
+    """Check everything, denoise, write, tell."""
+    if command.source.is_dir():
+        return folder.run(command, read_settings(command))
+    _check(command)
+    done = _run_denoising(command)
+    formats.save(done.motion, command.out)
+    if command.report is not None:
+        found = results.build_report("denoise", command, done.motion, done.summary())
+        report.write_report(found, command.report)
+    _draw_pictures(command, done)
+    if not command.quiet:
+        _tell(command, done)
+    lost = float(done.proposal_share.mean()) < 0.5 and done.noise.max() > 0
+    return exit_status.NOT_SATISFIED if command.strict and lost else 0
+
+
+def _check(command: Denoise) -> None:
+    for name, idle in (("cluster", command.cluster is None), ("again", not command.again), ("jobs", command.jobs == 1)):
+        if not idle:
+            raise RequestError(f"--{name} is for folders; {command.source} is a file")
+    results.check_destinations(command.out, command.video, command.report, command.plot, given=(command.source,))
+    outputs.check_plot(command.plot)
+
+
+def _run_denoising(command: Denoise) -> DenoiseResult:
+    settings, rig = read_settings(command), inputs.read_rig(command.rig)
+    told = () if command.mask is None else load_masks(command.mask)
+    densities = priors.load_choice(command.prior)
+    denoiser = priors.load_denoiser(command.denoiser)
+    motion, lost, _ = inputs.read_motion_with_gaps(command.source, rig)
+    masks = (*told, *lost)
+    with show_progress("denoising", quiet=command.quiet) as progress:
+        if command.causal:
+            delay = _DEFAULT_DELAY if command.delay is None else command.delay
+            return denoise_causal(
+                motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
+            )
+        return denoise(
+            motion, denoiser, masks=masks, settings=settings, densities=densities, rig=rig, progress=progress
+        )
+
+
+def read_settings(command: Denoise) -> DenoiseSettings:
+    """What is known of the capture; RequestError for numbers that make no sense."""
+    if command.causal and command.prior is not None:
+        raise RequestError("--causal has no time for a density; leave --prior out")
+    if command.delay is not None and not command.causal:
+        raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
+    return DenoiseSettings(sigma_deg=command.sigma_deg, sigma_cm=command.sigma_cm, anchor=command.anchor)
+
+
+def _draw_pictures(command: Denoise, done: DenoiseResult) -> None:
+    if command.plot is not None:
+        plot(done.capture, done.motion, command.plot, rig=done.rig)
+    results.film_comparison(done.capture, done.motion, command.video, rig=done.rig, quiet=command.quiet)
+
+
+def _tell(command: Denoise, done: DenoiseResult) -> None:
+    summary = done.summary()
+    moved = sum(summary["correction_cm"].values()) / len(summary["correction_cm"])
+    print(
+        f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
+        f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame"
+    )
+    for line in format_faults(done):
+        print(line)
+    for note in (*done.notes, *format_densities(done)):
+        print(note)
+
+
+def format_faults(done: DenoiseResult) -> list[str]:
+    """The faults in a few lines, a line a kind."""
+    kinds: dict[str, dict[str, list]] = {}
+    for fault in done.faults:
+        kinds.setdefault(fault.kind, {}).setdefault(fault.joint, []).append(fault)
+    lines = []
+    for kind, joints in kinds.items():
+        worst = sorted(joints, key=lambda name: -max(fault.amount for fault in joints[name]))
+        named = []
+        for name in worst[:_MAX_NAMED]:
+            found = joints[name]
+            top = max(found, key=lambda fault: fault.amount)
+            amount = f" {top.amount:.1f} {top.unit}" if top.unit else f" {sum(f.stop - f.start for f in found)} frames"
+            named.append(f"{name}{amount}" + (f" ({len(found)} times)" if len(found) > 1 else ""))
+        rest = len(worst) - len(named)
+        lines.append(f"{kind}: {', '.join(named)}" + (f" and {rest} more joints" if rest > 0 else ""))
+    return lines
+
+
+def format_densities(done: DenoiseResult) -> list[str]:
+    """Which densities counted, how likely the motion is under each, and where they were out of their depth."""
+    if not done.stretches:
+        return []
+    frames = {name: 0 for name in done.stretches[0].nats}
+    totals = dict.fromkeys(frames, 0.0)
+    for part in done.stretches:
+        frames[part.prior] += part.stop - part.start
+        for name, nats in part.nats.items():
+            totals[name] += nats * (part.stop - part.start)
+    whole = sum(frames.values())
+    told = ", ".join(f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames)
+    lines = [f"prior: {told} of {whole} frames"]
+    doubted = [part for part in done.stretches if part.weight < _LOW_WEIGHT]
+    if doubted:
+        places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MAX_NAMED])
+        rest = len(doubted) - _MAX_NAMED
+        lines.append(
+            f"prior out of its depth, so that it counts for less than half: frames {places}"
+            + (f" and {rest} more windows" if rest > 0 else "")
+        )
+    return lines

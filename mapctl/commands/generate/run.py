@@ -1,0 +1,84 @@
+"""`mapctl generate`: motion drawn from a prior, of any length."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+import priors
+from controllers.generation.foot_cleanup import FootCleanupSettings
+from controllers.generation.generate import GenerateSettings, sample_stratified_starts, stream
+from mapctl import formats
+from mapctl.commands.generate import Generate
+from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.shared.character import read_character
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.resumption import explain_progress
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.formats.bvh.stream import open_bvh_stream
+from mapctl.motion import Motion
+
+_MAX_CLIPS = 10_000
+
+
+def run(command: Generate) -> int:
+    """Check everything, then write clip after clip; clips that are finished stay if it is interrupted."""
+    frames, settings, clip = inputs.count_frames(command.seconds), *_check_settings(command)
+    prior = priors.load(command.prior)
+    if command.style not in (None, "none"):
+        prior = prior.conditioned_on([name.strip() for name in command.style.split(",")])
+    wanted = command.refiner != "auto" or (command.no_footing and not command.no_refine)
+    refiner = priors.refiner_of(command.prior, command.refiner) if wanted else None
+    person = read_character(command.rig)
+    if settings.foot_cleanup is not None:
+        footing = replace(settings.foot_cleanup.footing, rest_height=person.toe_rest_height)
+        settings = replace(settings, foot_cleanup=replace(settings.foot_cleanup, footing=footing))
+    draw = partial(stream, prior, seconds=command.seconds, start_clip=clip, refiner=refiner, skeleton=person.skeleton)
+    starts = sample_stratified_starts(prior, command.count, torch.Generator().manual_seed(command.seed))
+    with outputs.make_folder(command.out) as folder, explain_progress(command.count, "clips") as finished:
+        for number, seed in enumerate(_sample_seeds(command)):
+            own = settings if settings.start is not None else replace(settings, start=starts[number])
+            pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
+            _write(command, map(person.on_rig, pieces), folder / f"generated_{number:03d}.bvh", frames)
+            finished(number + 1)
+    return 0
+
+
+def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]:
+    options.check_seed(command.seed)
+    if not 1 <= command.count <= _MAX_CLIPS:
+        raise RequestError(f"the count must be 1 to {_MAX_CLIPS}, got {command.count}")
+    outputs.check_folder(command.out)
+    numbered = command.start is not None and command.start.lstrip("-").isdecimal()
+    if command.no_refine and command.refiner != "auto":
+        raise RequestError("--refiner and --no-refine exclude each other")
+    if command.no_refine and command.no_footing:
+        raise RequestError("--no-refine leaves out the footing pass as well; leave --no-footing out")
+    finishing = None if command.no_refine or command.no_footing else FootCleanupSettings()
+    start = int(command.start) if command.start and numbered else None
+    settings = GenerateSettings(command.temperature, start, command.style is None, finishing)
+    if command.start is None or numbered:
+        return settings, None
+    return settings, formats.load(command.start)
+
+
+def _sample_seeds(command: Generate) -> list[int]:
+    """One for each clip; the first clips are the same however many are asked for."""
+    draws = torch.Generator().manual_seed(command.seed)
+    return torch.randint(2**62, (command.count,), generator=draws).tolist()
+
+
+def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:
+    began = time.perf_counter()
+    with show_progress(path.name, quiet=command.quiet) as progress, open_bvh_stream(path, frames) as file:
+        for piece in pieces:
+            file.append(piece)
+            if progress is not None:
+                progress(file.written, frames)
+    if not command.quiet:
+        rate = frames / (time.perf_counter() - began)
+        print(f"{path}: {frames} frames, {frames / PRIOR_FPS:.1f} s, drawn at {rate:.0f} frames a second")

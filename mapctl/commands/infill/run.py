@@ -1,0 +1,77 @@
+"""`mapctl infill`: gaps and lost joints of a motion are filled in."""
+
+from collections.abc import Sequence
+
+import priors
+from controllers.inbetweening.infill import InfillResult, InfillSettings, infill
+from mapctl import formats, report
+from mapctl.commands.infill import Infill
+from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared.frame_syntax import parse_ranges
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.recording.gap_detection import find_gaps
+from mapctl.recording.masks import ALL, Mask
+from mapctl.retarget.rigs import Rig
+
+
+def run(command: Infill) -> int:
+    """Check everything, fill, write, tell."""
+    _check(command)
+    rig = inputs.read_rig(command.rig)
+    motion, marked, holed = inputs.read_motion_with_gaps(command.source, rig)
+    masks = (*marked, *_parse_masks(command, motion)) or (() if holed else find_gaps(motion))
+    done = _run_infilling(command, motion, masks, rig)
+    formats.save(done.motion, command.out)
+    if command.report is not None:
+        found = results.build_report("infill", command, done.motion, done.summary())
+        report.write_report(found, command.report)
+    results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
+    if not command.quiet:
+        _tell(command, done)
+    return 0
+
+
+def _check(command: Infill) -> None:
+    if command.curve is not None and command.method == "linear":
+        raise RequestError("--curve needs a network's steps; leave --method linear out")
+    results.check_method(command.method, prior=command.prior, infiller=command.infiller)
+    results.check_destinations(command.out, command.video, command.report, given=(command.source,))
+
+
+def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
+    """What is lost by the options; RequestError for what cannot be."""
+    if not command.gap and command.joints is None:
+        return ()
+    gaps = parse_ranges(command.gap, fps=float(motion.fps), frames=motion.num_frames) or [(0, motion.num_frames)]
+    names = [ALL] if command.joints is None else [name.strip() for name in command.joints.split(",")]
+    return [Mask(name, start, stop) for start, stop in gaps for name in names]
+
+
+def _run_infilling(command: Infill, motion: Motion, masks: Sequence[Mask], rig: Rig | None) -> InfillResult:
+    infiller = None if command.method == "linear" else priors.load_infiller(command.infiller or "infiller")
+    densities = priors.load_choice(command.prior)
+    rollout_densities = () if command.method != "map" else priors.load_choice(command.prior or "auto")
+    settings = InfillSettings(method=command.method)
+    course = None if command.curve is None else inputs.read_curve(command.curve, None)
+    return infill(
+        motion,
+        infiller,
+        masks,
+        settings=settings,
+        densities=densities,
+        rig=rig,
+        course=course,
+        rollout_densities=rollout_densities,
+    )
+
+
+def _tell(command: Infill, done: InfillResult) -> None:
+    summary = done.summary()
+    gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in summary["gaps"])
+    print(
+        f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
+        f" {summary['frame_ms']:.1f} ms a filled frame"
+    )
+    for note in (*done.notes, *done.gap_notes):
+        print(note)

@@ -1,0 +1,24 @@
+"""`mapctl info`: what is installed: priors and their cards, scenes, versions, rendering, threads; or what a clip is."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class Info(Command):
+    """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads; or a clip's rig."""
+
+    single_thread: ClassVar[bool] = False
+
+    name: Positional[Annotated[str | None, arg(metavar="NAME|CLIP")]] = None
+    """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip (.bvh, .npz), of which
+    rig, joints, unit, axes and length are told."""
+    rig: options.MaybeRig = None
+    """The clip's rig, where it is not the one that would be recognised."""
+    json: bool = False
+    """Print JSON instead of tables."""

@@ -1,0 +1,23 @@
+"""`mapctl live`: characters in the browser, steered as they go."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class Live(Command):
+    """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
+
+    port: Annotated[int, arg(metavar="P")] = 8080
+    """Where the page is served, on 127.0.0.1 only; the next free port if this one is taken."""
+    characters: options.Count = 1
+    """How many, side by side; each computes on a core of its own as long as there are cores."""
+    prior: options.Name = "locomotion-live"
+    """A bundled prior, or the file or run folder of a trained one."""
+    seed: options.Count = 0
+    """Of the poses that they begin with."""

@@ -1,0 +1,80 @@
+"""`mapctl live`: characters in the browser, steered as they go."""
+
+import functools
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import priors
+from controllers.steering.process import CharacterProcess, CharacterRequest
+from mapctl.commands.live import Live
+from mapctl.commands.shared import options
+from mapctl.errors import RequestError
+from mapctl.intent.steering import Command
+from mapctl.runtime.processes import reraise_ctrl_c
+from scenes.live.app import LiveApp
+from scenes.live.inputs import SteeringInputs
+
+_MAX_CHARACTERS = 16
+_START_SPACING = 1.5  # metres between characters where they begin
+
+
+def run(command: Live) -> int:
+    """Check, open, serve until Ctrl-C."""
+    _check(command)
+    with reraise_ctrl_c():
+        show = _open_app(command)
+    try:
+        if not show.url.endswith(f":{command.port}"):
+            print(f"port {command.port} is in use")
+        print(f"open {show.url} in a browser; Ctrl-C ends", flush=True)
+        show.run()
+    except KeyboardInterrupt:
+        print()
+        for path in show.save_recordings(Path.cwd()):
+            print(f"the recording that was going on is in {path.name}")
+    finally:
+        show.close()
+    return 0
+
+
+def _open_app(command: Live) -> LiveApp:
+    prior = priors.load(command.prior)
+    orders = [SteeringInputs() for _ in range(command.characters)]
+    with reraise_ctrl_c():
+        characters = _start_characters(command)
+    try:
+        return LiveApp(
+            characters, orders, port=command.port, fastest=prior.limits.max_steering_speed, labels=prior.labels
+        )
+    except BaseException:
+        for character in characters:
+            character.close()
+        raise
+
+
+def _check(command: Live) -> None:
+    options.check_seed(command.seed)
+    if not 1 <= command.port <= 65535:
+        raise RequestError(f"the port must be a number from 1 to 65535, got {command.port}")
+    if not 1 <= command.characters <= _MAX_CHARACTERS:
+        raise RequestError(f"--characters must be 1 to {_MAX_CHARACTERS}, got {command.characters}")
+    for package in ("viser", "trimesh"):
+        if find_spec(package) is None:
+            raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
+
+
+def _start_characters(command: Live) -> Sequence[CharacterProcess]:
+    load = functools.partial(priors.load, command.prior)
+    places = [(_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)]
+    found: list[CharacterProcess] = []
+    try:
+        for number, at in enumerate(places):
+            found.append(CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), command.seed + number, at)))
+        for character in found:
+            character.wait()
+    except BaseException:
+        for character in found:
+            character.close()
+        raise
+    return found

@@ -1,0 +1,37 @@
+"""`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class Measure(Command):
+    """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
+
+    All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
+    a folder the means over its clips; beside a folder of mocap also whether the two can be told apart. Clips of a
+    folder that cannot be measured are left out and listed.
+    """
+
+    clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
+    """.bvh, .npz or .amc; or a folder, every one of them below it."""
+    reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
+    """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
+    curve: options.MaybeCurve = None
+    """What it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
+    speed: options.MaybeNumber = None
+    """Speed it was asked for, m/s: adds the progress along the curve."""
+    metres_per_unit: options.MaybeNumber = None
+    """Scale of a CSV or SVG file."""
+    prior: options.Name = "locomotion"
+    """Whose card has mocap's values."""
+    seed: options.Count = 0
+    """Of the network that tells two folders apart."""
+    json: bool = False
+    """Print JSON instead of a table."""

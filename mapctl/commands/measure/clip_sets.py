@@ -1,0 +1,150 @@
+"""Folders of clips as sets to compare: read whole, with the files named that will not do."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mapctl import formats, metrics
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.errors import MapctlError, RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.metrics import realism
+from mapctl.metrics.comparison import make_comparable
+from mapctl.metrics.realism.diversity import align_to_start, measure_position_diversity
+from mapctl.metrics.realism.gait import PIECE_SECONDS
+from mapctl.motion import Motion
+
+SETTINGS = realism.RealismSettings()
+"""How folders are told apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class _MeasuredClip:
+    """One file of a folder."""
+
+    motion: Motion
+    """Comparable."""
+    measures: dict[str, float]
+    """By name."""
+    positions: Tensor
+    """Canonical joints, (frames, joints, 3); nothing unless read with windows."""
+    windows: Tensor
+    """(windows, frames, channels); likewise."""
+    notes: list[str]
+    """What could not be made comparable."""
+
+    @staticmethod
+    def read(path: Path, *, with_windows: bool) -> "_MeasuredClip":
+        """MapctlError for what cannot be read, measured or cut."""
+        motion, notes = make_comparable(formats.load(path))
+        measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
+        if with_windows:
+            positions = realism.canonical_positions(motion)
+            windows = realism.cut_windows(positions, SETTINGS.windows)
+        return _MeasuredClip(motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
+
+
+@dataclass(frozen=True, eq=False)
+class ClipSet:
+    """Every clip below a folder, in the order of their paths."""
+
+    folder: Path
+    """Where they lie."""
+    motions: list[Motion]
+    """On canonical joints and at 30 frames a second at most, so that sets on different rigs compare (see
+    `metrics.comparing`)."""
+    means: dict[str, float]
+    """Mean of each measure over the clips that can give it."""
+    positions: list[Tensor]
+    """Canonical joints of each clip, (frames, joints, 3); none unless read with windows."""
+    windows: list[Tensor]
+    """Windows of each clip, (windows, frames, channels); none unless read with windows."""
+    skipped: dict[str, str]
+    """Files that were left out, and why, each a sentence that begins with the file."""
+    notes: tuple[str, ...] = ()
+    """What could not be made comparable, each a sentence."""
+
+    @staticmethod
+    def read(folder: Path, *, with_windows: bool) -> "ClipSet":
+        """Read and measure. A file that cannot be read, measured or cut into windows is left out; RequestError if none
+        can."""
+        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
+        if not paths:
+            raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
+        clips: list[_MeasuredClip] = []
+        skipped: dict[str, str] = {}
+        with show_progress(f"reading {folder}") as progress:
+            for number, path in enumerate(paths, start=1):
+                try:
+                    clips.append(_MeasuredClip.read(path, with_windows=with_windows))
+                except MapctlError as error:
+                    skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+                if progress is not None:
+                    progress(number, len(paths))
+        if not clips:
+            raise RequestError(f"{folder}: no clip can be measured; {next(iter(skipped.values()))}")
+        positions, windows = [c.positions for c in clips if with_windows], [c.windows for c in clips if with_windows]
+        return ClipSet(
+            folder,
+            [clip.motion for clip in clips],
+            _average_measures([clip.measures for clip in clips]),
+            positions,
+            windows,
+            skipped,
+            tuple(note for clip in clips for note in clip.notes),
+        )
+
+    def diversity(self) -> realism.Diversity:
+        """Of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
+
+        Each clip is seen from its own start, so that sets which did not begin in one place can be compared.
+        """
+        frames = round(PIECE_SECONDS * PRIOR_FPS)
+        pieces = [align_to_start(clip)[:frames] for clip in self.positions if len(clip) >= frames]
+        if len(pieces) < 2:
+            return realism.Diversity(math.nan, math.nan)
+        return measure_position_diversity(torch.stack(pieces))
+
+
+def compare_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Realism:
+    """Ours against the reference; RequestError, which says what is left to do, for too few clips."""
+    fewest = SETTINGS.min_clips
+    for clips in (ours, reference):
+        if len(clips.motions) < fewest:
+            raise RequestError(
+                f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in "
+                f"each folder{_describe_skipped(clips)} (without --reference a folder of any size is "
+                "measured)"
+            )
+    draws = torch.Generator().manual_seed(seed)
+    with show_progress("telling apart") as progress:
+        return realism.measure_window_realism(
+            ours.windows, reference.windows, generator=draws, settings=SETTINGS, progress=progress
+        )
+
+
+def compare_variability(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, float]]:
+    """By measure ours, the reference's and their ratio: standard deviations of gait, average pairwise distances."""
+    sides = []
+    for clips in (ours, reference):
+        gait = {f"std_of_{name}": spread.std for name, spread in realism.measure_gait_spread(clips.motions).items()}
+        apart = clips.diversity()
+        sides.append(gait | {f"pairwise_distance_{name}": value for name, value in apart._asdict().items()})
+    mine, theirs = sides
+    return {
+        name: {"ours": value, "reference": theirs[name], "ratio": value / theirs[name] if theirs[name] else math.nan}
+        for name, value in mine.items()
+    }
+
+
+def _describe_skipped(clips: ClipSet) -> str:
+    first = next(iter(clips.skipped.values()), None)
+    return "" if first is None else f", and {len(clips.skipped)} cannot be measured: {first}"
+
+
+def _average_measures(rows: list[dict[str, float]]) -> dict[str, float]:
+    """NaN, a clip that cannot give a measure, is left out."""
+    return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in rows[0]}

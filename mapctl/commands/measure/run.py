@@ -1,0 +1,146 @@
+"""`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mapctl import formats, metrics, report
+from mapctl.commands.measure import Measure
+from mapctl.commands.measure.clip_sets import ClipSet, compare_realism, compare_variability
+from mapctl.commands.shared import inputs, options
+from mapctl.commands.shared.tables import format_cell, print_table
+from mapctl.curves.curve import Curve
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.metrics.comparison import make_comparable
+from mapctl.motion import Motion
+from priors import checkpoints
+
+_MAX_LINES = 12  # of notes and clips that are left out
+
+
+def run(command: Measure) -> int:
+    """Measure and print."""
+    folders = [path.is_dir() for path in options.collect_paths(command.clip, command.reference)]
+    if any(folders):
+        _check_folders(command, all(folders))
+    values = _measure_folders(command) if any(folders) else _measure_clips(command)
+    if command.json:
+        print(report.to_json(values), end="")
+    else:
+        _print_tables(values)
+    return 0
+
+
+def _measure_clips(command: Measure) -> dict[str, Any]:
+    curve = _read_curve(command)
+    clip, notes = _load_comparable(command.clip)
+    ours = metrics.measure(clip, curve, speed=command.speed)
+    reference = {}
+    if command.reference is not None:
+        other, more = _load_comparable(command.reference)
+        reference, notes = metrics.measure(other), notes + more
+    return {
+        "clip": str(command.clip),
+        "measures": ours,
+        "reference": reference,
+        "mocap": _read_mocap_values(command.prior),
+        "notes": notes,
+    }
+
+
+def _read_curve(command: Measure) -> Curve | None:
+    if command.speed is not None and not 0 < command.speed < float("inf"):
+        raise RequestError(f"speed must be positive, got {command.speed:g} m/s")
+    if command.curve is None and (command.speed is not None or command.metres_per_unit is not None):
+        raise RequestError("--speed and --metres-per-unit are about a curve; name it with --curve")
+    return None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
+
+
+def _check_folders(command: Measure, alike: bool) -> None:
+    options.check_seed(command.seed)
+    if not alike:
+        raise RequestError(f"{command.clip} and {command.reference}: a folder and a clip; name two of one kind")
+    if any(option is not None for option in (command.curve, command.speed, command.metres_per_unit)):
+        raise RequestError(f"{command.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
+
+
+def _measure_folders(command: Measure) -> dict[str, Any]:
+    compared = command.reference is not None
+    ours = ClipSet.read(command.clip, with_windows=compared)
+    reference = ClipSet.read(command.reference, with_windows=True) if command.reference is not None else None
+    values = {
+        "clip": str(command.clip),
+        "clips": len(ours.motions),
+        "measures": ours.means,
+        "reference": {} if reference is None else reference.means,
+        "mocap": _read_mocap_values(command.prior),
+        "notes": ours.notes + (() if reference is None else reference.notes),
+        "skipped": ours.skipped | ({} if reference is None else reference.skipped),
+    }
+    return values if reference is None else values | _compare_folders(command, ours, reference)
+
+
+def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
+    realism = compare_realism(ours, reference, seed=command.seed)
+    return {
+        "reference_clips": len(reference.motions),
+        "realism": asdict(realism),
+        "spread": compare_variability(ours, reference),
+    }
+
+
+def _print_tables(values: Mapping[str, Any]) -> None:
+    """What there is of measures, realism and spread, each as a table."""
+    reference, mocap = values["reference"], values["mocap"]
+    rows = [
+        [name, value, reference.get(name), _format_range(mocap.get(name))] for name, value in values["measures"].items()
+    ]
+    title = None if "clips" not in values else f"means over {values['clips']} clips"
+    if "reference_clips" in values:
+        title = f"{title}, and over {values['reference_clips']} of the reference"
+    print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows, title=title)
+    if "realism" in values:
+        _print_realism(values["realism"])
+        rows = [[name, *row.values()] for name, row in values["spread"].items()]
+        print_table(
+            ["spread", "ours", "reference", "ratio"], rows, title="how widely the clips spread (in pieces of 3 s)"
+        )
+    for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
+        print(line)
+
+
+def _shorten(lines: Sequence[str]) -> list[str]:
+    """The first of them, and how many more there are."""
+    more = len(lines) - _MAX_LINES
+    return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
+
+
+def _load_comparable(path: Path) -> tuple[Motion, list[str]]:
+    """A clip as mocap's values were measured, and what could not be made so."""
+    motion, notes = make_comparable(formats.load(path))
+    return motion, [f"{path}: {note}" for note in notes]
+
+
+def _print_realism(realism: Mapping[str, Any]) -> None:
+    counts = f"{realism['made_windows']} and {realism['mocap_windows']} windows of one second"
+    rows = [
+        ["told apart, %", *(100 * realism[name] for name in ("accuracy", "floor_accuracy"))],
+        ["Frechet distance", realism["frechet"], realism["floor_frechet"]],
+    ]
+    columns = ["realism", "ours against the reference", "halves of the reference (floor)"]
+    print_table(columns, rows, title=f"{counts}; 50 % cannot be told apart")
+
+
+def _read_mocap_values(prior: str) -> Mapping[str, Any]:
+    """Mocap's values from the prior's card; none where the prior is not there."""
+    try:
+        return report.reference_measures(checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality)
+    except CheckpointError:
+        return {}
+
+
+def _format_range(values: Mapping[str, float] | None) -> str | None:
+    if values is None:
+        return None
+    return f"{format_cell(values['mean'])} ({format_cell(values['p2'])} to {format_cell(values['p98'])})"

@@ -1,0 +1,31 @@
+"""`mapctl render`: a film of a motion."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class Render(Command):
+    """Film a motion: MP4, GIF, or a PNG contact sheet. Files of known rigs that have Z up are put upright."""
+
+    single_thread: ClassVar[bool] = False
+
+    source: options.InFile
+    """.bvh, .npz, or .amc with its .asf beside it."""
+    out: options.OutFile
+    """.mp4, .gif or .png."""
+    curve: options.MaybeCurve = None
+    """Drawn on the ground: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
+    camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
+    """Goes along, stands so that all is seen, or looks from above."""
+    size: options.Size = "1280x720"
+    """Width and height in pixels."""
+    metres_per_unit: options.MaybeNumber = None
+    """Scale of a CSV or SVG file."""
+    quiet: bool = False
+    """No line on what was written and no progress bar."""

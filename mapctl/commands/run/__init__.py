@@ -1,0 +1,25 @@
+"""`mapctl run`: a scripted scene."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class RunScene(Command):
+    """A scripted scene of several actors, from a TOML file or a ready one by name."""
+
+    scene: Positional[Annotated[str, arg(metavar="SCENE.toml")]]
+    """The scene file, or the name of a scene that comes with mapctl (`mapctl info` lists them)."""
+    out: options.OutFolder = Path()
+    """Folder for the scene's outputs; made if it is not there."""
+    rig: options.OutRig = "canonical"
+    """Whose body the actors have: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
+    quiet: bool = False
+    """No summary and no progress bar."""

@@ -1,0 +1,146 @@
+"""`mapctl steer`: a script of commands is replayed, as live steering would answer it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import priors
+from controllers.steering import steer
+from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
+from mapctl import formats, metrics, report
+from mapctl.commands.shared import exit_status, inputs, options, outputs
+from mapctl.commands.shared.character import OutputCharacter, read_character
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.steer import Steer
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.steering import CommandTrack, SteeringLimits
+from mapctl.intent.steering_csv import read_commands
+from mapctl.metrics.travel import measure_commands
+from mapctl.motion import Motion
+from mapctl.terms import FootContact
+from priors.lstm_gmm.density import LstmGmmDensity
+from scenes.plots.steering import plot
+
+_LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
+
+
+def run(command: Steer) -> int:
+    """Check everything, steer, write, tell. Ctrl-C ends the script early; what was steered is written."""
+    _check(command)
+    track = read_commands(command.commands)
+    person, prior = read_character(command.rig), priors.load(command.prior)
+    track, lowered = track.limit_speed(prior.limits.max_steering_speed)
+    for labels in {wanted.told for wanted in track.commands if wanted.told}:
+        prior.conditioned_on(labels)  # what it does not know is said now
+    recorder, records, frames = _run_steering(command, prior, track, person)
+    motion = recorder.motion(frames)
+    person.on_rig(motion).save(command.out)
+    found = _build_report(command, motion, recorder, records, track, lowered, prior)
+    if command.report is not None:
+        report.write_report(found, command.report)
+    if command.plot is not None:
+        plot(motion, track, command.plot)
+    if not command.quiet:
+        print("\n".join(_format_summary(found, options.collect_paths(command.out, command.report, command.plot))))
+    if motion.num_frames < frames:
+        return exit_status.INTERRUPTED
+    return exit_status.NOT_SATISFIED if command.strict and (lowered or found["timing"]["late_frames"]) else 0
+
+
+def _check(command: Steer) -> None:
+    options.check_seed(command.seed)
+    _limits(command)
+    formats.check_ending(command.out)
+    outputs.check_files(options.collect_paths(command.out, command.report, command.plot))
+    outputs.check_plot(command.plot)
+
+
+def _limits(command: Steer) -> SteeringLimits:
+    return SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
+
+
+def _run_steering(
+    command: Steer, prior: LstmGmmDensity, track: CommandTrack, person: OutputCharacter
+) -> tuple[Recorder, list[StepRecord], int]:
+    first, recorder = track.commands[0], Recorder()
+    frames = inputs.count_frames(track.times[-1] + (_LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0))
+    footing = FootContact(rest_height=person.toe_rest_height)
+    settings = steer.SteerSettings(limits=_limits(command), footing=footing)
+    generator = torch.Generator().manual_seed(command.seed)
+    state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=person.skeleton)
+    recorder.show(pose, 0.0)
+    for wanted in (first, *{wanted.told: wanted for wanted in track.commands}.values()):
+        steer.step(state, wanted)  # what is compiled, loaded or told on first use must not cost frames
+    clock = WallClock() if command.realtime else StreamClock()
+    with show_progress("steering", quiet=command.quiet) as progress:
+        displays = [recorder] if progress is None else [recorder, _ProgressDisplay(progress, frames)]
+        _, records = drive(state, track, displays, frames=frames, clock=clock)
+    return recorder, records, frames
+
+
+def _build_report(
+    command: Steer,
+    motion: Motion,
+    recorder: Recorder,
+    records: Sequence[StepRecord],
+    track: CommandTrack,
+    lowered: Sequence[str],
+    prior: LstmGmmDensity,
+) -> dict[str, Any]:
+    cost = summarise_step_timing(records, [time for time in track.times[1:] if time < motion.seconds])
+    return {
+        "request": options.describe_request("steer", command),
+        "seed": command.seed,
+        "versions": report.package_versions(),
+        "prior": {"name": prior.name, "licence": prior.card.licence},
+        "motion": report.summarise_motion(motion),
+        "status": {"text": "; ".join(lowered) or "done", "ok": not lowered, "notes": list(lowered)},
+        "commands": measure_commands(motion, track),
+        "ledger": recorder.ledger.summary(),
+        "measures": metrics.measure(motion),
+        "mocap": report.reference_measures(prior.card.quality),
+        "timing": cost | {"peak_memory_mb": report.peak_memory_mb()},
+    }
+
+
+@dataclass(frozen=True)
+class _ProgressDisplay:
+    """A Display that moves a progress bar."""
+
+    progress: Any
+    frames: int
+
+    def show(self, frames: Any, due: float) -> None:
+        self.progress(min(self.frames, round(due * PRIOR_FPS) + frames.motion.num_frames), self.frames)
+
+
+def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
+    lines = []
+    for row in found["commands"][:-1]:
+        reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
+        steady = "" if row["steady_speed_mps"] is None else f", then {row['steady_speed_mps']:.2f} m/s"
+        off, rate = row["steady_heading_error_deg"], row["steady_turn_deg_s"]
+        turned = "" if off is None else f", {off:+.1f} degrees off"
+        turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
+        turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
+        way = (
+            f"to {row['heading_deg']:.0f} degrees"
+            if row["turn_deg_s"] is None
+            else (f"turning {row['turn_deg_s']:.0f} degrees/s")
+        )
+        asked = f"{row['speed_mps']:.2f} m/s {way}"
+        lines.append(f"{row['time_s']:6.1f} s  {asked}: {reached}{steady}{turned}")
+    cost, latency = found["timing"], found["timing"]["command_latency_s"]
+    waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
+    slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""
+    return [
+        *lines,
+        f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+        f"{cost['late_frames']} late, {cost['evaluations_per_frame']:.1f} evaluations a frame{waited}{slow}",
+        f"status    {found['status']['text']}",
+        f"wrote     {', '.join(map(str, files))}",
+    ]

@@ -1,0 +1,56 @@
+"""`mapctl tween`: a few keys to a whole motion."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import Command
+
+
+@dataclass(frozen=True)
+class Tween(Command):
+    """Frames of a clip are keys, or poses that a file puts in time and place, and the motion between them is made anew.
+    On any known rig."""
+
+    source: options.InFile
+    """A motion file; or a TOML file of [[key]] tables: a frame or seconds, a pose (a motion file and a pose_frame of
+    it), a place = [x, z], height and facing_deg of the hips, and joints, reach or root_only where not all of it counts
+    (docs/infilling.md)."""
+    out: options.OutFile
+    """Where the motion goes: as long as IN, or until the last key."""
+    keyframes: Annotated[str | None, arg(metavar="F,F,...")] = None
+    """Of a motion file, frames that stay, or seconds as in 1.5s; the first and the last one are whole poses."""
+    joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    """Keys between the first and the last only tell where these hands or feet are: canonical names or the rig's own."""
+    root_only: bool = False
+    """Keys between the first and the last only tell where the hips are and which way they face."""
+    suggest_timing: bool = False
+    """Tell how many frames the way from each whole pose to the next takes in mocap, beside what is given; the motion
+    keeps the given timing."""
+    method: Annotated[Literal["map", "infiller", "slerp"], arg(metavar="map|infiller|slerp")] = "map"
+    """map: the infiller proposes, or a density is rolled between keys so far apart that the infiller would slide, and
+    the MAP stage finishes; a note tells for every gap who proposed. infiller: its proposal on rigid bones. slerp: none
+    of it."""
+    rig: options.MaybeRig = None
+    """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
+    infiller: options.MaybeName = None
+    """The file or run folder of a trained infiller; the bundled one if not given."""
+    prior: options.MaybeName = None
+    """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
+    window, the bundled one under which the motion is likelier."""
+    variations: options.Count = 1
+    """How many different motions to make, as OUT_000.bvh, OUT_001.bvh, ...: the first is what one would be, in the
+    others densities (--prior, or auto) are drawn from and steered from key to key."""
+    best_of: options.Count = 1
+    """Of so many answers the one with the least energy is kept: from the infiller's proposal, slerp's, and rollouts of
+    densities (--prior, or auto) that are steered from key to key."""
+    seed: options.Count = 0
+    """Of everything that is drawn; the first variations are the same however many are asked for."""
+    report: options.MaybeFile = None
+    """JSON with the keys, what is missed at them, contacts, ledger, measures, compute and suggested timing."""
+    video: options.MaybeFile = None
+    """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
+    quiet: bool = False
+    """No summary and no progress bar."""

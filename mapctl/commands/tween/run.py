@@ -1,0 +1,135 @@
+"""`mapctl tween`: a few keys to a whole motion."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import priors
+from controllers.inbetweening.keyframe_poses import KeyframeClip, build_keyframe_clip
+from controllers.inbetweening.keyframe_timing import KeyInterval, suggest_intervals
+from controllers.inbetweening.keyframes import check_effectors
+from controllers.inbetweening.pipeline import InfillResult, InfillSettings
+from controllers.inbetweening.tween import measure_keyframe_errors, tween
+from mapctl import formats, report
+from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared.frame_syntax import parse_frame
+from mapctl.commands.shared.tables import print_table
+from mapctl.commands.tween import Tween, variations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.intent.keyframe_toml import KeyRequest, read_keys
+from mapctl.intent.keyframes import Keys
+from mapctl.retarget.rigs import Rig
+
+
+def run(command: Tween) -> int:
+    """Check everything, make, write, tell."""
+    request = _read_key_request(command)
+    _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
+    asked = _read_keyframe_clip(command, request)
+    if command.variations > 1:
+        variations.run_variations(command, asked)
+        return 0
+    intervals = _suggest_timing(command, asked)
+    done = _run_tweening(command, asked)
+    formats.save(done.motion, command.out)
+    if command.report is not None:
+        report.write_report(_build_report(command, done, asked, intervals), command.report)
+    results.film_comparison(asked.motion, done.motion, command.video, rig=asked.rig, quiet=command.quiet)
+    if not command.quiet:
+        _tell(command, done, asked, intervals)
+    return 0
+
+
+def _tell(command: Tween, done: InfillResult, asked: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:
+    ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
+    print(f"{command.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
+    for note in (*done.notes, *done.gap_notes):
+        print(note)
+    if intervals:
+        rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
+        print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
+
+
+def _suggest_timing(command: Tween, asked: KeyframeClip) -> list[KeyInterval]:
+    return suggest_intervals(asked.motion, asked.keys, asked.rig) if command.suggest_timing else []
+
+
+def _is_key_file(command: Tween) -> bool:
+    """Whether the keys are those of a TOML file."""
+    return command.source.suffix.lower() == ".toml"
+
+
+def _read_key_request(command: Tween) -> KeyRequest | None:
+    return read_keys(command.source) if _is_key_file(command) else None
+
+
+def _check(command: Tween, given: Sequence[Path]) -> None:
+    """Of the options; files that are given are read, and so not written."""
+    if command.joints is not None and command.root_only:
+        raise RequestError("--joints and --root-only are two kinds of keys; choose one")
+    idle = [
+        name
+        for name, value in (
+            ("--keyframes", command.keyframes),
+            ("--joints", command.joints),
+            ("--root-only", command.root_only or None),
+        )
+        if value is not None
+    ]
+    if _is_key_file(command) and idle:
+        raise RequestError(f"{idle[0]} is for motion files; {command.source} says itself what its keys are")
+    if not _is_key_file(command) and command.keyframes is None:
+        raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
+    variations.check_answers(command, given)
+    # Variations are rolled by a density whatever the method.
+    prior = command.prior if command.variations == command.best_of == 1 else None
+    results.check_method(command.method, prior=prior, infiller=command.infiller)
+
+
+def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:
+    """The motion that holds the keys, these, and its rig where it is known."""
+    rig = inputs.read_rig(command.rig)
+    if request is not None:
+        return _load_key_file(command, request, rig)
+    motion = inputs.read_motion(command.source, rig)
+    frames = [parse_frame(word, fps=float(motion.fps)) for word in (command.keyframes or "").split(",")]
+    if len(set(frames)) == 2 and (command.root_only or command.joints is not None):
+        name = "--root-only" if command.root_only else "--joints"
+        raise RequestError(f"{name} is about keys between the first and the last, and --keyframes has none there")
+    limbs = () if command.joints is None else tuple(name.strip() for name in command.joints.split(","))
+    if limbs:  # also where there is no key between the first and the last
+        check_effectors(limbs, motion, rig)
+    return KeyframeClip(motion, Keys.of(frames, limbs=limbs, root_only=command.root_only), rig)
+
+
+def _load_key_file(command: Tween, request: KeyRequest, rig: Rig | None) -> KeyframeClip:
+    try:
+        return build_keyframe_clip(request, rig)
+    except RequestError as error:
+        raise FileFormatError(command.source, str(error)) from error
+
+
+def _run_tweening(command: Tween, asked: KeyframeClip) -> InfillResult:
+    method = "linear" if command.method == "slerp" else command.method
+    infiller = None if method == "linear" else priors.load_infiller(command.infiller or "infiller")
+    densities = priors.load_choice(command.prior)
+    settings = InfillSettings(method=method)
+    if command.best_of > 1 and infiller is not None:
+        return variations.tween_lowest_energy(command, asked, infiller, settings)
+    rollout_densities = () if method != "map" else priors.load_choice(command.prior or "auto")
+    return tween(
+        asked.motion,
+        asked.keys,
+        infiller,
+        settings=settings,
+        densities=densities,
+        rig=asked.rig,
+        rollout_densities=rollout_densities,
+    )
+
+
+def _build_report(
+    command: Tween, done: InfillResult, asked: KeyframeClip, intervals: Sequence[KeyInterval]
+) -> dict[str, object]:
+    missed = measure_keyframe_errors(done.motion, asked.motion, asked.keys, asked.rig)
+    timing = {"timing": [interval.summary() for interval in intervals]} if command.suggest_timing else {}
+    return results.build_report("tween", command, done.motion, {"keys": missed, **timing, **done.summary()})

@@ -1,0 +1,75 @@
+"""`mapctl bench`: a sub-command a table, each with its own options; and every command's work is found."""
+
+import json
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from helpers import run
+
+from controllers.benchmarks.solver import SpeedBenchmarkSettings, benchmark_speed
+from mapctl import cli
+from mapctl.commands import COMMANDS, bench
+from mapctl.commands.shared.command import Command
+
+
+@pytest.mark.parametrize("words", [[], ["--json"], ["--prior", "general"], ["speed", "--json"]], ids=" ".join)
+def test_speed_is_meant_where_no_table_is_named(words):
+    found = cli.parse(["bench", *words])
+    assert isinstance(found, bench.Speed)
+    assert found.json is ("--json" in words)
+    assert found.prior == ("general" if "general" in words else "locomotion")
+
+
+def test_tables_have_options_of_their_own():
+    found = cli.parse(["bench", "denoise", "--data", "mocap", "--count", "10", "--prior", "auto"])
+    assert found == bench.Denoise(data=Path("mocap"), count=10, prior="auto")
+    assert cli.parse(["bench", "live", "--minutes", "2"]) == bench.Live(minutes=2.0)
+    assert cli.parse(["bench", "gaps", "--data", "mocap"]) == bench.Gaps(data=Path("mocap"))
+
+
+@pytest.mark.parametrize("name", bench.TABLES)
+def test_every_table_has_help(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("bench", name, "--help")
+    assert stop.value.code == 0
+    assert f"mapctl bench {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["speed", "--count", "3"], "--count 3 (see mapctl bench speed --help)"),
+        (["infill"], "--data"),
+        (["infill"], "mapctl bench infill --help"),
+        (["fly"], "speed, ablation, free-run"),
+        (["fly"], "(see mapctl bench --help)"),
+        (["infill", "--data", "."], "does not hold the clips kept from training"),
+        (["live", "--minutes", "0"], "--minutes must be more than 0"),
+        (["live", "--characters", "1,two"], "--characters must be numbers from 1 to 64"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_impossible_tables(fails, words, said):
+    assert said in fails("bench", *words)
+
+
+def test_speed_is_measured(prior, monkeypatch, capsys):
+    short = SpeedBenchmarkSettings(repeats=1, particles=(1,), lengths=(1.0,))
+    monkeypatch.setattr("mapctl.commands.bench.speed.benchmark_speed", partial(benchmark_speed, settings=short))
+    assert run("bench", "--prior", prior, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["bench"] == "speed"
+    assert [row["what"] for row in told["rows"]] == [
+        "energy and gradient, 34 frames, 1 candidates",
+        "follow a circle for 1 s",
+    ]
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in (*COMMANDS.values(), *bench.TABLES.values()) if issubclass(kind, Command)]
+)
+def test_work_is_found(kind):
+    if kind is not bench.Bench:  # which only has sub-commands
+        assert callable(import_module(kind.work or f"{kind.__module__}.run").run)
