@@ -18,7 +18,7 @@ class ContactSettings:
     reach: float = 0.025
     """A planted toe is within this height over its floor, metres."""
     slow: float = 0.35
-    """And slower than this over the ground, m/s."""
+    """A planted toe is slower than this over the ground, m/s."""
     floor_percentile: float = 5.0
     """The floor is this percentile of the toe's own height in the clip."""
     shortest: float = 0.1
@@ -32,10 +32,10 @@ def detect_contacts(
     fps: float | Fraction,
     settings: ContactSettings = ContactSettings(),
 ) -> Bool[Tensor, "frames feet"]:
-    """Whether each toe stands on its floor in each frame; positions in metres, Y up.
+    """Detect whether each toe stands on its floor in each frame; positions in metres, Y up.
 
-    A frame's speed is that of the way to it. The first frames, which have no such way, count as planted where
-    they are low and the first frame with one is planted. RequestError for no frames or no frame rate.
+    A frame's speed is that from the frame before. The first frames, which have none, count as planted where they are
+    low and the first frame with a speed is planted. RequestError for no frames or no frame rate.
     """
     toes, fps = torch.as_tensor(toe_positions), float(fps)
     if len(toes) == 0 or not fps > 0:
@@ -50,12 +50,12 @@ def detect_contacts(
 def estimate_floor_heights(
     toe_positions: Float[Tensor, "frames feet 3"], settings: ContactSettings = ContactSettings()
 ) -> Float[Tensor, "feet"]:
-    """Height of the floor under each toe joint, metres: a low percentile of the toe's own height."""
+    """Estimate the floor height under each toe joint, metres: a low percentile of the toe's own height."""
     return torch.quantile(toe_positions[..., 1], settings.floor_percentile / 100, dim=0)
 
 
 def remove_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
-    """Runs of true shorter than `shortest` frames become false: a morphological opening."""
+    """Remove runs of true shorter than `shortest` frames: a morphological opening."""
     if len(stands) < shortest:
         return torch.zeros_like(stands)
     whole = stands.T.unfold(-1, shortest, 1).all(dim=-1)  # windows that are true throughout
@@ -66,17 +66,16 @@ def remove_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Boo
 def support_speed(
     heights: Float[Tensor, "*batch feet"], speeds: Float[Tensor, "*batch feet"], near: float = 0.05
 ) -> Float[Tensor, "*batch"]:
-    """Speed over the ground, m/s, of the slowest of the toes less than `near` metres over their rest height: of what
-    the body stands on; 0 where none is near, in flight.
-    """
+    """Return the speed over the ground, m/s, of the slowest of the toes less than `near` metres over their rest height:
+    of what the body stands on; 0 where none is near, in flight."""
     close = heights < near
     return torch.where(close.any(dim=-1), torch.where(close, speeds, torch.inf).amin(dim=-1), 0.0)
 
 
 MIN_CONTACT_FRAMES = 3
-"""Frames at the prior's rate that a contact, or a gap in one, lasts at least: `ContactSettings.shortest`."""
+"""Least duration of a contact, or of a gap in one, frames at the prior's rate: `ContactSettings.shortest`."""
 
 
 def debounced(stands: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
-    """Contacts at the prior's rate without gaps, and then without contacts, of less than STEADY frames."""
+    """Close gaps in contacts at the prior's rate, then remove contacts, of less than STEADY frames."""
     return remove_short_runs(~remove_short_runs(~stands, MIN_CONTACT_FRAMES), MIN_CONTACT_FRAMES)

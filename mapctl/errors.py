@@ -17,11 +17,11 @@ class FileFormatError(MapctlError):
 
 
 class RequestError(MapctlError):
-    """A wish, option or argument that cannot be."""
+    """A request, option or argument that cannot be."""
 
 
 class WriteError(RequestError):
-    """A place that cannot be written, or a disk that is full."""
+    """A path that cannot be written, or a disk that is full."""
 
 
 class DiskFullError(WriteError):

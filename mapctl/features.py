@@ -1,8 +1,8 @@
-"""State features of the prior: what of a motion is left when place and heading are taken away.
+"""State features of the prior: a motion without position and heading.
 
-rnn paper, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change, the
-root height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation
-vectors about the canonical T-pose stand in for the paper's Euler angles, whose wraps real rigs sit near.
+Wang et al. 2019, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change,
+the root height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation
+vectors about the canonical T-pose stand in for their Euler angles, whose wraps real rigs sit near.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.errors import MapctlError
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, mirror_name
+from mapctl.skeleton import CANONICAL, TOES, mirror_name
 
 PRIOR_FPS = 30
 """Frames per second of every prior: steps and turns a frame mean nothing at another rate, so results are resampled."""
@@ -32,7 +32,7 @@ class FeatureLayout:
 
     @cached_property
     def slices(self) -> Mapping[str, slice]:
-        """Where each block lies."""
+        """Slice of each block."""
         places, start = {}, 0
         for name, width in self.blocks:
             places[name] = slice(start, start + width)
@@ -50,11 +50,12 @@ class FeatureLayout:
         return self.size - self.blocks[-1][1]
 
     def fingerprint(self) -> str:
-        """Short hash of the blocks; a card holds it so that weights meet only the features they were trained on."""
+        """Return a short hash of the blocks; a card holds it so that weights meet only the features they were trained
+        on."""
         return sha256(repr(self.blocks).encode()).hexdigest()[:12]
 
     def pick(self, features: Float[Tensor, "*batch size"], block: str) -> Float[Tensor, "*batch width"]:
-        """The named block of a feature tensor."""
+        """Select the named block of a feature tensor."""
         return features[..., self.slices[block]]
 
 
@@ -72,31 +73,31 @@ LAYOUT = FeatureLayout(
 
 @dataclass(frozen=True, eq=False)
 class GroundPose:
-    """Where the root stands on the ground and which way it faces."""
+    """Ground position and heading of the root."""
 
     position_xz: Float[Tensor, "*batch 2"]
     """Ground projection of the root, metres."""
     heading: Float[Tensor, "*batch"]
-    """Radians about +Y; 0 faces +Z."""
+    """Heading, radians about +Y; 0 faces +Z."""
 
     def displace(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "GroundPose":
-        """One step of Eq. 4: displaced in its own heading frame, then turned."""
+        """Displace in the own heading frame, then rotate: one step of Wang et al. 2019, Eq. 4."""
         step = rotations.rotate_ground(displacement_heading, self.heading)
         return GroundPose(self.position_xz + step, self.heading + turn)
 
     def before(self, displacement_heading: Float[Tensor, "*batch 2"], turn: Float[Tensor, "*batch"]) -> "GroundPose":
-        """The place from which one such step leads here."""
+        """Return the pose from which one such step leads here."""
         heading = self.heading - turn
         return GroundPose(self.position_xz - rotations.rotate_ground(displacement_heading, heading), heading)
 
     @staticmethod
     def origin(dtype: torch.dtype = torch.float32) -> "GroundPose":
-        """At the origin, facing +Z."""
+        """Return the pose at the origin, facing +Z."""
         return GroundPose(torch.zeros(2, dtype=dtype), torch.zeros((), dtype=dtype))
 
 
 def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], GroundPose]:
-    """Features of a canonical motion (float64) and the ground pose from which `pose.decode` leads back to it.
+    """Encode features of a canonical motion (float64), and the ground pose from which `pose.decode` leads back to it.
 
     The first frame has no past: it repeats the second frame's displacement, and the place returned lies that much
     before it. Raises MapctlError for other skeletons or fewer than two frames.
@@ -112,7 +113,7 @@ def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], GroundPose]:
     step, turn = torch.cat([step[:1], step]), torch.cat([turn[:1], turn])
     tilt_vector = rotations.to_rotation_vector(tilt)
     joints = rotations.to_rotation_vector(motion.local_quat_xyzw[:, 1:]).flatten(1)
-    toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+    toes = CANONICAL.indices(TOES)
     planted = torch.as_tensor(contacts.detect_contacts(motion.joint_positions()[:, toes], float(motion.fps))).to(
         step.dtype
     )
@@ -124,7 +125,7 @@ def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], GroundPose]:
 def integrate_root(
     features: Float[Tensor, "*batch frames size"], start: GroundPose
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames"]]:
-    """Root ground positions (world, metres) and headings (radians, not wrapped) by Eq. 4. The one root integration."""
+    """Integrate root positions on the ground (metres) and headings (radians, not wrapped): Wang et al. 2019, Eq. 4."""
     turns = LAYOUT.pick(features, "heading_change")[..., 0]
     heading = start.heading.unsqueeze(-1) + torch.cumsum(turns, dim=-1)
     steps = rotations.rotate_ground(LAYOUT.pick(features, "root_displacement_heading"), heading - turns)
@@ -132,12 +133,12 @@ def integrate_root(
 
 
 def ground_speed(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch"]:
-    """Speed of the root over the ground in each frame, m/s."""
+    """Return the root's speed over the ground in each frame, m/s."""
     return LAYOUT.pick(features, "root_displacement_heading").norm(dim=-1) * PRIOR_FPS
 
 
 def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
-    """Features of the motion mirrored left to right."""
+    """Mirror features left to right."""
     swap = [CANONICAL.index(mirror_name(name)) - 1 for name in CANONICAL.names[1:]]
     vectors = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))[..., swap, :]
     flip = features.new_tensor

@@ -1,4 +1,4 @@
-"""Joints as people name them: side and body part by a name, which joint a name stands for, and what may be meant."""
+"""Joint names: side and body part by a name, which joint a name stands for, and the nearest names."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -99,14 +99,14 @@ _SIDES = tuple(
 
 @lru_cache(maxsize=4096)
 def normalise_name(name: str) -> str:
-    """Lower case without program prefix and punctuation: `mixamorig:LeftToeBase` is `lefttoebase`."""
+    """Normalise a name to lower case without program prefix and punctuation: `mixamorig:LeftToe` is `lefttoe`."""
     strip = partial(_PREFIX.sub, "")
     # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
     return re.sub(r"[^a-z0-9]", "", (strip(strip(name)) or name).lower())
 
 
 def classify_joint(name: str) -> Role:
-    """Side and part of a joint by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
+    """Classify a joint's side and part by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
     for side, pattern in _SIDES:
         found = pattern.search(name)
         if found:
@@ -122,7 +122,7 @@ def _classify_part(name: str) -> Part:
 
 
 def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mapping[str, int]] = dict) -> int | None:
-    """The joint of a rig that a name stands for; None for none.
+    """Find the joint of a rig that a name stands for; None for none.
 
     In this order: the rig's own `names` as they are written, canonical names, both in any case, and own names without
     prefix and punctuation. `canonical` gives the rig's joint by canonical name, and is asked only where it is needed.
@@ -147,7 +147,7 @@ def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mappin
 
 
 def suggest_joints(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> list[str]:
-    """The few names nearest to a wanted one, the nearest first.
+    """Return the few names nearest to a wanted one, the nearest first.
 
     They stay on the side and the limb that it tells, if any name is there. `roles` tell what the names are, else the
     names themselves do.
@@ -168,12 +168,12 @@ def suggest_joints(wanted: str, names: Sequence[str], roles: Sequence[Role] | No
 
 
 def describe_nearest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> str:
-    """The end of a refusal: which names are nearest."""
+    """Describe the nearest names, for the end of a refusal."""
     first, *others = [*suggest_joints(wanted, names, roles)] or ["none"]
     return f"the nearest is {first}" + (f", then {' and '.join(others)}" if others else "")
 
 
 def abbreviate_names(names: Sequence[str]) -> str:
-    """The first few of many names, and how many there are."""
+    """List the first few of many names, and how many there are."""
     more = len(names) - 2 * _MAX_SUGGESTIONS
     return ", ".join(names[: 2 * _MAX_SUGGESTIONS]) + (f" and {more} more" if more > 0 else "")

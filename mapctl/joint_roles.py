@@ -1,4 +1,4 @@
-"""Which joint of any rig is the hips, a toe, an upper leg: told by the names that rigs commonly use."""
+"""Which joint of any rig is the hips, a toe, an upper leg, by the names that rigs commonly use."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ _ROOTS = ("rootjoint", "root")  # of rigs without hips
 
 
 def find_hips(skeleton: Skeleton) -> int:
-    """Index of the hips; RequestError lists the joints if none is named so."""
+    """Find the index of the hips; RequestError lists the joints if none is named so."""
     names = _normalise_names(skeleton)
     for match, parts in ((_match_exactly, _HIPS), (_match_suffix, _HIPS), (_match_exactly, _ROOTS)):
         for part in parts:
@@ -27,12 +27,12 @@ def find_hips(skeleton: Skeleton) -> int:
 
 
 def find_feet(skeleton: Skeleton) -> tuple[int, int]:
-    """Indices of the left and right toe, or foot where there are no toes; RequestError if there are none."""
+    """Find indices of the left and right toe, or foot where there are no toes; RequestError if there are none."""
     return _find_pair(skeleton, _TOES, "toe or foot")
 
 
 def find_upper_legs(skeleton: Skeleton) -> tuple[int, int]:
-    """Indices of the left and right upper leg, whose line tells facing; RequestError if there are none."""
+    """Find indices of the left and right upper leg, whose line tells facing; RequestError if there are none."""
     return _find_pair(skeleton, _UPPER_LEGS, "upper leg")
 
 
@@ -47,7 +47,7 @@ def _find_pair(skeleton: Skeleton, parts: Sequence[str], role: str) -> tuple[int
 
 
 def _side_spellings(part: str, side: str) -> set[str]:
-    """Plain ways to write a part of one side: leftfoot, footleft, lfoot, footl."""
+    """Spell a part of one side in plain ways: leftfoot, footleft, lfoot, footl."""
     return {f"{mark}{part}" for mark in (side, side[0])} | {f"{part}{mark}" for mark in (side, side[0])}
 
 
@@ -56,7 +56,7 @@ def _match_exactly(names: Sequence[str], wanted: set[str]) -> int | None:
 
 
 def _match_suffix(names: Sequence[str], wanted: set[str]) -> int | None:
-    """After an unknown beginning (`Character1_LeftFoot`); words as short as `lfoot` prove too little."""
+    """Match a name after an unknown beginning (`Character1_LeftFoot`); words as short as `lfoot` prove too little."""
     telling = tuple(word for word in wanted if len(word) >= 6 and ("left" in word or "right" in word))
     return _find_first(names, lambda name: name.endswith(telling or tuple(wanted & {"hips", "pelvis"})))
 
@@ -76,7 +76,7 @@ def _unknown_joint_error(skeleton: Skeleton, role: str) -> RequestError:
 
 
 def classify_joints(skeleton: Skeleton) -> tuple[Role, ...]:
-    """The role of every joint, settled by what else the rig has.
+    """Classify the role of every joint, settled by what else the rig has.
 
     Where there are collars, a `shoulder` is the upper arm; without thighs, a hip with a side is one.
     """

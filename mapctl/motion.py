@@ -20,13 +20,13 @@ class Motion:
     """Frames of one skeleton, float64, metres, Y up."""
 
     skeleton: Skeleton
-    """Whose joints these are."""
+    """Skeleton of the joints."""
     fps: Fraction
     """Frames per second, exact."""
     root_position: Float[Tensor, "frames 3"]
-    """Joint 0 in the world, metres."""
+    """Position of joint 0 in the world, metres."""
     local_quat_xyzw: Float[Tensor, "frames joints 4"]
-    """Each joint's rotation in its parent's frame."""
+    """Rotation of each joint in its parent's frame, xyzw."""
     moving_offsets: Mapping[int, Float[Tensor, "frames 3"]] = field(default_factory=dict)
     """Joints below the root whose offset is animated, as Hips under a static root; metres."""
     source: object | None = None
@@ -65,21 +65,21 @@ class Motion:
         return kinematics.forward_kinematics(offsets, self.skeleton.parents, self.root_position, self.local_quat_xyzw)
 
     def joint_positions(self) -> Float[Tensor, "frames joints 3"]:
-        """World positions in metres, joints in file order."""
+        """Return the world positions in metres, joints in file order."""
         return self._world[0]
 
     def joint_rotations(self) -> Float[Tensor, "frames joints 4"]:
-        """World rotations (xyzw), joints in file order."""
+        """Return the world rotations (xyzw), joints in file order."""
         return self._world[1]
 
     def slice(self, start: int, stop: int) -> "Motion":
-        """Frames start to stop (half-open); RequestError if they are not all there."""
+        """Return frames start to stop (half-open); RequestError if they are not all there."""
         if not 0 <= start < stop <= self.num_frames:
             raise RequestError(f"frames {start}:{stop} are not within 0:{self.num_frames}")
         return self._map_frames(lambda values: values[start:stop])
 
     def join(self, other: "Motion") -> "Motion":
-        """This motion followed by `other`, which must have the same skeleton and frame rate; nothing is moved."""
+        """Join this motion and `other`, which must have the same skeleton and frame rate; nothing is moved."""
         if not self.skeleton.matches(other.skeleton) or self.fps != other.fps:
             raise MapctlError("only motions of one skeleton and frame rate can be joined")
         travelling = sorted({*self.moving_offsets, *other.moving_offsets})
@@ -93,7 +93,7 @@ class Motion:
         )
 
     def resample(self, fps: Fraction | float) -> "Motion":
-        """The motion at another frame rate: positions linear, rotations slerp; the first frame stays.
+        """Resample the motion to another frame rate: positions linear, rotations slerp; the first frame stays.
 
         Going down, a short moving average would blur contacts, so frames are interpolated, not filtered.
         """
@@ -121,7 +121,7 @@ class Motion:
         )
 
     def mirror(self) -> "Motion":
-        """Left and right exchanged through the plane x = 0; for canonical joint frames and names.
+        """Exchange left and right through the plane x = 0; for canonical joint frames and names.
 
         Bones are exchanged too. Raises MapctlError where a side's joint has no partner, or sides are named otherwise.
         """
@@ -149,7 +149,7 @@ class Motion:
         formats.save(self, path)
 
     def _offset(self, joint: int) -> Float[Tensor, "frames 3"]:
-        """A joint's offset in every frame, animated or not."""
+        """Return a joint's offset in every frame, animated or not."""
         return self.moving_offsets.get(joint, self.skeleton.offsets[joint].expand(self.num_frames, 3))
 
     def _map_frames(self, pick) -> "Motion":

@@ -1,4 +1,4 @@
-"""Reports: what was asked, what came out and what it cost, as JSON that every parser reads."""
+"""Reports: the request, the result and its cost, as JSON that every parser reads."""
 
 import json
 import math
@@ -35,7 +35,7 @@ def build_report(
     seconds: float,
     prior: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything about one solve; `seconds` is its wall clock, `prior` its name, licence and quality.
+    """Build the report on one solve; `seconds` is its wall clock, `prior` its name, licence and quality.
 
     Keys: mapctl, request, seed, versions, prior, status, motion, ledger, measures, mocap, timing.
     """
@@ -55,34 +55,34 @@ def build_report(
 
 
 def write_report(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
-    """Write a report whole or not at all; RequestError if the place cannot be written."""
+    """Write a report whole or not at all; RequestError if the path cannot be written."""
     write_text(path, to_json(report))
 
 
 def to_json(values: Any) -> str:
-    """Indented JSON that every parser reads: NaN and infinities are null."""
+    """Format indented JSON that every parser reads: NaN and infinities are null."""
     return json.dumps(_replace_non_finite(values), indent=1, allow_nan=False) + "\n"
 
 
 def summarise_status(solution: Solution) -> dict[str, Any]:
-    """How the solve ended: text (the message), outcome, ok, notes."""
+    """Summarise how the solve ended: text (the message), outcome, ok, notes."""
     ended = solution.status
     return {"text": ended.text, "outcome": ended.outcome.value, "ok": ended.ok, "notes": list(ended.notes)}
 
 
 def summarise_motion(motion: Motion) -> dict[str, float]:
-    """Frames, frames per second and seconds."""
+    """Summarise frames, frames per second and seconds."""
     return {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds}
 
 
 def measure_path(motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None) -> dict[str, float]:
-    """All measures of a motion that was to go `wanted_m` metres along the curve, at whatever speed."""
+    """Measure a motion that was to go `wanted_m` metres along the curve, at whatever speed."""
     seconds = (motion.num_frames - 1) / float(motion.fps)
     return metrics.measure(motion, curve, speed=wanted_m / seconds, joint=joint)
 
 
 def reference_measures(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """What held-out mocap shows, by measure: mean, p2, p98; empty where the prior's card has no table."""
+    """Return measures of held-out mocap: mean, p2, p98; empty where the prior's card has no table."""
     return dict(quality.get("mocap", {}))
 
 
@@ -109,7 +109,7 @@ def summarise_timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict
 
 
 def peak_memory_mb() -> float | None:
-    """Most memory the process ever held, MiB; None where the system does not tell (Windows)."""
+    """Return the peak memory of the process, MiB; None where the system does not tell (Windows)."""
     if resource is None:
         return None
     unit = 1 if platform.system() == "Darwin" else 1024
@@ -117,13 +117,13 @@ def peak_memory_mb() -> float | None:
 
 
 def package_versions() -> dict[str, str]:
-    """Of mapctl, Python and the packages that decide the numbers, and the platform."""
+    """Return versions of mapctl, Python and the packages that decide the numbers, and the platform."""
     installed = {name: metadata.version(name) for name in _PACKAGES}
     return {"mapctl": __version__, "python": platform.python_version(), **installed, "platform": platform.platform()}
 
 
 def _replace_non_finite(values: Any) -> Any:
-    """The same tree with null for NaN and infinities."""
+    """Replace NaN and infinities in a tree by null."""
     match values:
         case float():
             return values if math.isfinite(values) else None

@@ -1,16 +1,21 @@
 """Rotation maths, once for the whole project; quaternions are xyzw, angles radians.
 
 Built on roma, whose first derivatives are exact at the identity and near pi. What roma lacks and a character needs
-is here: the split of a rotation into a turn about the vertical and what remains.
+is here: the split of a rotation into heading and tilt, rotations about the vertical, and shortest arcs.
 """
 
+import math
 from functools import partial
+from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.numerics.light_roma import roma
+
+Angle = TypeVar("Angle", float, np.ndarray, Tensor)
 
 multiply = roma.quat_product
 inverse = roma.quat_conjugation
@@ -24,13 +29,14 @@ rotation_vector_to_matrix = roma.rotvec_to_rotmat
 
 
 def about_y(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 4"]:
-    """Quaternion (xyzw) of a turn by `angle` radians about +Y; positive turns +Z toward +X."""
+    """Return the quaternion (xyzw) of a turn by `angle` radians about +Y; positive turns +Z toward +X."""
     zero = torch.zeros_like(angle)
     return torch.stack([zero, torch.sin(angle / 2), zero, torch.cos(angle / 2)], dim=-1)
 
 
 def split_heading(quat_xyzw: Float[Tensor, "*batch 4"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 4"]]:
-    """Swing-twist about Y: (heading, tilt) with `quat = about_y(heading) * tilt` and no turn about Y left in `tilt`.
+    """Split a rotation about Y: (heading, tilt) with `quat = about_y(heading) * tilt` and no rotation about Y left in
+    `tilt`.
 
     The tilt's rotation vector has a zero y component, so two numbers hold it. Undefined only upside down.
     """
@@ -39,26 +45,52 @@ def split_heading(quat_xyzw: Float[Tensor, "*batch 4"]) -> tuple[Float[Tensor, "
     return heading, multiply(about_y(-heading), quat_xyzw)
 
 
-def wrap_angle(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The same angle in [-pi, pi)."""
-    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+def wrap_angle(angle: Angle) -> Angle:
+    """Wrap an angle, or each of many, to [-pi, pi)."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def unwrap_angle(angle: Float[Tensor, "*batch frames"]) -> Float[Tensor, "*batch frames"]:
-    """Angles along the last axis without jumps of 2 pi."""
+    """Unwrap angles along the last axis: no jumps of 2 pi."""
     steps = wrap_angle(torch.diff(angle, dim=-1))
     return torch.cat([angle[..., :1], angle[..., :1] + torch.cumsum(steps, dim=-1)], dim=-1)
 
 
 def rotate_ground(vector_xz: Float[Tensor, "*#batch 2"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 2"]:
-    """Ground-plane (x, z) vectors turned by `angle` radians about +Y; one angle may turn several vectors."""
+    """Rotate ground vectors (x, z) by `angle` radians about +Y; one angle may rotate several vectors."""
     x, z = vector_xz.unbind(-1)
     sine, cosine = torch.sin(angle), torch.cos(angle)
     return torch.stack([cosine * x + sine * z, cosine * z - sine * x], dim=-1)
 
 
+def lift_ground(ground_xz: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    """Return ground vectors (x, z) as (x, 0, z)."""
+    return torch.stack([ground_xz[..., 0], torch.zeros_like(ground_xz[..., 0]), ground_xz[..., 1]], dim=-1)
+
+
+def rotate_about_y(vector: Float[Tensor, "*#batch 3"], angle: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 3"]:
+    """Rotate vectors by `angle` radians about +Y; one angle may rotate several vectors."""
+    ground = rotate_ground(vector[..., ::2], angle)
+    return torch.stack([ground[..., 0], vector[..., 1], ground[..., 1]], dim=-1)
+
+
+def between_vectors(start: Float[Tensor, "*batch 3"], stop: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """Return the shortest rotation (xyzw) from one direction to the other; none where one of them has no length."""
+    start, stop = (torch.nn.functional.normalize(vector, dim=-1) for vector in (start, stop))
+    cosine = (start * stop).sum(-1, keepdim=True)
+    axis = torch.linalg.cross(start, stop)
+    # Half a turn has no shortest arc: any axis across will do.
+    across = torch.linalg.cross(start, start.abs().argmin(dim=-1, keepdim=True).eq(torch.arange(3)).to(start))
+    opposite = (cosine < 0) & (axis.norm(dim=-1, keepdim=True) < 1e-9)
+    real = torch.where(cosine < -0.99, (start + stop).square().sum(-1, keepdim=True) / 2, 1 + cosine)  # exact near it
+    quat = torch.cat([torch.where(opposite, across, axis), torch.where(opposite, 0.0, real)], dim=-1)
+    still = (start.norm(dim=-1, keepdim=True) < 0.5) | (stop.norm(dim=-1, keepdim=True) < 0.5)
+    none = quat.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quat)
+    return torch.nn.functional.normalize(torch.where(still, none, quat), dim=-1)
+
+
 def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[Tensor, "frames *joints 4"]:
-    """The same rotations with signs chosen so that neighbouring frames lie in one half of the sphere."""
+    """Choose signs of the same rotations so that neighbouring frames lie in one half of the sphere."""
     dots = (quat_xyzw[1:] * quat_xyzw[:-1]).sum(-1)
     signs = torch.cumprod(torch.where(dots < 0, -1.0, 1.0).to(quat_xyzw.dtype), dim=0)
     return torch.cat([quat_xyzw[:1], quat_xyzw[1:] * signs.unsqueeze(-1)])
@@ -67,7 +99,7 @@ def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[
 def slerp(
     start_xyzw: Float[Tensor, "*batch 4"], stop_xyzw: Float[Tensor, "*batch 4"], weight: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Shortest-arc spherical interpolation; weight 0 gives the start."""
+    """Interpolate spherically along the shortest arc; weight 0 gives the start."""
     aligned = torch.where((start_xyzw * stop_xyzw).sum(-1, keepdim=True) < 0, -stop_xyzw, stop_xyzw)
     step = to_rotation_vector(multiply(inverse(start_xyzw), aligned))
     return multiply(start_xyzw, from_rotation_vector(step * weight.unsqueeze(-1)))

@@ -1,7 +1,7 @@
 """Skeletons: joint names, the tree, and bone offsets; and the canonical one that priors speak."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -35,23 +35,27 @@ class Skeleton:
 
     @property
     def num_joints(self) -> int:
-        """How many joints there are."""
+        """Number of joints."""
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """The joint's index; MapctlError names the nearest joints if there is none."""
+        """Return the joint's index; MapctlError names the nearest joints if there is none."""
         try:
             return self.names.index(name)
         except ValueError:
             raise MapctlError(f"no joint {name!r}; {describe_nearest(name, self.names)}") from None
 
+    def indices(self, names: Iterable[str]) -> list[int]:
+        """Return the joints' indices; MapctlError as `index`."""
+        return [self.index(name) for name in names]
+
     def matches(self, other: "Skeleton", tolerance: float = 1e-6) -> bool:
-        """Same joints, tree and bone offsets (within `tolerance` metres)."""
+        """Return whether joints, tree and bone offsets (within `tolerance` metres) are the same."""
         same_tree = self.names == other.names and self.parents == other.parents
         return same_tree and bool(torch.allclose(self.offsets, other.offsets, atol=tolerance, rtol=0))
 
     def mirror_partners(self) -> list[int]:
-        """By joint, the index of its mirror image; itself in the middle of the body.
+        """Return by joint the index of its mirror image; itself in the middle of the body.
 
         Sides are told by the canonical `left` and `right` alone. MapctlError for a skeleton that has none, names sides
         in another way (which would pass for the middle), or lacks a partner.
@@ -63,7 +67,7 @@ class Skeleton:
         return [self.index(mirror_name(name)) for name in self.names]
 
     def children(self, joint: int) -> list[int]:
-        """Indices of the joint's children."""
+        """Return indices of the joint's children."""
         return [j for j, parent in enumerate(self.parents) if parent == joint]
 
 
@@ -117,16 +121,45 @@ _FOREIGN_SIDE_NAMES = re.compile(
 )
 TOE_REST_HEIGHT = 0.0425
 """Height of the canonical toe joints over the floor while the foot stands flat, metres."""
+TOES = ("leftToes", "rightToes")
+"""Canonical toe joints, in the order of the two contact bits."""
+TOE_JOINTS = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
+"""Indices of the canonical toe joints."""
+
+
+@dataclass(frozen=True)
+class Limb:
+    """Two bones and the effector at their end: an arm or a leg."""
+
+    upper: int
+    """Joint at which it begins."""
+    lower: int
+    """Elbow or knee, the only child of `upper`."""
+    end: int
+    """Hand or foot, the only child of `lower`."""
+    bend_direction: tuple[float, float, float]
+    """Direction in which the elbow or the knee of a straight limb would bend, in the frame of `upper`."""
+    shown: bool = True
+    """Whether the initial motion shows how it bends; if not, only the proposed elbow or knee tells."""
+
+
+_KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
+LIMBS = {
+    side + end: Limb(*(CANONICAL.index(side + part) for part in (upper, lower, end)), bend_direction=bends)
+    for upper, lower, end, bends in (("UpperArm", "LowerArm", "Hand", _ELBOW), ("UpperLeg", "LowerLeg", "Foot", _KNEE))
+    for side in ("left", "right")
+}
+"""Canonical arms and legs by the name of their effectors; knees go forward and elbows back."""
 
 
 def leg_length(skeleton: Skeleton) -> float:
-    """Of canonical joints, along the bones from the left hip to the ankle, metres."""
+    """Return the length of the bones from the left hip to the ankle of canonical joints, metres."""
     bones = [skeleton.index(name) for name in ("leftLowerLeg", "leftFoot")]
     return float(skeleton.offsets[bones].norm(dim=-1).sum())
 
 
 def mirror_name(name: str) -> str:
-    """The joint of the other side: `leftHand` for `rightHand`; other names are their own mirror image."""
+    """Return the joint of the other side: `leftHand` for `rightHand`; other names are their own mirror image."""
     for side, other in (("left", "right"), ("right", "left")):
         if name.startswith(side):
             return other + name[len(side) :]

@@ -24,30 +24,30 @@ from priors.tensor_files import write_tensors
 
 @dataclass(frozen=True)
 class Card:
-    """What a set of weights is."""
+    """Card of a set of weights."""
 
     kind: str
-    """`lstm-gmm` and so on."""
+    """Kind of network: `lstm-gmm` and so on."""
     config: dict[str, Any]
     """The network's settings."""
     layout: list[list[Any]]
     """Blocks of the feature vector: name and width."""
     fingerprint: str
-    """Of the layout."""
+    """Fingerprint of the feature layout."""
     licence: str
-    """Of the weights."""
+    """Licence of the weights."""
     data: dict[str, Any] = field(default_factory=dict)
-    """What it was trained on: clips, frames, attribution, split seed."""
+    """Training data: clips, frames, attribution, split seed."""
     training: dict[str, Any] = field(default_factory=dict)
     """Recipe, seed, steps, command and curve."""
     quality: dict[str, Any] = field(default_factory=dict)
-    """Measured figures and the command that printed them."""
+    """Measured quality and the command that printed it."""
     abilities: dict[str, float] = field(default_factory=dict)
-    """Speeds and turning that the data show."""
+    """Limits of speed and turning that the data show."""
 
     @staticmethod
     def layout_fields() -> dict[str, Any]:
-        """The two layout fields for the features of this code."""
+        """Return the two layout fields for the features of this code."""
         return {"layout": [list(block) for block in LAYOUT.blocks], "fingerprint": LAYOUT.fingerprint()}
 
 
@@ -68,7 +68,8 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
 
 
 def encode_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:
-    """JSON that every parser reads; CheckpointError, naming the file it was for, where a number is not finite."""
+    """Encode the JSON that every parser reads; CheckpointError, naming the file it was for, where a number is not
+    finite."""
     try:
         return json.dumps(values, indent=indent, allow_nan=False) + "\n"
     except ValueError as error:
@@ -76,7 +77,7 @@ def encode_json(values: dict[str, Any], path: Path, *, indent: int | None = None
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], Card]:
-    """Tensors in float32 and the card; CheckpointError if either is missing, broken or of another layout."""
+    """Load tensors in float32 and the card; CheckpointError if either is missing, broken or of another layout."""
     card = read_card(path.with_suffix(".json"))
     if card.fingerprint != LAYOUT.fingerprint():
         ours = [list(block) for block in LAYOUT.blocks]
@@ -90,7 +91,7 @@ def load(path: Path) -> tuple[dict[str, Tensor], Card]:
 
 @contextmanager
 def open_checkpoint(name: str, kind: str, *, called: str | None = None) -> Iterator[tuple[dict[str, Tensor], Card]]:
-    """Tensors and card of a bundled name, a file or a run folder, for building the network within.
+    """Open tensors and card of a bundled name, a file or a run folder, to build the network within.
 
     CheckpointError for weights of another kind than this, which messages call `called`, and where what is built of the
     card does not take the tensors.
@@ -106,7 +107,7 @@ def open_checkpoint(name: str, kind: str, *, called: str | None = None) -> Itera
 
 
 def read_card(path: Path) -> Card:
-    """The card alone."""
+    """Read the card alone."""
     try:
         return Card(**json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
@@ -114,13 +115,13 @@ def read_card(path: Path) -> Card:
 
 
 def list_bundled() -> list[str]:
-    """Names of the priors that come with the package."""
+    """List names of the priors that come with the package."""
     found = (p.name for p in files("priors.weights").iterdir())
     return sorted(name.removesuffix(".safetensors") for name in found if name.endswith(".safetensors"))
 
 
 def locate(name: str) -> Path:
-    """The safetensors file of a bundled name, of a path, or of a training run's folder."""
+    """Locate the safetensors file of a bundled name, of a path, or of a training run's folder."""
     path = Path(name)
     for candidate in (path, path / "model.safetensors", Path(f"{name}.safetensors")):
         if candidate.is_file() and candidate.suffix == ".safetensors":

@@ -39,12 +39,12 @@ def __getattr__(name: str):
 
 
 def list_scenes() -> tuple[str, ...]:
-    """Names of the scenes that come with mapctl."""
+    """List names of the scenes that come with mapctl."""
     return tuple(sorted(p.name.removesuffix(".toml") for p in files("scenes").iterdir() if p.name.endswith(".toml")))
 
 
 def find_scene(scene: str) -> Path:
-    """The path of a scene file or of a ready scene by name; RequestError lists these if there is neither."""
+    """Find the path of a scene file or of a ready scene by name; RequestError lists these if there is neither."""
     if Path(scene).is_file() or Path(scene).suffix:
         return Path(scene)
     if scene not in list_scenes():

@@ -1,4 +1,4 @@
-"""Cameras: where to look from so that everything is in the picture. Pure functions, no graphics library."""
+"""Cameras: positions from which everything is in the picture. Pure functions, no graphics library."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from mapctl.mesh.primitives import Array, unit
 
 _UP = np.array([0.0, 1.0, 0.0])
 _FRAMING_MARGIN = 1.12
-"""How much larger the picture is than what must be seen."""
+"""Ratio of the picture's size to that of what must be in it."""
 _MAX_FRAMES = 400
 """Frames looked at to find the distance; more of a long motion would not change it."""
 
@@ -30,23 +30,23 @@ _BOUNDS = (
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """How a film looks at its actors. The distance is always found from the motion."""
+    """Settings of a film's camera. The distance is always found from the motion."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}
 
     kind: Literal["fixed", "follow", "top"] = "fixed"
     """Fixed: everything in view all the time. Follow: with the actors, smoothly. Top: fixed, from above."""
     azimuth_deg: float | None = None
-    """Where the camera stands, degrees about +Y: 0 is +Z, 90 is +X. From the top it is what lies at the bottom.
-    If not given, 30, and 0 from the top."""
+    """Direction of the camera, degrees about +Y: 0 is +Z, 90 is +X. From the top it is what lies at the bottom. If not
+    given, 30, and 0 from the top."""
     elevation_deg: float = 24.0
-    """How high it stands over the horizon, degrees, 0 to 89. Ignored from the top."""
+    """Elevation over the horizon, degrees, 0 to 89. Ignored from the top."""
     fov_deg: float = 32.0
     """Vertical field of view, degrees."""
     zoom: float = 1.0
-    """Closer than needed (over 1) or further away; 2 halves the distance."""
+    """Zoom: closer than needed (over 1) or further away; 2 halves the distance."""
     smooth_seconds: float = 0.6
-    """How slowly a following camera moves: standard deviation of a Gaussian over time, seconds."""
+    """Smoothing of a following camera: standard deviation of a Gaussian over time, seconds."""
 
     def __post_init__(self):
         if self.kind not in ("fixed", "follow", "top"):
@@ -59,19 +59,19 @@ class CameraSettings:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera at one moment."""
+    """One camera at one time."""
 
     pose: Array
     """(4, 4) camera to world, looking along its -z, y up in the picture."""
     fov: float
     """Vertical field of view, radians."""
     width: int
-    """Pixels."""
+    """Width of the picture, pixels."""
     height: int
-    """Pixels."""
+    """Height of the picture, pixels."""
 
     def project(self, points: Array) -> Array:
-        """(..., 3) world to (..., 3): pixels right, pixels down, metres in front of the camera."""
+        """Project world points (..., 3) to (..., 3): pixels right, pixels down, metres in front of the camera."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         depth = -local[..., 2]
         focal = self.height / 2 / np.tan(self.fov / 2)
@@ -81,7 +81,7 @@ class View:
 
 
 def look_at(eye: Array, target: Array, up: Array = _UP) -> Array:
-    """(4, 4) camera-to-world pose at `eye`; straight up or down the picture's top is -Z."""
+    """Return the (4, 4) camera-to-world pose at `eye`; straight up or down the picture's top is -Z."""
     back = unit(np.asarray(eye, float) - target)
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-6:
@@ -94,7 +94,7 @@ def look_at(eye: Array, target: Array, up: Array = _UP) -> Array:
 
 
 def camera_axes(settings: CameraSettings) -> Array:
-    """(3, 3) columns right, up and back of the camera."""
+    """Return (3, 3) columns right, up and back of the camera."""
     usual = 0.0 if settings.kind == "top" else _AZIMUTH_DEG
     azimuth = np.radians(usual if settings.azimuth_deg is None else settings.azimuth_deg)
     if settings.kind == "top":
@@ -107,10 +107,10 @@ def camera_axes(settings: CameraSettings) -> Array:
 
 
 def fit_eye(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
-    """The nearest place (3,) from which a camera with the given axes sees all points (n, 3), in the middle.
+    """Find the nearest position (3,) from which a camera with the given axes sees all points (n, 3), in the middle.
 
-    Each side of the picture bounds the eye by a plane. Left and right, and top and bottom, meet in two
-    lines; the eye lies on the further one, and is centred in the direction that has room left.
+    Each side of the picture bounds the eye by a plane. Left and right, and top and bottom, meet in two lines; the eye
+    lies on the further one, and is centred in the direction that has room left.
     """
     right, up, back = (points @ axes).T
     wide, high = aspect * np.tan(fov / 2), np.tan(fov / 2)
@@ -120,12 +120,12 @@ def fit_eye(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
 
 
 def _find_apex(across: Array, back: Array, slope: float) -> float:
-    """How far back the tightest wedge of a slope starts that opens over all points."""
+    """Find how far back the tightest wedge of a slope starts that opens over all points."""
     return float(((across / slope + back).max() + (-across / slope + back).max()) / 2)
 
 
 def _find_centre(across: Array, depth: Array) -> float:
-    """The place across that has the outermost points of both sides equally far from the middle."""
+    """Find the sideways position that has the outermost points of both sides equally far from the middle."""
     depth = np.maximum(depth, 1e-6)
 
     def lopsided(place: float) -> float:
@@ -138,10 +138,10 @@ def _find_centre(across: Array, depth: Array) -> float:
 def compute_views(
     settings: CameraSettings, points: Array, targets: Array, *, fps: float, size: tuple[int, int]
 ) -> list[View]:
-    """One view a frame.
+    """Compute one view a frame.
 
-    `points` (frames or 1, n, 3) must be seen; a following camera follows `targets` (frames, 3). `size` is
-    the picture's width and height, pixels.
+    `points` (frames or 1, n, 3) must be seen; a following camera follows `targets` (frames, 3). `size` is the picture's
+    width and height, pixels.
     """
     axes, fov = camera_axes(settings), np.radians(settings.fov_deg)
     centre = np.zeros_like(targets)
@@ -158,7 +158,7 @@ def compute_views(
 
 
 def _smooth(path: Array, sigma: float) -> Array:
-    """The path (frames, 3) without its quick part; it goes on straight at both ends, so that it does not lag there."""
+    """Smooth a path (frames, 3); it is extended straight at both ends, so that it does not lag there."""
     margin = math.ceil(3 * sigma)
     longer = np.pad(path, ((margin, margin), (0, 0)), mode="reflect", reflect_type="odd")
     return gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]

@@ -11,27 +11,28 @@ from scenes.content import Painter
 from scenes.stage import Stage
 
 _GAP = 0.008
-"""Between pictures, as a share of the width."""
+"""Margin between pictures, as a share of the width."""
 _GHOST_STRIDE = 1.0
-"""Ghosts stand about this far apart, metres."""
+"""Distance between ghosts, about, metres."""
 _MAX_GHOSTS = 16
-"""Of all actors together, but at least four each."""
+"""Number of ghosts of all actors together, but at least four each."""
 
 
 @dataclass(frozen=True)
 class StillRow:
-    """How the stills look."""
+    """Layout of the stills."""
 
     count: int
-    """Stills beside each other."""
+    """Number of stills beside each other."""
     height_over_width: float
     """Height of one over its width."""
     kind: str
-    """Their camera."""
+    """Kind of the stills' camera (see CameraSettings)."""
 
 
 def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Array:
-    """(height, width, 3) uint8 of the given width; the ghosts' picture has `size`, the stills come below."""
+    """Draw the sheet, (height, width, 3) uint8 of the given width; the ghosts' picture has `size`, the stills come
+    below."""
     wide = replace(camera, kind="top" if camera.kind == "top" else "fixed")
     top = brush.paint(stage.views(wide, size)[0], stage.compose_ghosts(_choose_ghost_frames(stage)))
     row = _choose_row(stage, camera, size)
@@ -49,7 +50,7 @@ def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, siz
 
 
 def _choose_row(stage: Stage, camera: CameraSettings, size: tuple[int, int]) -> StillRow:
-    """One actor is seen close in upright stills; several need the whole picture."""
+    """Choose upright close stills for one actor; several need the whole picture."""
     if len(stage.players) == 1:
         return StillRow(6, 1.15, "top" if camera.kind == "top" else "follow")
     return StillRow(4, size[1] / size[0], camera.kind)
@@ -60,7 +61,7 @@ def _space_evenly(last: int, count: int) -> list[int]:
 
 
 def _choose_ghost_frames(stage: Stage) -> list[int]:
-    """Frames about a stride apart for who goes furthest; without the first where a loop ends there."""
+    """Choose frames about a stride apart for the actor that goes furthest, less the first where a loop ends there."""
     paths = [player.body.anatomy.hips_world[:, [0, 2]] for player in stage.players]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
     most = max(4, _MAX_GHOSTS // len(paths))

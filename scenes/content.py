@@ -1,4 +1,4 @@
-"""What one picture shows, and what it takes to paint it."""
+"""Content of one picture, and the protocol of its painter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ class Figure:
     """One body in one pose."""
 
     body: Mannequin
-    """Whose."""
+    """Body of an actor."""
     frame: int
-    """Of its own motion."""
+    """Frame of the actor's own motion."""
     fade: float = 0.0
     """Share of the background in its colours; ghosts have some."""
 
     def surface(self) -> Surface:
-        """Its skin."""
+        """Return the body's surface."""
         skin = self.body.surface(self.frame)
         rgba = skin.rgba.copy()
         rgba[:, :3] = colours.blend_colours(rgba[:, :3], colours.rgb(colours.BACKGROUND), self.fade)
@@ -31,7 +31,7 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What one picture shows."""
+    """Content of one picture."""
 
     ground: Sequence[Surface]
     """Flat surfaces in the order in which they cover each other; the figures' shadows fall on them."""
@@ -46,5 +46,5 @@ class Painter(Protocol):
     name: str
 
     def paint(self, view: View, content: Content) -> Array:
-        """(height, width, 3) uint8."""
+        """Paint (height, width, 3) uint8."""
         ...

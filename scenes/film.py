@@ -21,7 +21,7 @@ from scenes.writers import gif_writer, mp4_writer, save_png
 
 WRITERS = {".mp4": mp4_writer, ".gif": gif_writer}
 ENDINGS = (*WRITERS, ".png")
-"""What `film` can write."""
+"""Endings that `film` can write."""
 _MIN_PIXELS, _MAX_PIXELS = 16, 8192
 
 PathOrText = str | PathLike[str]
@@ -66,7 +66,7 @@ def film(
 
 
 def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path]:
-    """The paths, or RequestError before any long work."""
+    """Check outputs before any long work; return the paths. RequestError otherwise."""
     width, height = size
     if not (_MIN_PIXELS <= width <= _MAX_PIXELS and _MIN_PIXELS <= height <= _MAX_PIXELS):
         raise RequestError(f"the size must be {_MIN_PIXELS} to {_MAX_PIXELS} pixels a side, got {width}x{height}")
@@ -81,7 +81,7 @@ def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path
 
 
 def render_frames(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Iterator[Array]:
-    """Every picture of a film in turn, (height, width, 3) uint8."""
+    """Render every picture of a film in turn, (height, width, 3) uint8."""
     for frame, view in enumerate(stage.views(camera, size)):
         yield brush.paint(view, stage.content(frame))
 

@@ -1,4 +1,4 @@
-"""What lies on the ground: metre grid, curve, walked trail, planted-foot marks, soft shadows.
+"""Marks on the ground: metre grid, curve, walked trail, planted-foot marks, soft shadows.
 
 All are flat surfaces a few millimetres apart; whoever draws them keeps the order of this file.
 """
@@ -27,7 +27,7 @@ _SHADOW_STRENGTH = 0.5
 
 
 def build_grid(places: Array) -> Surface:
-    """Squares of 1 m and lines, every fifth stronger, around the places (n, 2) x, z; they fade with distance.
+    """Build squares of 1 m and lines, every fifth stronger, around positions (n, 2) x, z; they fade with distance.
 
     Where the places are more than 60 m apart the squares grow to 5 m, 25 m and so on.
     """
@@ -49,7 +49,7 @@ def build_grid(places: Array) -> Surface:
 
 
 def _build_tiles(x: Array, z: Array, step: float) -> Array:
-    """Every second square of a chessboard, (quads, 4, 2)."""
+    """Build every second square of a chessboard, (quads, 4, 2)."""
     a, b = np.meshgrid(x[:-1], z[:-1], indexing="ij")
     dark = (a + b) % 2 == 0
     corner = np.stack([a[dark], b[dark]], axis=-1)[:, None]
@@ -57,7 +57,7 @@ def _build_tiles(x: Array, z: Array, step: float) -> Array:
 
 
 def _build_lines(x: Array, z: Array, step: float) -> Array:
-    """Lines along z in pieces of one square, so that they can fade, (quads, 4, 2)."""
+    """Build lines along z in pieces of one square, so that they can fade, (quads, 4, 2)."""
     a, b = np.meshgrid(x, z[:-1], indexing="ij")
     half = np.where(a % 5 == 0, _MAJOR_LINE, _LINE).reshape(-1, 1) / 2 * step**0.5
     left, right = a.reshape(-1, 1) * step - half, a.reshape(-1, 1) * step + half
@@ -66,7 +66,7 @@ def _build_lines(x: Array, z: Array, step: float) -> Array:
 
 
 def _fade_quads(quads: Array, height: Array, rgb: Array, strength: Array, tree: KDTree) -> Surface:
-    """Quads whose colours turn into the background's; opaque, for eight bits of opacity show as rings."""
+    """Build quads whose colours fade to the background's; opaque, for eight bits of opacity show as rings."""
     distance = tree.query(quads.reshape(-1, 2))[0].reshape(-1, 4)
     share = np.clip((_FADE_END - distance) / (_FADE_END - _FADE_START), 0, 1)
     shown = strength[:, None] * share * share * (3 - 2 * share)
@@ -80,7 +80,7 @@ def _fade_quads(quads: Array, height: Array, rgb: Array, strength: Array, tree: 
 
 
 def build_ribbon(points: Array, *, width: float, rgb: Array, height: float) -> Surface:
-    """A flat band along points (n, 2) x, z on the ground, or (n, 3) in space, of constant width in metres."""
+    """Build a flat band along points (n, 2) x, z on the ground, or (n, 3) in space, of constant width in metres."""
     space = np.insert(points, 1, 0.0, axis=1) if points.shape[1] == 2 else points
     space = space + np.array([0.0, height, 0.0])
     along = np.gradient(space[:, [0, 2]], axis=0) if len(space) > 1 else np.ones((1, 2))
@@ -93,12 +93,12 @@ def build_ribbon(points: Array, *, width: float, rgb: Array, height: float) -> S
 
 
 def cut_ribbon(whole: Surface, points: int) -> Surface:
-    """The first `points` points of a ribbon."""
+    """Return the first `points` points of a ribbon."""
     return Surface(whole.vertices[: 2 * points], whole.faces[: 2 * max(points - 1, 0)], whole.rgba[: 2 * points])
 
 
 def build_discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: int = 24) -> Surface:
-    """Marks on the ground at centres (n, 2) x, z in colours (n, 3): a pale disc with a strong rim."""
+    """Build marks on the ground at centres (n, 2) x, z in colours (n, 3): a pale disc with a strong rim."""
     turn = np.arange(corners) * 2 * np.pi / corners
     circle = np.stack([np.sin(turn), np.cos(turn)], axis=-1)
     rings = np.concatenate([np.zeros((1, 2)), *(circle * radius * share for share in (0.74, 0.78, 1.0))])
@@ -115,10 +115,10 @@ def build_discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: i
 
 
 def build_shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
-    """Soft shadow of capsules (n, 2, 3) on the ground, darker and sharper the closer they are to it.
+    """Build the soft shadow of capsules (n, 2, 3) on the ground, darker and sharper the closer they are to it.
 
-    Each capsule falls along LIGHT; the higher it is the more its edge is blurred, as under a large lamp.
-    `layer` keeps the shadows of several actors apart.
+    Each capsule falls along LIGHT; the higher it is the more its edge is blurred, as under a large lamp. `layer` keeps
+    the shadows of several actors apart.
     """
     flat = segments[..., [0, 2]] - segments[..., 1:2] * (LIGHT[[0, 2]] / LIGHT[1])
     blur = 0.02 + 0.22 * np.clip(segments[..., 1], 0, None)
@@ -137,7 +137,7 @@ def build_shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
 
 
 def _compute_transmittance(places: Array, flat: Array, blur: Array, radii: Array) -> Array:
-    """Share of light that reaches each place (m, 2) past all capsules."""
+    """Compute the share of light that reaches each position (m, 2) past all capsules."""
     left = np.ones(len(places), dtype=np.float32)
     for (start, stop), soft, radius in zip(flat, blur, radii, strict=True):
         along = stop - start
@@ -153,5 +153,5 @@ def _compute_transmittance(places: Array, flat: Array, blur: Array, radii: Array
 
 
 def _triangulate_quads(quads: Array) -> Array:
-    """Two triangles for each quad (n, 4), next to each other so that the drawing order stays."""
+    """Return two triangles for each quad (n, 4), next to each other so that the drawing order stays."""
     return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)

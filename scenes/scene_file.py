@@ -36,52 +36,52 @@ class Actor:
     name: Annotated[str, Field(pattern=r"^[\w-]+$")] = ""
     """Used in file names; `actor1`, `actor2`, ... if not given."""
     speed: Annotated[float, Field(gt=0, le=20)] | None = None
-    """Along the curve, m/s; the controller's own if not given."""
+    """Speed along the curve, m/s; the controller's own if not given."""
     seconds: Seconds | None = None
-    """How long the actor walks; once along the curve if not given."""
+    """Duration of the walk, seconds; once along the curve if not given."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Of everything random about this actor."""
+    """Seed of everything random about this actor."""
     colour: str | None = None
-    """Of the torso: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
+    """Torso colour: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
     offset: tuple[Coordinate, Coordinate] = (0.0, 0.0)
-    """Where the curve's origin goes, x and z, metres."""
+    """Position of the curve's origin, x and z, metres."""
     turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """How far the curve is turned about its origin before that, degrees; positive turns +Z toward +X."""
+    """Rotation of the curve about its origin before that, degrees; positive turns +Z toward +X."""
     start_seconds: Annotated[float, Field(ge=0, le=_MAX_SECONDS)] = 0.0
-    """When the actor starts; until then it stands in its first pose."""
+    """Start time, seconds; until then the actor stands in its first pose."""
 
 
 @dataclass(frozen=True)
 class SceneDescription:
-    """A whole scene file."""
+    """Contents of a scene file."""
 
     __pydantic_config__ = STRICT
 
     actors: Annotated[tuple[Actor, ...], Field(min_length=1, max_length=100)]
-    """Who walks; one [[actors]] table each."""
+    """Actors, one [[actors]] table each."""
     outputs: Annotated[tuple[str, ...], Field(min_length=1)]
     """File names: .mp4, .gif, .png of all; .bvh, .npz, one an actor; .json for the report."""
     title: str = ""
-    """For people."""
+    """Description for people."""
     prior: str = "locomotion"
-    """Which bundled or trained prior moves the actors."""
+    """Bundled or trained prior that moves the actors."""
     camera: CameraSettings = field(default_factory=CameraSettings)
-    """Who looks from where."""
+    """Camera of the film."""
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (1280, 720)
     """Width and height of the pictures, pixels."""
     fps: Annotated[float, Field(gt=0, le=240)] | None = None
     """Frame rate of the film; the motions' own if not given."""
 
     def films(self, folder: PathLike[str] | str) -> list[Path]:
-        """Paths of videos and pictures."""
+        """Return paths of videos and pictures."""
         return self._select_paths(folder, _FILMS)
 
     def reports(self, folder: PathLike[str] | str) -> list[Path]:
-        """Paths of JSON reports."""
+        """Return paths of JSON reports."""
         return self._select_paths(folder, _REPORTS)
 
     def motions(self, folder: PathLike[str] | str) -> Mapping[str, list[Path]]:
-        """Actor name to its motion's paths; `walk.bvh` becomes `walk-NAME.bvh` where there are several."""
+        """Map actor names to their motions' paths; `walk.bvh` becomes `walk-NAME.bvh` where there are several."""
         paths = self._select_paths(folder, _MOTIONS)
         if len(self.actors) == 1:
             return {self.actors[0].name: paths}
@@ -92,7 +92,7 @@ class SceneDescription:
 
 
 def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]]:
-    """The scene and each actor's curve in the world, checked. FileFormatError names the file and the key."""
+    """Load the scene and each actor's curve in the world, checked. FileFormatError names the file and the key."""
     try:
         scene = toml.read(path, SceneDescription, what="scene file", unknown=_list_allowed_keys)
     except RequestError as error:
@@ -109,7 +109,7 @@ def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]
 
 
 def transform_curve(actor: Actor, folder: Path) -> Curve:
-    """The actor's curve turned and moved to its place; files are relative to `folder`."""
+    """Rotate and move the actor's curve into the world; files are relative to `folder`."""
     is_file = PurePath(actor.curve).suffix.lower() in (".csv", ".svg")
     curve = curves.read(folder / actor.curve if is_file else actor.curve)
     points = curve.points.numpy().copy()
@@ -131,7 +131,7 @@ def _name_actors(scene: SceneDescription) -> SceneDescription:
 
 
 def _check(path: str | PathLike[str], scene: SceneDescription) -> None:
-    """What the types cannot say."""
+    """Check what the types cannot express."""
     names = [actor.name for actor in scene.actors]
     for number, actor in enumerate(scene.actors):
         if names.index(actor.name) != number:

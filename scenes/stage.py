@@ -1,4 +1,4 @@
-"""Who is in a film and what lies on the ground, frame by frame, for whoever paints it."""
+"""Actors of a film and marks on the ground, frame by frame, for whoever paints them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,29 +27,29 @@ class Shot(NamedTuple):
     """One actor of a film; a plain tuple (motion, curve, colour, start) serves as well."""
 
     motion: Motion
-    """On any rig and at any frame rate."""
+    """Motion on any rig and at any frame rate."""
     curve: Curve | None = None
-    """What the actor was asked to follow."""
+    """Curve that the actor was asked to follow."""
     colour: str | None = None
     """Name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
     start_seconds: float = 0.0
-    """When the motion begins; until then the actor stands in its first pose."""
+    """Start of the motion, seconds; until then the actor stands in its first pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class StagedActor:
-    """An actor made ready: its body, and its ribbons and contacts worked out once."""
+    """An actor made ready: its body, and its ribbons and contacts computed once."""
 
     body: Mannequin
     wish: Surface | None
     trail: Surface
     planted: Array
-    """(frames, feet) whether the foot stands."""
+    """(frames, feet) whether the foot is planted."""
     start: int
-    """Film frame of the motion's first."""
+    """Film frame of the motion's first frame."""
 
     def frame(self, film_frame: int) -> int:
-        """The motion's frame at a film's; the first before it starts and the last after it ends."""
+        """Return the motion's frame at a film's; the first before it starts and the last after it ends."""
         return min(max(film_frame - self.start, 0), self.body.num_frames - 1)
 
 
@@ -72,7 +72,7 @@ class Stage:
         return float(self.num_frames / self.fps)
 
     def content(self, film_frame: int) -> Content:
-        """Everything at one frame."""
+        """Return the content of one frame."""
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
         trails = [overlays.cut_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_build_contact_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
@@ -80,7 +80,7 @@ class Stage:
         return Content(ground, figures)
 
     def compose_ghosts(self, film_frames: Sequence[int]) -> Content:
-        """All actors at several moments in one picture, earlier ones paler, with the whole trails."""
+        """Compose all actors at several times in one picture, earlier ones paler, with the whole trails."""
         fades = np.linspace(0.62, 0.0, len(film_frames)) if len(film_frames) > 1 else [0.0]
         moments = list(zip(film_frames, fades, strict=True))
         figures = [
@@ -93,7 +93,7 @@ class Stage:
         return Content([self._still, *trails], figures)
 
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
-        """One view a frame that shows all actors, and all curves unless the camera follows."""
+        """Return one view a frame that shows all actors, and all curves unless the camera follows."""
         index = [[p.frame(k) for k in range(self.num_frames)] for p in self.players]
         bodies = [p.body.anatomy.seen[i] for p, i in zip(self.players, index, strict=True)]
         hips = [p.body.anatomy.hips_world[i] for p, i in zip(self.players, index, strict=True)]
@@ -105,7 +105,7 @@ class Stage:
         return compute_views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
 
     def _places(self) -> Array:
-        """(n, 3) where anything happens, for the grid."""
+        """Return (n, 3) positions where anything happens, metres, for the grid."""
         paths = [p.body.anatomy.hips_world for p in self.players]
         return np.concatenate([*paths, *(p.wish.vertices for p in self.players if p.wish is not None)])
 
@@ -116,7 +116,7 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     motion = shot.motion.resample(fps)
     colour = colours.rgb(shot.colour or colours.default_colour(number))
     body = Mannequin(motion, colour)
-    # One actor has a red wish and a yellow trail as in the paper; among several both must say whose they are.
+    # One actor has a red curve and a yellow trail as in Wang et al. 2019; among several both must say whose they are.
     wish, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
         wish, trod = colours.blend_colours(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
@@ -127,7 +127,7 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
 
 
 def _build_curve_ribbon(curve: Curve, rgb: Array) -> Surface:
-    """A band along the curve; its dense points are thinned to what a picture shows."""
+    """Build a band along the curve; its dense points are thinned to what a picture shows."""
     points = curve.points.detach().cpu().numpy()
     keep = max(1, round(_RIBBON_STEP / max(curve.length / (len(points) - 1), 1e-6)))
     thin = np.concatenate([points[:-1:keep], points[-1:]])
@@ -142,7 +142,7 @@ def _detect_foot_contacts(body: Mannequin, fps: float) -> Array:
 
 
 def _build_contact_marks(player: StagedActor, frame: int) -> Surface | None:
-    """A disc under the ball of every foot that stands, in its side's colour."""
+    """Build a disc under the ball of every planted foot, in its side's colour."""
     feet = [foot for foot, stands in zip(player.body.anatomy.feet, player.planted[frame], strict=True) if stands]
     if not feet:
         return None

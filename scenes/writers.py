@@ -81,7 +81,7 @@ def _check_gif_size(pictures: int, size: tuple[int, int]) -> None:
 
 
 def _quantize(image, picture: Array, first):
-    """With the palette of the first picture, or for the first with one of its own."""
+    """Quantise with the palette of the first picture, or for the first with one of its own."""
     whole, plain = image.fromarray(picture), image.Dither.NONE
     if first is None:
         sample = image.fromarray(np.concatenate([picture, _make_swatches(picture.shape[1], picture.shape[0] // 12)]))
@@ -90,7 +90,7 @@ def _quantize(image, picture: Array, first):
 
 
 def _make_swatches(width: int, height: int) -> Array:
-    """(4 * ceil(height / 4), width, 3): colours in light and shade that the first picture may lack."""
+    """Make (4 * ceil(height / 4), width, 3): colours in light and shade that the first picture may lack."""
     shown = (colours.LEFT, colours.RIGHT, colours.TARGET, colours.TRAIL)
     light = np.linspace(0.55, 1.0, width)[:, None]
     rows = np.stack([colours.rgb(colour) * light * 255 for colour in shown])

@@ -15,8 +15,7 @@ from mapctl.kinematics import local_from_world
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask
 from mapctl.retarget import from_canonical, to_canonical
-from mapctl.skeleton import CANONICAL
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import CANONICAL, LIMBS, TOES
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def perturb_positions(motion: Motion, generator: torch.Generator, *, centimetres
     for joint in range(CANONICAL.num_joints):
         if below := CANONICAL.children(joint):
             child = below[0]
-            turn = _shortest_arc(places[:, child] - places[:, joint], wrong[:, child] - wrong[:, joint])
+            turn = rotations.between_vectors(places[:, child] - places[:, joint], wrong[:, child] - wrong[:, joint])
             world[:, joint] = rotations.multiply(turn, world[:, joint])
     local = rotations.make_sign_continuous(local_from_world(CANONICAL.parents, world))
     spoilt = replace(canonical, root_position=wrong[:, 0], local_quat_xyzw=local)
@@ -82,7 +81,8 @@ def drop_arm(motion: Motion, generator: torch.Generator, *, seconds: float) -> C
     rigmap = retarget.identify_rig(motion.skeleton)
     length = min(round(seconds * float(motion.fps)), motion.num_frames // 2)
     start = (motion.num_frames - length) // 2
-    arm = [rigmap.joint_of[CANONICAL.index(name)] for name in ("leftUpperArm", "leftLowerArm", "leftHand")]
+    limb = LIMBS["leftHand"]
+    arm = [rigmap.joint_of[joint] for joint in (limb.upper, limb.lower, limb.end)]
     joints = [joint for joint in arm if joint is not None]
     lost = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
     lost[start : start + length, joints] = True
@@ -115,7 +115,7 @@ CONDITIONS: Mapping[str, CorruptionFunction] = {
 def detect_true_contacts(motion: Motion) -> Tensor:
     """Left and right toe planted in a clean motion, at its own rate (frames, 2)."""
     canonical, _ = to_canonical(motion)
-    toes = [canonical.skeleton.index(name) for name in TOES]
+    toes = canonical.skeleton.indices(TOES)
     return detect_contacts(canonical.joint_positions()[:, toes], float(motion.fps))
 
 
@@ -142,10 +142,3 @@ def _randomise_rotations(motion: Motion, lost: Tensor, generator: torch.Generato
     """Lost joints turned at random, so that whoever looks at them sees it."""
     wild = rotations.from_rotation_vector(_sample_angle_noise(motion, generator))
     return replace(motion, local_quat_xyzw=torch.where(lost[..., None], wild, motion.local_quat_xyzw))
-
-
-def _shortest_arc(start: Tensor, stop: Tensor) -> Tensor:
-    """Quaternions (frames, 4) of the smallest turns from one direction to another."""
-    start, stop = (torch.nn.functional.normalize(vector, dim=-1) for vector in (start, stop))
-    real = 1 + (start * stop).sum(dim=-1, keepdim=True)
-    return torch.nn.functional.normalize(torch.cat([torch.linalg.cross(start, stop), real], dim=-1), dim=-1)

@@ -14,8 +14,7 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
-from mapctl.skeleton import CANONICAL
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import CANONICAL, TOES
 
 GAP_LENGTHS = (15, 30, 60, 90, 120, 180)
 """Frames of the gaps."""
@@ -63,7 +62,7 @@ def _evaluate_gap(
     lost = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
     done: InfillResult = fill(part, lost, infiller, another=partial(choose_proposals, densities=densities))
     off = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
-    toes = [CANONICAL.index(name) for name in TOES]
+    toes = CANONICAL.indices(TOES)
     slid, mocap = (
         worst_frame.measure_longest_unsupported(each.joint_positions()[:, toes], each.root_position, PRIOR_FPS)
         for each in (done.motion, part)

@@ -20,12 +20,10 @@ from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask
-from mapctl.skeleton import CANONICAL, leg_length
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
 WINDOW_FRAMES = 120
 """Frames of a clip that are looked at: the paper's 4 s."""
-_TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 _GAP_CONTEXT_FRAMES = 40  # frames on either side while the gap's length is varied
 _COMPARED_METHODS: tuple[InfillMethod, InfillMethod] = ("linear", "map")
 _MEASURED_BONES = tuple(
@@ -166,7 +164,7 @@ def _evaluate_network(clip: Motion, task: Task, network: Inbetweener, generator:
     known = _sample_observation_mask(task, generator)
     seen = truth + task.noise * torch.randn(truth.shape, generator=generator)
     facing = heading(clip.local_quat_xyzw[:, 0]).float()
-    stands = contacts.detect_contacts(truth[:, list(_TOES)], PRIOR_FPS).float()
+    stands = contacts.detect_contacts(truth[:, list(TOE_JOINTS)], PRIOR_FPS).float()
     guess = interpolate_positions(seen[None], clip.local_quat_xyzw.float()[None], known[None])
     image = PositionImage.of_world(
         guess,
@@ -174,7 +172,7 @@ def _evaluate_network(clip: Motion, task: Task, network: Inbetweener, generator:
         stands[None],
         known=known[None],
         present=torch.ones(1, len(truth), dtype=torch.bool),
-        toes=_TOES,
+        toes=TOE_JOINTS,
     )
     places = image.to_world(network.propose(image).places)[0]
     return _measure_errors(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))

@@ -21,7 +21,7 @@ from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import TOES
 
 TWEEN_FRAMES = 6 * PRIOR_FPS
 """Of a clip that are looked at."""

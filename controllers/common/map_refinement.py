@@ -28,11 +28,10 @@ from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, Re
 from mapctl.problem.solution import Outcome, WindowRecord
 from mapctl.protocols import Density
 from mapctl.recording import Capture
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
-from mapctl.terms.foot_contact import TOES
 
 _DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the travel of planted toes is averaged
 
@@ -179,7 +178,7 @@ def anchor_to_contacts(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Mo
 
     For captures whose body drifts against its feet. Feet that roll or turn while they stand are taken to do so.
     """
-    toes = [motion.skeleton.index(name) for name in TOES]
+    toes = motion.skeleton.indices(TOES)
     ground = motion.joint_positions()[:, toes][..., ::2]
     step = torch.diff(ground, dim=0, prepend=ground[:1])
     planted = (contacts & torch.cat([contacts[:1], contacts[:-1]])).to(step)
@@ -194,7 +193,7 @@ def anchor_to_contacts(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Mo
 
 def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> float:
     """Of the performer's planted toes, metres; where none is planted, of low ones."""
-    toes = [motion.skeleton.index(name) for name in TOES]
+    toes = motion.skeleton.indices(TOES)
     heights = motion.joint_positions()[:, toes, 1]
     planted = heights[contacts]
     return float(planted.median() if len(planted) else heights.quantile(0.05))

@@ -25,9 +25,8 @@ from mapctl.recording.masks import Mask, expand_masks
 from mapctl.recording.pose_mixing import angle_between, linear_fit_weights
 from mapctl.retarget import RigMap, from_canonical
 from mapctl.retarget.pose_axes import RigPoses
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
-_LIMBS = tuple(side + part for side in ("left", "right") for part in ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg"))
 _TPOSE_TOLERANCE, _REST_TOLERANCE = (
     math.radians(40),
     math.radians(35),
@@ -98,7 +97,7 @@ def _resembles_tpose(canonical: Motion) -> bool:
 
 def _is_near_zero_pose(motion: Motion, rigmap: RigMap) -> bool:
     """Whether the limbs of frame 0 are turned as little as in the pose of no rotations."""
-    joints = [joint for name in _LIMBS if (joint := rigmap.joint_of[CANONICAL.index(name)]) is not None]
+    joints = [j for limb in LIMBS.values() for k in (limb.upper, limb.lower) if (j := rigmap.joint_of[k]) is not None]
     return bool((rotations.to_rotation_vector(motion.local_quat_xyzw[0, joints]).norm(dim=-1) < _REST_TOLERANCE).all())
 
 

@@ -31,8 +31,7 @@ from mapctl.recording.spike_detection import find_residual_spikes
 from mapctl.recording.sure_smoothing import smooth_rotations
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, leg_length
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import CANONICAL, TOES, leg_length
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ class SegmentDenoiser:
         found += artefacts.list_spikes(names, self._map_spikes_to_rig(), away, "deg")
         found += artefacts.list_spikes([traveller], self._find_root_spikes(), apart[:, None], "cm")
         found += artefacts.list_dropouts(names, examined.dropouts)
-        toes = [proposal.skeleton.index(name) for name in TOES]
+        toes = proposal.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
         ratio = float(motion.fps) / float(self.shown.fps)

@@ -13,17 +13,15 @@ from controllers.inbetweening.keyframes import effector_joint
 from controllers.inbetweening.pipeline import InfillResult, InfillSettings, fill
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.kinematics import heading, inverse
-from mapctl.kinematics.inverse import Limb
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import Stance
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS, Limb
 
 _MIN_MARGIN_SECONDS = 0.3  # seconds
 _USUAL_HAND_ACCELERATION, _MAX_HAND_ACCELERATION = 20.0, 80.0  # m/s^2 of a hand

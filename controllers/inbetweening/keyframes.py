@@ -7,14 +7,14 @@ import torch
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 
 def missing_between_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> MissingMask:

@@ -22,17 +22,17 @@ _FILE_ENDINGS = (".csv", ".tsv", ".txt", ".svg")
 
 
 def from_points(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool | None = None) -> Curve:
-    """The curve through points (x, z) or (x, y, z) in metres: an array or tensor of shape (n, 2) or (n, 3).
+    """Build the curve through points (x, z) or (x, y, z) in metres: an array or tensor of shape (n, 2) or (n, 3).
 
-    `closed` None closes it where its ends meet (within 1 mm, or half the points' usual spacing). RequestError
-    for fewer than 2 distinct points, more than a million, values that are not finite, or lengths that are not
-    1 cm to 100 km.
+    `closed` None closes it where its ends meet (within 1 mm, or half the points' usual spacing). RequestError for fewer
+    than 2 distinct points, more than a million, values that are not finite, or lengths that are not 1 cm to 100 km.
     """
     return Curve(*build_dense_polyline(points, closed))
 
 
 def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
-    """A smooth open curve through a few points set by hand: a cubic spline over the square root of the chord length.
+    """Build a smooth open curve through a few points set by hand: a cubic spline over the square root of the chord
+    length.
 
     That parameter (as in centripetal Catmull-Rom splines) keeps loops out where far and near points follow each other.
     Errors as of `from_points`, of which it is a finer case.
@@ -49,27 +49,27 @@ def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
 
 
 def circle(*, radius: float) -> Curve:
-    """A circle to the left of its start, the origin, heading +Z; radius in metres (0.01 to 10,000)."""
+    """Make a circle to the left of its start, the origin, heading +Z; radius in metres (0.01 to 10,000)."""
     return _build_shape("circle", {"radius": radius})
 
 
 def figure8(*, radius: float) -> Curve:
-    """Two circles that touch at the origin, the left one first, both along +Z there; radius in metres."""
+    """Make two circles that touch at the origin, the left one first, both along +Z there; radius in metres."""
     return _build_shape("figure8", {"radius": radius})
 
 
 def s(*, length: float) -> Curve:
-    """An S: a half circle to the left, then one to the right; `length` metres from end to end, along +X."""
+    """Make an S: a half circle to the left, then one to the right; `length` metres from end to end, along +X."""
     return _build_shape("s", {"length": length})
 
 
 def line(*, length: float) -> Curve:
-    """A straight line along +Z; length in metres."""
+    """Make a straight line along +Z; length in metres."""
     return _build_shape("line", {"length": length})
 
 
 def wave(*, amplitude: float, length: float) -> Curve:
-    """One period of a sine along +Z, first to the left; `amplitude` is half of peak to peak; metres."""
+    """Make one period of a sine along +Z, first to the left; `amplitude` is half of peak to peak; metres."""
     return _build_shape("wave", {"amplitude": amplitude, "length": length})
 
 
@@ -78,10 +78,10 @@ def _build_shape(name: str, sizes: dict[str, float]) -> Curve:
 
 
 def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -> Curve:
-    """The curve that a shape (`circle:4`, `wave:1x8`), a CSV file or an SVG file (by its ending) describes.
+    """Read the curve that a shape (`circle:4`, `wave:1x8`), a CSV file or an SVG file (by its ending) describes.
 
-    `metres_per_unit` scales a file's numbers; by default a CSV is in metres and 100 SVG units are a metre.
-    RequestError for shapes and scales that cannot be; FileFormatError, with its line, for files.
+    `metres_per_unit` scales a file's numbers; by default a CSV is in metres and 100 SVG units are a metre. RequestError
+    for shapes and scales that cannot be; FileFormatError, with its line, for files.
     """
     text = os.fspath(source)
     if metres_per_unit is not None and not 1e-9 <= metres_per_unit <= 1e9:

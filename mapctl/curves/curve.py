@@ -84,7 +84,7 @@ class Curve:
         return min(TANGENT_BASE, self.length / 8) / 2
 
     def _segment(self, arc: Tensor) -> tuple[Tensor, Int[Tensor, "*batch"]]:
-        """The arc within the tables, float64, and the segment it lies on."""
+        """Return the arc within the tables, float64, and the segment it lies on."""
         arc = torch.remainder(arc.double(), self.length) if self.closed else arc.double()
         return arc, _find_segment(self._tables[0], arc)
 
@@ -94,12 +94,12 @@ class Curve:
         return points[segment] + (arc - knots[segment]).unsqueeze(-1) * directions[segment]
 
     def point(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
-        """The place on the curve at an arc, metres."""
+        """Return the position on the curve at an arc, metres."""
         arc = _to_tensor(arc)
         return self._point_at(arc).to(arc.dtype)
 
     def tangent(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
-        """Unit direction of travel: a chord of 5 cm, so that the jitter of a drawing does not flip it."""
+        """Return the unit direction of travel: a chord of 5 cm, so that the jitter of a drawing does not flip it."""
         arc = _to_tensor(arc)
         chord = self._point_at(arc.double() + self._half_base) - self._point_at(arc.double() - self._half_base)
         # At the tip of a way back on itself the chord vanishes; the segment still has a direction.
@@ -108,7 +108,7 @@ class Curve:
         return _normalise(chord).to(arc.dtype)
 
     def left(self, arc: Arc) -> Float[Tensor, "*batch 2"]:
-        """Unit ground vector (x, z) to the left of travel."""
+        """Return the unit ground vector (x, z) to the left of travel."""
         tangent = self.tangent(arc)
         across = torch.stack([tangent[..., -1], -tangent[..., 0]], dim=-1)
         return across / across.norm(dim=-1, keepdim=True).clamp_min(1e-9)
@@ -137,17 +137,17 @@ class Curve:
         return ((ahead - behind) / base).to(arc.dtype)
 
     def _of_curve(self, points_world: Tensor) -> Tensor:
-        """Points in the curve's own coordinates: world points lose their height for a curve on the ground."""
+        """Return points in the curve's own coordinates: world points lose their height for a curve on the ground."""
         return points_world[..., ::2] if points_world.shape[-1] > self.dims else points_world
 
     def nearest(
         self, points_world: Float[Tensor, "*batch axes"], around: Arc | None = None, *, reach: float = 0.5
     ) -> Float[Tensor, "*batch"]:
-        """Arc of the point nearest to each given one: (x, y, z), or (x, z) for a curve on the ground.
+        """Find the arc of the point nearest to each given one: (x, y, z), or (x, z) for a curve on the ground.
 
-        With `around`, only arcs within `reach` metres of it are searched, so that a curve that crosses itself
-        is not left for its other branch; the result is not wrapped (it stays near `around`) and may lie
-        beyond the ends. Without, the whole curve is searched between its ends. Differentiable in the points.
+        With `around`, only arcs within `reach` metres of it are searched, so that a curve that crosses itself is not
+        left for its other branch; the result is not wrapped (it stays near `around`) and may lie beyond the ends.
+        Without, the whole curve is searched between its ends. Differentiable in the points.
         """
         points = self._of_curve(points_world)
         if around is None:
@@ -161,7 +161,7 @@ class Curve:
         return (guess + self._project(points, segments, within)).to(points.dtype)
 
     def _project(self, points: Tensor, segments: Int[Tensor, "*batch tried"], within: Tensor | float) -> Tensor:
-        """Metres from the arc `within` to the nearest place on the best of each point's segments."""
+        """Return metres from the arc `within` to the nearest position on the best of each point's segments."""
         knots, corners, directions = self._tables
         last = len(directions) - 1
         segments = segments % (last + 1) if self.closed else segments.clamp(0, last)
@@ -178,7 +178,7 @@ class Curve:
         return torch.remainder(step + self.length / 2, self.length) - self.length / 2 if self.closed else step
 
     def _search_closest(self, points: Tensor, around: Tensor, reach: float, step: float) -> Tensor:
-        """The closest to each point of the arcs `around` - reach ... + reach, `step` apart."""
+        """Find the closest to each point among the arcs `around` - reach ... + reach, `step` apart."""
         count = math.ceil(reach / step)
         arcs = around.unsqueeze(-1) + torch.arange(-count, count + 1, dtype=torch.float64) * (reach / count)
         best = (self._point_at(arcs) - points.unsqueeze(-2)).square().sum(-1).argmin(-1, keepdim=True)
@@ -198,19 +198,19 @@ class Curve:
         return arc.to(points.dtype)
 
     def signed_offset(self, points_world: Float[Tensor, "*batch axes"], arc: Arc) -> Float[Tensor, "*batch"]:
-        """Metres from the curve's place at `arc` to each point, sideways on the ground; left is positive."""
+        """Return metres from the curve's position at `arc` to each point, sideways on the ground; left is positive."""
         apart = self._of_curve(points_world) - self.point(arc)
         return (apart[..., :: self.dims - 1] * self.left(arc)).sum(-1)
 
     def track(
         self, points_world: Float[Tensor, "frames axes"], *, start: float | None = None, reach: float = 0.5
     ) -> Float[Tensor, "frames"]:
-        """Arcs of a walk, not wrapped: along the curve without a jump, and forward unless the walk goes back.
+        """Track the arcs of a walk, not wrapped: along the curve without a jump, and forward unless the walk goes back.
 
         So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are told apart, and
         laps of a closed one counted (see `mapctl.curves.tracking`). `start` is where to look first, within `reach`
-        metres; by default the curve's start if the walk begins within `reach` of it (where a figure-8 crosses, arcs
-        are ambiguous), else wherever the whole walk fits best.
+        metres; by default the curve's start if the walk begins within `reach` of it (where a figure-8 crosses, arcs are
+        ambiguous), else wherever the whole walk fits best.
         """
         points = self._of_curve(points_world).detach().double()
         if start is None and bool((points[0] - self.start).norm() <= reach):
@@ -223,7 +223,7 @@ def _to_tensor(arc: Arc) -> Tensor:
 
 
 def _find_segment(knots: Tensor, arc: Tensor) -> Int[Tensor, "*batch"]:
-    """Index of the knot before each arc; the first or the last but one for arcs outside."""
+    """Find the index of the knot before each arc; the first or the last but one for arcs outside."""
     return torch.searchsorted(knots, arc.detach().contiguous(), right=True).sub(1).clamp(0, len(knots) - 2)
 
 

@@ -27,10 +27,10 @@ _EXPECTED = "expected columns x,z or x,y,z in metres"
 
 
 def read_csv(path: str | PathLike[str]) -> ndarray:
-    """Points (n, 2) as x, z or (n, 3) as x, y, z from a table, metres.
+    """Read points (n, 2) as x, z or (n, 3) as x, y, z from a table, metres.
 
-    Delimiters: comma, semicolon (then a decimal comma is understood), tab or blanks. A header is optional and
-    may order the columns; blank lines and lines from `#` on are skipped. FileFormatError names file and line.
+    Delimiters: comma, semicolon (then a decimal comma is understood), tab or blanks. A header is optional and may order
+    the columns; blank lines and lines from `#` on are skipped. FileFormatError names file and line.
     """
     rows, order = [], None
     for number, line in enumerate(_read_text(path, MAX_CSV_BYTES).splitlines(), start=1):
@@ -74,7 +74,7 @@ def _split_line(line: str) -> list[str]:
 
 
 def _parse_header(path: str | PathLike[str], words: list[str], number: int) -> list[int] | None:
-    """Where the header says that x, (y,) z are; None if the line is no header."""
+    """Parse which columns are x, (y,) z; None if the line is no header."""
     if any(_is_number(word) for word in words):
         return None
     names = [word.lower() for word in words]
@@ -102,7 +102,7 @@ def _parse_row(path: str | PathLike[str], words: list[str], number: int, columns
 
 
 def _is_number(word: str) -> bool:
-    """Whether the word is a number, nan and inf included: those are refused by their size. `1_000` is none."""
+    """Return whether the word is a number, nan and inf included: those are refused by their size. `1_000` is none."""
     try:
         float(word)
     except ValueError:
@@ -111,11 +111,11 @@ def _is_number(word: str) -> bool:
 
 
 def read_svg(path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_UNIT) -> ndarray:
-    """Points (n, 2) along a drawing, metres.
+    """Read points (n, 2) along a drawing, metres.
 
-    SVG x is world x and SVG y, which points down the page, is world z: the page is the ground from above. The
-    curve is the drawing's paths, which must touch end to start; without any <path>, its lines, polylines,
-    circles and the like. Transforms are applied. FileFormatError for a file that is no such drawing.
+    SVG x is world x and SVG y, which points down the page, is world z: the page is the ground from above. The curve is
+    the drawing's paths, which must touch end to start; without any <path>, its lines, polylines, circles and the like.
+    Transforms are applied. FileFormatError for a file that is no such drawing.
     """
     pieces = [_sample_segment(path, segment, metres_per_unit) for segment in _read_segments(path, metres_per_unit)]
     points = np.concatenate(pieces)
@@ -125,7 +125,7 @@ def read_svg(path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_
 
 
 def _read_segments(path: str | PathLike[str], metres_per_unit: float) -> list:
-    """Path segments in drawing order, each of which starts where the one before ended."""
+    """Read the path segments in drawing order, each of which starts where the one before ended."""
     segments = [segment for drawn in _read_svg_paths(path) for segment in drawn]
     if not segments:
         raise FileFormatError(path, "holds no drawn path")
@@ -157,7 +157,7 @@ def _read_svg_paths(path: str | PathLike[str]) -> list:
 
 
 def _sample_segment(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
-    """A straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
+    """Sample a straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
 
     def places(count: int) -> ndarray:
         with np.errstate(all="ignore"):

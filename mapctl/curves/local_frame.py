@@ -1,6 +1,6 @@
-"""Where walkers stand beside a curve: the nearest place of each and the curve's axes there, in one compiled pass.
+"""Local frames of curves: the nearest position to each walker and the curve's axes there, in one compiled pass.
 
-Same places and directions as `Curve.nearest`, `Curve.point`, `Curve.tangent` and `Curve.left`, which are the
+Same positions and directions as `Curve.nearest`, `Curve.point`, `Curve.tangent` and `Curve.left`, which are the
 specification; a term that asks for all of them at every evaluation asks here.
 """
 
@@ -20,11 +20,11 @@ class LocalFrame:
     """The curve near each point; constants, without gradient."""
 
     place: Float[Tensor, "batch frames dims"]
-    """The nearest place, metres."""
+    """Nearest position on the curve, metres."""
     axes: Float[Tensor, "batch frames dims dims"]
     """Unit rows: left on the ground, forward; in space a third, upward less what of it lies along the slope."""
     tangent_extension: Float[Tensor, "batch frames dims"]
-    """Where the arc looked around would lie if the curve went straight on from the nearest place, metres."""
+    """Position of the arc looked around if the curve went straight on from the nearest one, metres."""
 
 
 class _CurveTables(NamedTuple):
@@ -39,7 +39,7 @@ class _CurveTables(NamedTuple):
 def find_local_frames(
     curve: Curve, points: Float[Tensor, "batch frames dims"], around: Float[Tensor, " frames"], *, reach: float
 ) -> LocalFrame:
-    """The nearest places within `reach` metres of the arcs `around`; results have the points' dtype.
+    """Find the nearest positions within `reach` metres of the arcs `around`; results have the points' dtype.
 
     Points have the curve's dimensions. Arcs that are not finite give NaN.
     """

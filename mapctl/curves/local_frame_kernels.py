@@ -1,4 +1,4 @@
-"""Compiled search of a curve's nearest place, and its axes there (imported late: needs numba). Float64."""
+"""Compiled search of a curve's nearest position, and its axes there (imported late: needs numba). Float64."""
 
 import math
 
@@ -13,7 +13,7 @@ _ARC_LIMIT = 1e9  # metres; beyond it, and for arcs that are no numbers, there i
 
 @inner
 def find_segment(curve, arc):
-    """The segment that an arc lies on, counted on through the laps of a closed curve, and the lap's first arc."""
+    """Find the segment of an arc, counted on through the laps of a closed curve, and the lap's first arc."""
     count, lap = len(curve.directions), 0.0
     if curve.closed:
         lap = math.floor(arc / curve.length)
@@ -23,7 +23,7 @@ def find_segment(curve, arc):
 
 @inner
 def evaluate_position(curve, arc, place):
-    """The place on the curve at an arc: straight on beyond open ends."""
+    """Evaluate the position on the curve at an arc: straight on beyond open ends."""
     segment = find_segment(curve, arc)
     lap, index = segment // len(curve.directions), segment % len(curve.directions)
     along = arc - lap * curve.length - curve.knots[index]
@@ -33,7 +33,7 @@ def evaluate_position(curve, arc, place):
 
 @inner
 def find_nearest_arc(curve, point, around, reach):
-    """Arc of the place nearest to a point on the segments within reach of `around`; NaN if the point is."""
+    """Find the arc of the position nearest to a point on the segments within reach of `around`; NaN if the point is."""
     best, found, count = math.inf, math.nan, len(curve.directions)
     for segment in range(find_segment(curve, around - reach), find_segment(curve, around + reach) + 1):
         lap, index = segment // count, segment % count
@@ -53,7 +53,7 @@ def find_nearest_arc(curve, point, around, reach):
 
 @inner
 def evaluate_axes(curve, arc, axes):
-    """Rows: left on the ground, forward (a chord's direction), and in space upward but for what lies forward."""
+    """Evaluate rows: left on the ground, forward (a chord's direction), in space upward but for what lies forward."""
     ahead, behind, last = np.empty(axes.shape[1]), np.empty(axes.shape[1]), axes.shape[1] - 1
     evaluate_position(curve, arc + curve.half_base, ahead)
     evaluate_position(curve, arc - curve.half_base, behind)
@@ -74,7 +74,7 @@ def evaluate_axes(curve, arc, axes):
 
 @entry
 def fill_local_frames(curve, points, around, reach, places, axes, straightened):
-    """For points (batch, frames, dims) and arcs `around` (frames), see `curve_axes.CurveAxes`."""
+    """Fill local frames of points (batch, frames, dims) near arcs `around` (frames); see `local_frame.LocalFrame`."""
     if curve.closed:
         reach = min(reach, 0.5 * curve.length)  # a lap holds every place once
     dims = points.shape[2]

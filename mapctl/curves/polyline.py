@@ -13,9 +13,9 @@ SPACING = 0.01
 TANGENT_BASE = 0.05
 """Metres of the chord that gives a tangent: longer than the jitter of a drawing, shorter than a stride."""
 MIN_LENGTH, MAX_LENGTH = 0.01, 100_000.0
-"""Metres that a curve may be long."""
+"""Least and greatest length of a curve, metres."""
 MAX_POINTS = 1_000_000
-"""Most points that a curve may be given with, and has."""
+"""Largest number of points that a curve may be given with, and has."""
 
 _COINCIDENT = 1e-6  # metres; nearer neighbours are one point
 _CLOSED_GAP = 1e-3  # metres; ends nearer than this meet
@@ -24,12 +24,12 @@ _CLOSED_GAP = 1e-3  # metres; ends nearer than this meet
 def build_dense_polyline(
     points: ndarray | Tensor, closed: bool | None = None
 ) -> tuple[Float[Tensor, "dense dims"], bool]:
-    """The polyline through `points` (n, 2 or 3; metres), vertices about 1 cm apart, and whether it is closed.
+    """Build the polyline through `points` (n, 2 or 3; metres), vertices about 1 cm apart, and whether it is closed.
 
-    Straight pieces are divided evenly; of points denser than 1 cm the one that bends the curve most is kept
-    in each centimetre. Closed where `closed` says so, or by default where the ends lie within 1 mm, or half
-    the points' usual spacing, of each other; a closed polyline repeats its first point at the end. Raises
-    RequestError with the reason where points make no curve.
+    Straight pieces are divided evenly; of points denser than 1 cm the one that bends the curve most is kept in each
+    centimetre. Closed where `closed` says so, or by default where the ends lie within 1 mm, or half the points' usual
+    spacing, of each other; a closed polyline repeats its first point at the end. Raises RequestError with the reason
+    where points make no curve.
     """
     given = _check_points(points)
     distinct = given[np.r_[True, _span_lengths(given) > _COINCIDENT]]
@@ -69,14 +69,14 @@ def _ends_meet(points: ndarray) -> bool:
 
 
 def _close_polyline(points: ndarray) -> ndarray:
-    """With the first point repeated at the end, exactly."""
+    """Repeat the first point at the end, exactly."""
     if np.linalg.norm(points[-1] - points[0]) <= _CLOSED_GAP:
         points = points[:-1]
     return np.concatenate([points, points[:1]])
 
 
 def _thin_points(points: ndarray, spacing: float) -> ndarray:
-    """Both ends, and of the points in each piece of `spacing` metres the one farthest from its chord."""
+    """Keep both ends, and of the points in each piece of `spacing` metres the one farthest from its chord."""
     arcs = np.r_[0.0, np.cumsum(_span_lengths(points))]
 
     def place(at: ndarray) -> ndarray:
@@ -92,7 +92,7 @@ def _thin_points(points: ndarray, spacing: float) -> ndarray:
 
 
 def _subdivide(points: ndarray, spacing: float) -> ndarray:
-    """Every straight piece cut into equal parts of at most `spacing` metres."""
+    """Cut every straight piece into equal parts of at most `spacing` metres."""
     parts = np.maximum(1, np.ceil(_span_lengths(points) / spacing - 1e-9)).astype(np.int64)
     piece = np.repeat(np.arange(len(parts)), parts)
     step = np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts)

@@ -11,12 +11,12 @@ from mapctl.curves.polyline import MAX_POINTS, SPACING
 from mapctl.errors import RequestError
 
 MIN_SIZE, MAX_SIZE = 0.01, 10_000.0
-"""Metres that a radius, length or amplitude may have."""
+"""Least and greatest radius, length or amplitude, metres."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """How a built-in curve is asked for."""
+    """Specification of a built-in curve."""
 
     sizes: tuple[str, ...]
     """Names of its sizes, in the order in which text gives them (joined by `x`); metres."""
@@ -25,11 +25,11 @@ class Shape:
     closed: bool
     """Whether it ends where it starts."""
     example: str
-    """As typed."""
+    """Example, as typed."""
 
 
 def _join_circular_arcs(*arcs: tuple[float, float]) -> ndarray:
-    """Circular arcs (signed radius, left positive; angle), joined smoothly, from the origin along +Z."""
+    """Join circular arcs (signed radius, left positive; angle) smoothly, from the origin along +Z."""
     place, heading, pieces = np.zeros(2), 0.0, [np.zeros((1, 2))]
     for radius, angle in arcs:
         # At least one vertex a degree, so that a tiny circle is round as well.
@@ -73,11 +73,11 @@ SHAPES: Mapping[str, Shape] = {
     "wave": Shape(("amplitude", "length"), _wave, False, "wave:1x8"),
 }
 SHAPE_EXAMPLES = ", ".join(shape.example for shape in SHAPES.values())
-"""What may be typed, for messages."""
+"""Examples of what may be typed, for messages."""
 
 
 def sample_shape(name: str, sizes: Mapping[str, float]) -> ndarray:
-    """Points of a built-in curve. RequestError for a size that is not from 1 cm to 10 km."""
+    """Sample points of a built-in curve. RequestError for a size that is not from 1 cm to 10 km."""
     for size, value in sizes.items():
         if not MIN_SIZE <= value <= MAX_SIZE:
             raise RequestError(f"{name}: {size} must be {MIN_SIZE:g} to {MAX_SIZE:g} m, got {value:g}")

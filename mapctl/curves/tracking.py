@@ -1,9 +1,9 @@
-"""Where a walker is along a curve, told by the whole walk: dynamic programming over arcs, as in map matching.
+"""Arcs of a walker along a curve, from the whole walk: dynamic programming over arcs, as in map matching.
 
-The nearest place alone jumps to another branch wherever a curve comes near itself, crosses itself or goes back the way
-it came. Here the arc goes on without a jump, and forward unless going back explains the walk clearly better: of all
-such ways along the curve the one with the least squared distance is found (Viterbi, 1967; with a hidden Markov model's
-states on the road, Newson and Krumm, 2009). The walk is taken by its own length, so neither speed nor rate matter.
+The nearest position alone jumps to another branch wherever a curve comes near itself, crosses itself or goes back the
+way it came. Here the arc goes on without a jump, and forward unless going back explains the walk clearly better: of all
+such paths along the curve the one with the least squared distance is found (Viterbi 1967; with a hidden Markov model's
+states on the road, Newson and Krumm 2009). The walk is taken by its own length, so neither speed nor rate matter.
 """
 
 import math
@@ -19,8 +19,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from mapctl.curves.curve import Curve
 
-_STEP = 0.02  # metres between neighbouring arcs, and between the walk's places that are looked at
-_MAX_ARCS = 10_000  # places and arcs: of long walks both lie farther apart
+_STEP = 0.02  # metres between neighbouring arcs, and between the walk's positions that are looked at
+_MAX_ARCS = 10_000  # positions and arcs: of long walks both lie farther apart
 _MAX_PACE_RATIO = 3  # times the walk's own way: how fast the arc goes where a bend or a corner is cut
 _BACKWARD_COST = 0.3**2  # square metres: going back must explain the walk better than going on or staying by 0.3 m
 _PRUNING_MARGIN = 3.0 / _STEP  # squared metres, summed: what explains the walk so much worse is given up
@@ -33,7 +33,7 @@ _REFINED_STEP, _TIE_BREAK = (
 def track_arcs(
     curve: "Curve", points: Float[Tensor, "frames dims"], *, start: float | None, reach: float
 ) -> Float[Tensor, " frames"]:
-    """Arcs of a walk, metres, not wrapped; beyond open ends the curve goes on straight.
+    """Track the arcs of a walk, metres, not wrapped; beyond open ends the curve goes on straight.
 
     The first arc is sought within `reach` metres of `start`, or anywhere on the curve. Every arc is the nearest within
     `reach` metres of the tracked one.
@@ -56,9 +56,9 @@ class _ArcGrid:
     """Evenly spaced arcs; number n lies n steps from the curve's start."""
 
     step: float
-    """Metres."""
+    """Arcs, metres."""
     places: Float[ndarray, "arcs dims"]
-    """The curve at each arc, metres."""
+    """Curve position at each arc, metres."""
     first: int
     """Number of the first arc; 0 on a closed curve, whose arcs go round."""
     lap: int
@@ -68,7 +68,7 @@ class _ArcGrid:
 
     @staticmethod
     def of(curve: "Curve", beyond: float) -> "_ArcGrid":
-        """Over the whole curve, and `beyond` metres straight on from open ends."""
+        """Space arcs over the whole curve, and `beyond` metres straight on from open ends."""
         step = max(_STEP, (curve.length + beyond) / _MAX_ARCS)
         lap = max(8, math.ceil(curve.length / step))
         step = curve.length / lap
@@ -77,11 +77,11 @@ class _ArcGrid:
         return _ArcGrid(step, curve.point(numbers * step).numpy(), -more, lap, curve.closed)
 
     def within(self, first: int, stop: int) -> tuple[int, int]:
-        """The numbers of a range that there are."""
+        """Clip a range of numbers to those that exist."""
         return (first, stop) if self.closed else (max(first, self.first), min(stop, self.first + len(self.places)))
 
     def squared_distances(self, point: Float[ndarray, " dims"], first: int, stop: int) -> Float[ndarray, " arcs"]:
-        """Of a place from the arcs first to stop."""
+        """Return squared distances from a position to the arcs first to stop."""
         numbers = np.arange(first - self.first, stop - self.first)
         near = self.places.take(numbers, axis=0, mode="wrap") if self.closed else self.places[numbers]
         return np.square(near - point).sum(-1)
@@ -90,7 +90,7 @@ class _ArcGrid:
 def _find_best_arcs(
     grid: _ArcGrid, places: Float[ndarray, "count dims"], first: int, stop: int
 ) -> Float[ndarray, " count"]:
-    """Numbers of the arcs at the walk's places; the first is one of first to stop."""
+    """Find the numbers of the arcs at the walk's positions; the first is one of first to stop."""
     most = _MAX_PACE_RATIO + 1
     # Columns: from how many arcs ahead (going back) to how many behind (going on); of equal ways the slowest.
     moves = np.arange(most, -most - 1, -1)
@@ -115,7 +115,7 @@ def _find_best_arcs(
 
 
 def _prune_arcs(first: int, cost: Float[ndarray, " arcs"]) -> tuple[int, int, Float[ndarray, " fewer"]]:
-    """The range of arcs outside of which none may still turn out best."""
+    """Narrow the range to the arcs that may still turn out best."""
     alive = np.flatnonzero(cost <= cost.min() + _PRUNING_MARGIN)
     low, high = int(alive[0]), int(alive[-1]) + 1
     return first + low, first + high, cost[low:high]
@@ -124,7 +124,7 @@ def _prune_arcs(first: int, cost: Float[ndarray, " arcs"]) -> tuple[int, int, Fl
 def _refine_arcs(
     curve: "Curve", points: Float[Tensor, "frames dims"], arcs: Float[Tensor, " frames"], reach: float
 ) -> Float[Tensor, " frames"]:
-    """The nearest arcs on the branch that was found."""
+    """Find the nearest arcs on the branch that was found."""
     room = (
         torch.arange(-math.ceil(reach / _REFINED_STEP), math.ceil(reach / _REFINED_STEP) + 1, dtype=torch.float64)
         * _REFINED_STEP

@@ -78,7 +78,7 @@ def load_with_missing(
 
 
 def _check_readable(path: str | PathLike[str]) -> str:
-    """The ending; FileFormatError unless it is one of `READERS`."""
+    """Return the ending; FileFormatError unless it is one of `READERS`."""
     ending = PurePath(path).suffix.lower()
     if ending not in READERS:
         why = _UNREADABLE_REASONS.get(ending, f"cannot read the ending {ending!r}")
@@ -93,7 +93,8 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 def check_ending(path: str | PathLike[str]) -> None:
-    """RequestError unless `path` ends as a format that can be written, and is installed; to fail before long work."""
+    """Raise RequestError unless `path` ends as a format that can be written, and is installed; to fail before long
+    work."""
     ending = PurePath(path).suffix.lower()
     if ending not in WRITERS:
         raise RequestError(f"cannot write {path}: unknown ending {ending!r}; allowed: {', '.join(WRITERS)}")

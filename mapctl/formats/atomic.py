@@ -53,7 +53,7 @@ def write_text(path: str | PathLike[str], content: str) -> None:
 
 
 def check_writable(path: str | PathLike[str]) -> None:
-    """WriteError if `path` cannot be written; leaves no trace. For use before long work."""
+    """Raise WriteError if `path` cannot be written; leave no trace. For use before long work."""
     target = Path(os.path.realpath(path))
     try:
         _check_target(path, target)
@@ -64,7 +64,7 @@ def check_writable(path: str | PathLike[str]) -> None:
 
 
 def check_folder(folder: str | PathLike[str]) -> None:
-    """WriteError unless the folder is there and can be written in, or can be made; leaves no trace."""
+    """Raise WriteError unless the folder exists and can be written in, or can be made; leave no trace."""
     place = Path(os.path.realpath(folder))
     while not place.exists():
         place = place.parent
@@ -79,7 +79,7 @@ def _write_error(path: str | PathLike[str], error: OSError) -> WriteError:
 
 
 def _check_target(path: str | PathLike[str], target: Path) -> None:
-    """Renaming onto a folder or a device (/dev/null) would fail late or replace it, so refuse both early."""
+    """Refuse folders and devices (/dev/null): renaming onto them would fail late or replace them."""
     if not os.fspath(path):
         raise WriteError("cannot write a file with an empty name")
     if not target.parent.is_dir():
@@ -95,13 +95,14 @@ def _permissions(path: Path) -> int:
 
 
 def _set_permissions(scratch: Path, mode: int) -> None:
-    """Libraries that write a file of their own and rename it (safetensors) leave it readable by nobody else."""
+    """Set the file's mode: libraries that write and rename a file of their own (safetensors) leave it unreadable to
+    others."""
     if _permissions(scratch) != mode:
         with suppress(PermissionError):  # file systems that know no permissions
             scratch.chmod(mode)
 
 
 def _flush_to_disk(scratch: Path) -> None:
-    """Without this a power cut after the rename could leave an empty file under the final name."""
+    """Flush the file, or a power cut after the rename could leave an empty file under the final name."""
     with scratch.open("rb+") as file:
         os.fsync(file.fileno())

@@ -4,9 +4,9 @@ from decimal import Decimal
 from fractions import Fraction
 
 SHORTEST_FRAME, LONGEST_FRAME = 1e-5, 100.0
-"""Frame times (seconds) that are taken seriously."""
+"""Least and greatest frame time, seconds."""
 SLOWEST, FASTEST = 0.01, 1e5
-"""The same as frames per second."""
+"""Least and greatest frame rate, frames per second."""
 
 _RATES = (30, 60, 120, 24, 25, 50, 100, 15, 20, 40, 48, 72, 75, 90, 144, 150, 200, 240)
 _COMMON = tuple(Fraction(rate) for rate in _RATES)
@@ -15,7 +15,7 @@ _FLOAT32 = 1.2e-7  # Some exporters print a float32 with 17 digits, of which 7 m
 
 
 def frame_rate(frame_time: str) -> Fraction:
-    """Frames per second of a frame time as printed (seconds, a finite positive decimal number).
+    """Return frames per second of a frame time as printed (seconds, a finite positive decimal number).
 
     A sensible rate whose frame time, rounded or cut, prints as this text; else the reciprocal as it is.
     """

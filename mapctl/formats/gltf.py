@@ -27,7 +27,7 @@ class _Buffer:
         self.document, self.blob = document, bytearray()
 
     def add(self, values: np.ndarray, target: int | None = None) -> int:
-        """Index of a new accessor over the values, (n,) or (n, width); with smallest and largest."""
+        """Add values, (n,) or (n, width), with least and greatest; return the index of the new accessor."""
         table = np.ascontiguousarray(values).reshape(len(values), -1)
         view = pygltflib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=table.nbytes, target=target)
         self.blob += table.tobytes()
@@ -52,7 +52,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> bytes:
-    """The whole file; `path` is what an error names."""
+    """Return the content of the file; `path` is what an error names."""
     if not (motion.root_position.isfinite().all() and motion.local_quat_xyzw.isfinite().all()):
         raise RequestError(f"cannot write {path}: the motion is not finite")
     document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}"))
@@ -86,7 +86,7 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
 
 
 def _build_nodes(motion: Motion) -> list[pygltflib.Node]:
-    """A node a joint, in file order, then one for each End Site."""
+    """Build a node for each joint, in file order, then one for each End Site."""
     skeleton, offsets = motion.skeleton, motion.skeleton.offsets.clone()
     offsets[0] = motion.root_position[0]
     for joint, track in motion.moving_offsets.items():

@@ -1,4 +1,4 @@
-"""What a file marks as lost: NaN where a number belongs, as trackers and spreadsheets write it."""
+"""Missing values of a file: NaN where a number belongs, as trackers and spreadsheets write it."""
 
 import re
 from dataclasses import dataclass
@@ -15,37 +15,38 @@ _FORMS = re.compile(r"(?<!\S)[+-]?(?:nan(?:\([^\s)]*\))?|1\.#(?:ind|qnan|snan)\S
 
 @dataclass(frozen=True, eq=False)
 class MissingValues:
-    """Where the numbers of a motion stand for nothing: the file has NaN there."""
+    """Where the numbers of a motion are missing: the file has NaN there."""
 
     rotations: Bool[Tensor, "frames joints"]
-    """Local rotations; the motion repeats the last one that is known."""
+    """Missing local rotations; the motion repeats the last known one."""
     places: Bool[Tensor, "frames joints"]
-    """Places within the parent, of the root in the world; the motion goes straight between those that are known."""
+    """Missing positions within the parent, of the root in the world; the motion interpolates linearly between known
+    ones."""
 
 
 def is_nan(word: str) -> bool:
-    """Whether a word of a text file stands for a number that was lost: `nan`, `-nan(ind)`, `1.#QNAN`."""
+    """Return whether a word of a text file stands for a missing number: `nan`, `-nan(ind)`, `1.#QNAN`."""
     return _FORMS.fullmatch(word) is not None
 
 
 def normalise_nan(text: str) -> str:
-    """The text with such words in the one form that numpy reads."""
+    """Return the text with such words in the one form that numpy reads."""
     return _FORMS.sub("nan", text) if "#" in text else text
 
 
 def missing_hint(word: str) -> str:
-    """What to add to the refusal of a word."""
+    """Return what to add to the refusal of a word."""
     return "; `mapctl infill` fills in what is lost" if is_nan(word) else ""
 
 
 def check_any_known(path: str | PathLike[str], lost: np.ndarray) -> None:
-    """FileFormatError where nothing is known."""
+    """Raise FileFormatError where nothing is known."""
     if lost.size and lost.all():
         raise FileFormatError(path, "every value is nan: nothing is known of the motion")
 
 
 def hold_last(values: np.ndarray) -> np.ndarray:
-    """Columns (frames, width) with the last known number in place of NaN, at first the first; 0 where none is known."""
+    """Fill NaN in columns (frames, width) with the last known number, at first the first; 0 where none is known."""
     known = ~np.isnan(values)
     if known.all():
         return values
@@ -55,7 +56,8 @@ def hold_last(values: np.ndarray) -> np.ndarray:
 
 
 def interpolate_nan(values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Columns (frames, width) straight between the known numbers around NaN; `otherwise` (width,) where none is."""
+    """Interpolate NaN in columns (frames, width) linearly between known numbers; `otherwise` (width,) where none is
+    known."""
     done, frame = values.copy(), np.arange(len(values))
     for column in np.flatnonzero(np.isnan(values).any(axis=0)):
         known = ~np.isnan(values[:, column])

@@ -52,7 +52,7 @@ _KEYS = {
 }
 
 _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
-"""Keys that change from frame to frame, and may hold NaN where what is lost is asked for."""
+"""Keys that change from frame to frame, and may hold NaN where a lossy reading is asked for."""
 _UNSOUND = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
@@ -77,9 +77,7 @@ def load(path: str | PathLike[str]) -> Motion:
 
 
 def load_lossy(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
-    """Read an archive in which rotations and places of some frames are NaN, and which they are; FileFormatError where
-    all of them are.
-    """
+    """Read an archive with rotations and positions that are NaN, and which they are; FileFormatError where all are."""
     return _read(path, lossy=True)
 
 
@@ -148,7 +146,7 @@ def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
 
 
 def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
-    """The known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
+    """Read the known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
     if not raw.startswith(b"PK\x03\x04"):
         raise FileFormatError(path, "is not an .npz archive")
     try:
@@ -164,7 +162,7 @@ def _read_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
 
 
 def _shorten_reason(error: Exception) -> str:
-    """In one short line: zipfile quotes pieces of the file, and a name may be a megabyte."""
+    """Shorten a reason to one line: zipfile quotes pieces of the file, and a name may be a megabyte."""
     text = " ".join(str(error).split())
     return text if text.isprintable() and len(text) <= 200 else shorten(text, 160)
 
@@ -197,7 +195,7 @@ def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray], *, l
 
 
 def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> MissingValues:
-    """What is NaN, which is replaced in the arrays."""
+    """Replace NaN in the arrays, and return where it was."""
     lost: list[np.ndarray] = [np.isnan(arrays[key]) for key in _TRACKS]
     missing.check_any_known(path, np.concatenate([part.ravel() for part in lost]))
     root, turns, moving = lost

@@ -30,14 +30,14 @@ class SkinnedBody:
 
 
 def build_skinned_body(motion: Motion) -> SkinnedBody:
-    """The mannequin of a motion."""
+    """Build the mannequin of a motion."""
     body, rest = build_skin(motion), _rest_positions(motion)
     linear = np.where(body.rgb <= 0.04045, body.rgb / 12.92, ((body.rgb + 0.055) / 1.055) ** 2.4)
     return SkinnedBody(rest, body.vertices + rest[body.joint], body.normals, body.faces, linear, body.joint)
 
 
 def _rest_positions(motion: Motion) -> Array:
-    """(joints, 3) joints with all rotations zero and the root at the origin, metres."""
+    """Return joint positions (joints, 3), metres, with all rotations zero and the root at the origin."""
     offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
     for joint, parent in enumerate(motion.skeleton.parents):
         rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0

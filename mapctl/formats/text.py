@@ -20,7 +20,7 @@ NUMBER = f"a finite number below {LARGEST_VALUE:g}"
 
 
 def read_bytes(path: str | PathLike[str]) -> bytes:
-    """The file's content. FileFormatError if it is missing, empty, too large or not an ordinary file."""
+    """Read the file's content; FileFormatError if it is missing, empty, too large or not an ordinary file."""
     file = Path(path)
     try:
         if file.is_dir():
@@ -41,18 +41,18 @@ def read_bytes(path: str | PathLike[str]) -> bytes:
 
 
 def shorten(word: str, limit: int = 40) -> str:
-    """A quoted, printable, bounded form of a piece of a file, for error messages."""
+    """Quote a piece of a file for an error message: printable, of bounded length."""
     return ascii(word if len(word) <= limit else word[: limit - 3] + "...")
 
 
 @lru_cache(maxsize=256)
 def warn_once(message: str) -> None:
-    """One line on standard error of what was read otherwise than it stands in a file; said once."""
+    """Log one line on standard error on what was read otherwise than the file says; once."""
     print(f"mapctl: {message}", file=sys.stderr)
 
 
 def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, str]:
-    """Text with plain line feeds, and its encoding. Names in an old one-byte encoding are kept as latin-1.
+    """Decode text to plain line feeds; also return its encoding. Names in an old one-byte encoding are kept as latin-1.
 
     `expected` is what a binary file was taken for, as "BVH text".
     """
@@ -69,7 +69,7 @@ def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, s
 
 
 def read_table(path: str | PathLike[str], expected: str) -> list[tuple[int, list[str]]]:
-    """The rows of a CSV that hold anything, each with its line, values without outer blanks.
+    """Read the rows of a CSV that hold anything, each with its line, values without outer blanks.
 
     `expected` says what the table should be, for messages. FileFormatError for what is no table of text.
     """
@@ -87,13 +87,13 @@ def read_table(path: str | PathLike[str], expected: str) -> list[tuple[int, list
 
 
 def check_extent(path: str | PathLike[str], frames: int, joints: int) -> None:
-    """FileFormatError where the rotations of so many frames and joints would fill the memory."""
+    """Raise FileFormatError where the rotations of so many frames and joints would fill the memory."""
     if frames * joints > MAX_POSES:
         raise FileFormatError(path, f"{frames} frames of {joints} joints, allowed are {MAX_POSES} in all")
 
 
 def finite_number(word: str) -> float | None:
-    """The number a word says, or None if it is none, not finite or absurd; `1_000` is none in a file."""
+    """Return the number a word says, or None if it is none, not finite or absurd; `1_000` is none in a file."""
     try:
         value = float(word)
     except ValueError:

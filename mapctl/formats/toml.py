@@ -12,17 +12,16 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from mapctl.errors import FileFormatError
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""Of dataclasses that are read: no key but their fields, and finite numbers."""
+"""Configuration of dataclasses that are read: no key but their fields, and finite numbers."""
 _MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 T = TypeVar("T")
 
 
 def read(path: str | PathLike[str], kind: type[T], *, what: str, unknown: Callable[[Sequence[int | str]], str]) -> T:
-    """The file as a `kind`, as in "a scene file is ...". FileFormatError names file and key, as in
-    `key[1].facing_deg: ...`, in one line; `unknown` tells which keys there are where one is not known. What `kind`
-    itself raises passes.
-    """
+    """Read the file as a `kind`, as in "a scene file is ...". FileFormatError names file and key, as in
+    `key[1].facing_deg: ...`, in one line; `unknown` says which keys are allowed where one is not known. What `kind`
+    itself raises passes."""
     table = json.dumps(_parse_toml(path, what), default=str)
     try:
         return TypeAdapter(kind).validate_json(table, strict=True)

@@ -7,9 +7,9 @@ import numpy as np
 UNITS_IN_METRES = (1.0, 0.01, 0.0254, 0.056444, 0.001)
 """Metre, centimetre, inch, the CMU ASF unit (inch / 0.45), millimetre; the first that fits counts."""
 LEG_METRES = (0.5, 1.4)
-"""Hips to toes along the bones, of people."""
+"""Least and greatest length of people from hips to toes along the bones, metres."""
 REACH_METRES = (0.8, 2.2)
-"""Longest way from the root to a leaf along the bones (hips to fingertips or toes), of people."""
+"""Least and greatest length of people from the root to a leaf along the bones (hips to fingertips or toes), metres."""
 
 _TOES, _FEET, _HIPS = ("toe",), ("foot", "ankle"), ("hips", "pelvis")
 
@@ -22,16 +22,15 @@ def metres_per_unit(
     end_offsets: Mapping[int, Sequence[float]],
     moving: Collection[int] = (),
 ) -> float:
-    """How many metres one unit of `offsets` (joints, 3) is, for a skeleton of about human size.
+    """Return how many metres one unit of `offsets` (joints, 3) is, for a skeleton of about human size.
 
-    Bones are measured from hips to toes; where no leg is named, from the root to the farthest leaf.
-    `moving` joints travel within their parent, so the way to them is no bone. A body of no length counts as
-    centimetres.
+    Bones are measured from hips to toes; where no leg is named, from the root to the farthest leaf. `moving` joints
+    travel within their parent, so the way to them is no bone. A body of no length counts as centimetres.
     """
     lengths = np.linalg.norm(offsets, axis=1)
     lengths[[0, *moving]] = 0.0
     ends = {joint: float(np.linalg.norm(offset)) for joint, offset in end_offsets.items()}
-    size, fits = leg_length(names, parents, lengths, ends, moving), LEG_METRES
+    size, fits = hips_to_toes_length(names, parents, lengths, ends, moving), LEG_METRES
     if size == 0:
         size, fits = longest_chain_length(parents, lengths, ends), REACH_METRES
     if size == 0:
@@ -43,14 +42,14 @@ def metres_per_unit(
     return min(UNITS_IN_METRES, key=lambda unit: abs(np.log(size * unit / middle)))
 
 
-def leg_length(
+def hips_to_toes_length(
     names: Sequence[str],
     parents: Sequence[int],
     lengths: np.ndarray,
     ends: Mapping[int, float],
     moving: Collection[int] = (),
 ) -> float:
-    """Hips to toes along the bones, or to the foot's End Site if there are no toes; 0 if no foot is named."""
+    """Return hips to toes along the bones, or to the foot's End Site if there are no toes; 0 if no foot is named."""
     plain = [_normalise_name(name) for name in names]
     joint = _first_named(_TOES, plain) or _first_named(_FEET, plain)
     if joint is None:
@@ -62,7 +61,7 @@ def leg_length(
 
 
 def longest_chain_length(parents: Sequence[int], lengths: np.ndarray, ends: Mapping[int, float]) -> float:
-    """The longest way from the root to a leaf or End Site along the bones, in the unit of `lengths`."""
+    """Return the length of the longest chain of bones from the root to a leaf or End Site, in the unit of `lengths`."""
     way = np.zeros(len(parents))
     for joint in range(1, len(parents)):
         way[joint] = way[parents[joint]] + lengths[joint]
@@ -70,7 +69,7 @@ def longest_chain_length(parents: Sequence[int], lengths: np.ndarray, ends: Mapp
 
 
 def _normalise_name(name: str) -> str:
-    """`mixamorig:LeftToe_Base` as `lefttoebase`."""
+    """Normalise a name: `mixamorig:LeftToe_Base` is `lefttoebase`."""
     return "".join(filter(str.isalnum, name.rpartition(":")[2])).lower()
 
 

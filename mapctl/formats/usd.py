@@ -35,12 +35,12 @@ _REASON = re.compile(r"rror occurred writing file: (.+?)'")
 
 
 def is_installed() -> bool:
-    """Whether the package is here."""
+    """Return whether the package is installed."""
     return find_spec("pxr") is not None
 
 
 def check_installed(path: str | PathLike[str]) -> None:
-    """RequestError that names the extra if USD cannot be written here."""
+    """Raise RequestError that names the extra if USD cannot be written here."""
     if not is_installed():
         raise RequestError(f"cannot write {path}: USD needs the package usd-core: pip install 'mapctl[usd]'")
 
@@ -55,7 +55,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 def _export(stage: "Usd.Stage", scratch: Path) -> None:
-    """OSError where it cannot be written: USD itself raises an error of many lines, the reason among them."""
+    """Export the stage; OSError where it cannot be written: USD's own error has many lines, the reason among them."""
     try:
         written = stage.GetRootLayer().Export(str(scratch))
     except RuntimeError as error:
@@ -90,7 +90,7 @@ def _build_stage(motion: Motion) -> "Usd.Stage":
 
 
 def joint_paths(skeleton: Skeleton) -> list[str]:
-    """Each joint as USD names it: the names from the root on, of letters, digits and _, unique among siblings."""
+    """Return each joint's USD path: the names from the root on, of letters, digits and _, unique among siblings."""
     found: list[str] = []
     for name, parent in zip(skeleton.names, skeleton.parents, strict=True):
         plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
@@ -118,7 +118,7 @@ def _define_skeleton(
 
 
 def _translation_matrices(places: np.ndarray) -> np.ndarray:
-    """(n, 4, 4) matrices that only move; USD's vectors are rows, so the way is the last row."""
+    """Return (n, 4, 4) translation matrices; USD's vectors are rows, so the translation is the last row."""
     matrices = np.tile(np.eye(4), (len(places), 1, 1))
     matrices[:, 3, :3] = places
     return matrices
@@ -164,7 +164,7 @@ def _define_mesh(stage: "Usd.Stage", body: SkinnedBody):
 
 
 def _set_extent(top: "UsdSkel.Root", motion: Motion) -> None:
-    """The box of the whole way, an arm's length around the joints; viewers frame the character by it."""
+    """Set the extent of the whole trajectory, an arm's length around the joints; viewers frame the character by it."""
     from pxr import Gf
 
     places = as_array(motion.joint_positions()).reshape(-1, 3)

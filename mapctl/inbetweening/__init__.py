@@ -1,4 +1,4 @@
-"""Gaps in a motion: what is known of it, and what an in-betweener is shown and proposes."""
+"""Gaps in a motion: what is known of it, and an in-betweener's input and proposal."""
 
 from mapctl.inbetweening.position_image import PositionImage, ProposedPositions
 

@@ -1,4 +1,4 @@
-"""Places that joints are to be at in frames that are otherwise free, and meeting them to the hair."""
+"""Target positions of effectors in frames that are otherwise free, and their exact fulfilment."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,34 +9,26 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.kinematics import inverse
-from mapctl.kinematics.inverse import Limb
 from mapctl.motion import Motion
 from mapctl.numerics import smooth_offsets
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
-_KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
-LIMBS = {
-    side + end: Limb(CANONICAL.index(side + upper), CANONICAL.index(side + lower), CANONICAL.index(side + end), bends)
-    for upper, lower, end, bends in (("UpperArm", "LowerArm", "Hand", _ELBOW), ("UpperLeg", "LowerLeg", "Foot", _KNEE))
-    for side in ("left", "right")
-}
-"""Arms and legs by the name of their ends, which can be brought to a place; knees go forward and elbows back."""
-_MIN_REACH_SECONDS = 0.15  # seconds over which a limb goes to its place and back, at least
+_MIN_REACH_SECONDS = 0.15  # seconds over which a limb goes to its target and back, at least
 _REACH_ACCELERATION = 15.0  # m/s^2 at which it goes farther
 _NEGLIGIBLE = 1e-12  # metres
 
 
 @dataclass(frozen=True, eq=False)
 class EffectorTargets:
-    """Wanted places, by frame and canonical joint; limbs bend to those of `LIMBS`."""
+    """Target positions, by frame and canonical joint; limbs bend to those of `LIMBS`."""
 
     places: Float[Tensor, "frames joints 3"]
-    """World, metres; anything finite where no place is wanted."""
+    """World positions, metres; anything finite where there is no target."""
     wanted: Bool[Tensor, "frames joints"]
-    """Whether a place is."""
+    """Whether a joint has a target in a frame."""
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
-        """At other moments, rising: every wanted place is one of the moment that is nearest to its own."""
+        """Return the targets at other times, rising: each is kept at the time that is nearest to its own."""
         own = torch.arange(len(self.places), dtype=seconds.dtype) / fps
         after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
         before = (after - 1).clamp_min(0)
@@ -50,7 +42,7 @@ class EffectorTargets:
 
 
 def check_limbs(targets: EffectorTargets) -> None:
-    """RequestError unless only ends of limbs, which can be brought to a place, are wanted somewhere."""
+    """Raise RequestError unless only ends of limbs have targets."""
     other = [
         name
         for name, some in zip(CANONICAL.names, targets.wanted.any(dim=0).tolist(), strict=True)
@@ -63,15 +55,14 @@ def check_limbs(targets: EffectorTargets) -> None:
 def compute_target_errors(
     places: Float[Tensor, "frames joints 3"], targets: EffectorTargets
 ) -> Float[Tensor, " frames"]:
-    """By frame, how far the worst joint is from its place, metres."""
+    """Compute the largest distance of a joint to its target, by frame, metres."""
     away = (places - targets.places).norm(dim=-1)
     return (away * targets.wanted).amax(dim=1)
 
 
 def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[Tensor, " frames"]) -> Motion:
-    """A canonical motion with limbs bent so that they are at their places, if these are in reach; they go there and
-    back smoothly within frames that are `free`. RequestError for wanted places of joints that end no limb.
-    """
+    """Bend limbs of a canonical motion to their targets, if these are in reach; they go there and back smoothly within
+    frames that are `free`. RequestError for targets of joints that end no limb."""
     check_limbs(targets)
     for limb in LIMBS.values():
         wanted = targets.wanted[:, limb.end] & free

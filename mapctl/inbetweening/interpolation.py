@@ -1,6 +1,4 @@
-"""What a motion is guessed to be where it is not known: rotations go the short way between those that are known, the
-root and its heading straight.
-"""
+"""Interpolation of a motion where it is not known: rotations along the shortest arc, root and heading linearly."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +14,8 @@ def interpolate_positions(
     local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
     known: Bool[Tensor, "batch frames joints"],
 ) -> Float[Tensor, "batch frames joints 3"]:
-    """World places, metres, on canonical bones; known ones as they are. What is not known may hold anything finite.
+    """Interpolate world positions, metres, on canonical bones; known ones as they are. Unknown values may be anything
+    finite.
 
     A rotation is known while the joint and all that it carries next are.
     """
@@ -40,5 +39,5 @@ def interpolate_positions(
 
 
 def interpolate_heading(heading: Float[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
-    """Headings, radians, straight and the short way between frames whose root is known."""
+    """Interpolate headings, radians, linearly along the shorter arc between frames whose root is known."""
     return fill_missing_angle(heading, known[..., 0])

@@ -1,4 +1,4 @@
-"""What a motion on any rig lacks, and what it is without anything better: straight lines between what is known."""
+"""Missing values of a motion on any rig, and their linear interpolation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +18,18 @@ from mapctl.skeleton import CANONICAL
 
 @dataclass(frozen=True, eq=False)
 class MissingMask:
-    """What of a motion's frames counts for nothing."""
+    """Mask of the missing values of a motion."""
 
     joints: Bool[Tensor, "frames joints"]
-    """Rotations, by joint of the rig."""
+    """Whether a joint's rotation is missing, by joint of the rig."""
     root: Bool[Tensor, " frames"]
-    """Where the body is."""
+    """Whether the body's position is missing."""
 
     @staticmethod
     def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap) -> "MissingMask":
-        """By masks. A joint whose place is lost takes the rotation that put it there along: its parent's, unless others
-        show that too. RequestError for joints and frames that the motion has not, and where nothing is left of it.
-        """
+        """Build the mask from masks by joint. A joint whose position is missing takes the rotation that put it there
+        along: its parent's, unless others show that too. RequestError for joints and frames that the motion has not,
+        and where nothing is left of it."""
         for mask in masks:
             if mask.stop > motion.num_frames:
                 raise RequestError(
@@ -47,18 +47,17 @@ class MissingMask:
 
     @property
     def frames(self) -> Bool[Tensor, " frames"]:
-        """In which anything is lost."""
+        """Frames in which anything is missing."""
         return self.root | self.joints.any(dim=1)
 
     def slice(self, start: int, stop: int) -> "MissingMask":
-        """Frames start to stop."""
+        """Return frames start to stop."""
         return MissingMask(self.joints[start:stop], self.root[start:stop])
 
 
 def interpolate_missing(motion: Motion, lost: MissingMask) -> Motion:
-    """What is lost, from the nearest known frames on both sides: joints by slerp, places by straight lines; beyond the
-    first and the last known frame they hold, and joints that are never known rest.
-    """
+    """Interpolate missing values from the nearest known frames on both sides: joints by slerp, positions linearly;
+    beyond the first and the last known frame they hold, and joints that are never known rest."""
     known = ~lost.joints.T
     before, after = last_observed(known).T, next_observed(known).T
     quats = motion.local_quat_xyzw
@@ -78,7 +77,7 @@ def interpolate_missing(motion: Motion, lost: MissingMask) -> Motion:
 
 
 def restore_observed(motion: Motion, original: Motion, lost: MissingMask) -> Motion:
-    """The original with what it lacks from `motion`, of the same rig and length; all else to the bit."""
+    """Return the original with what it lacks from `motion`, of the same rig and length; all else to the bit."""
     moving = {
         joint: torch.where(lost.root[:, None], motion.moving_offsets[joint], values)
         for joint, values in original.moving_offsets.items()

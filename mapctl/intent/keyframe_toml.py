@@ -1,4 +1,4 @@
-"""Key files: poses, when they are taken and where, for in-betweening. TOML, checked before any work."""
+"""Keyframe files: poses with time and position, for in-betweening. TOML, checked before any work."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -26,32 +26,32 @@ Name = Annotated[str, Field(min_length=1)]
 
 @dataclass(frozen=True)
 class KeyEntry:
-    """One key: when, which pose, where, and what of it counts."""
+    """One keyframe of a file: time, pose, position, and which of it counts."""
 
     __pydantic_config__ = STRICT
 
     frame: Frame | None = None
-    """When; or `seconds`."""
+    """Frame of the key; or `seconds`."""
     seconds: Seconds | None = None
-    """When, at the nearest frame."""
+    """Time of the key, seconds, at the nearest frame."""
     pose: Name | None = None
     """A motion file, relative to the key file; that of the body if not given."""
     pose_frame: Frame | None = None
-    """Which of its frames; or `pose_seconds`; the first if neither is given."""
+    """Frame of the pose in its file; or `pose_seconds`; the first if neither is given."""
     pose_seconds: Seconds | None = None
-    """Which, by time."""
+    """Time of the pose in its file, seconds."""
     place: tuple[Metres, Metres] | None = None
-    """Where the hips are over the ground, x and z; as in the pose's file if not given."""
+    """Hips position over the ground, x and z, metres; as in the pose's file if not given."""
     height: Annotated[float, Field(ge=-10, le=1000)] | None = None
-    """Of the hips, metres; as in the pose's file if not given."""
+    """Hips height, metres; as in the pose's file if not given."""
     facing_deg: Annotated[float, Field(ge=-3600, le=3600)] | None = None
-    """Where the hips face: 0 along +Z, 90 along +X; as in the pose's file if not given."""
+    """Hips heading, degrees: 0 along +Z, 90 along +X; as in the pose's file if not given."""
     joints: tuple[Name, ...] = ()
-    """Hands and feet of the body, whose places in the pose are all that counts."""
+    """Hands and feet of the body whose positions in the pose are all that counts."""
     reach: Mapping[Name, tuple[Metres, Metres, Metres]] = field(default_factory=dict)
-    """Hands and feet of the body, and the places x, y, z that they are to be at: all that counts, as of `joints`."""
+    """Hands and feet of the body with target positions x, y, z, metres: all that counts, as for `joints`."""
     root_only: bool = False
-    """Only where the hips are and how they are turned counts."""
+    """Whether only position and rotation of the hips count."""
 
     @property
     def needs_pose(self) -> bool:
@@ -61,7 +61,7 @@ class KeyEntry:
 
 @dataclass(frozen=True)
 class KeyRequest:
-    """A whole key file."""
+    """Contents of a keyframe file."""
 
     __pydantic_config__ = STRICT
 
@@ -104,12 +104,13 @@ class KeyRequest:
         return tuple(dict.fromkeys(name for name in named if name is not None))
 
     def frame_of(self, key: KeyEntry) -> int:
-        """When a key is, in frames."""
+        """Return the frame of a key."""
         return key.frame if key.frame is not None else round((key.seconds or 0.0) * self.fps)
 
 
 def read_keys(path: str | PathLike[str]) -> KeyRequest:
-    """The request of a file, the files that it names relative to its folder. FileFormatError names file and key."""
+    """Read the keyframe request of a file, the files that it names relative to its folder. FileFormatError names file
+    and key."""
     try:
         request = toml.read(path, KeyRequest, what="key file", unknown=_suggest_key)
     except RequestError as error:
@@ -125,7 +126,7 @@ def read_keys(path: str | PathLike[str]) -> KeyRequest:
 
 
 def _find_fault(key: KeyEntry, body: str | None) -> str | None:
-    """What the types cannot say."""
+    """Find faults that the types cannot express."""
     if (key.frame is None) == (key.seconds is None):
         return "frame: a key is at a frame or at seconds, one of them"
     if key.pose_frame is not None and key.pose_seconds is not None:

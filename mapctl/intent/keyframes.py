@@ -9,21 +9,21 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 
 WorldPosition = tuple[float, float, float]
-"""In a world that stands along Y, metres."""
+"""Position in a world with Y up, metres."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """A frame of a motion that counts, and what of it: the whole pose unless less is said."""
+    """A keyframe of a motion and which of it counts: the whole pose unless less is said."""
 
     frame: int
-    """Of the motion."""
+    """Frame of the motion."""
     limbs: tuple[str, ...] = ()
-    """Joints of the rig, hands and feet, whose places are all that counts."""
+    """Joints of the rig, hands and feet, whose positions are all that counts."""
     places: Mapping[str, WorldPosition] = field(default_factory=dict)
-    """Of such joints, where they are to be, if that is not where the motion has them."""
+    """Target positions of such joints, where the motion has them elsewhere."""
     root_only: bool = False
-    """Only the place and the rotation of the hips counts."""
+    """Whether only position and rotation of the hips count."""
 
     def __post_init__(self):
         if self.ends and self.root_only:
@@ -34,12 +34,12 @@ class Key:
 
     @property
     def ends(self) -> tuple[str, ...]:
-        """All hands and feet that it tells the place of, if these are all that counts."""
+        """All hands and feet whose positions count, if these are all that counts."""
         return tuple(dict.fromkeys((*self.limbs, *self.places)))
 
     @property
     def what(self) -> Literal["pose", "limbs", "root"]:
-        """Of the frame counts."""
+        """Whether all of the frame counts."""
         return "limbs" if self.ends else "root" if self.root_only else "pose"
 
     @property
@@ -50,14 +50,14 @@ class Key:
 
 @dataclass(frozen=True)
 class Keys:
-    """Which frames of a motion count, and what of them."""
+    """Keyframes of a motion, and which of each counts."""
 
     each: tuple[Key | int, ...]
     """In any order; a number is a whole pose. The first and the last in time must be whole."""
 
     @staticmethod
     def of(frames: Sequence[int], *, limbs: tuple[str, ...] = (), root_only: bool = False) -> "Keys":
-        """The first and the last frame count whole, of those between only limbs or the root if so asked for."""
+        """Make keys: the first and the last count whole, those between only by limbs or root if so asked."""
         if limbs and root_only:
             raise RequestError("keys of limbs and keys of the root only are two kinds; choose one")
         ends = (min(frames), max(frames)) if frames else ()
@@ -67,13 +67,12 @@ class Keys:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """As they were given."""
+        """Keys as they were given."""
         return tuple(key if isinstance(key, int) else key.frame for key in self.each)
 
     def checked(self, motion: Motion) -> list[Key]:
-        """In the order of time, each once; RequestError for those that are not the motion's, for two that differ at one
-        frame, for fewer than two, and where the first or the last is no whole pose.
-        """
+        """Sort keys by time, each once; RequestError for frames that the motion has not, for two keys that differ at
+        one frame, for fewer than two, and where the first or the last is no whole pose."""
         found: dict[int, Key] = {}
         for one in self.each:
             key = Key(one) if isinstance(one, int) else one

@@ -1,4 +1,4 @@
-"""What a person asks for, before it becomes terms."""
+"""Requests to walk along a path, before they become terms."""
 
 import math
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ class SpeedProfile:
     """Speed along a curve, m/s, linear between the given arcs and constant beyond them."""
 
     arcs: tuple[float, ...]
-    """Metres from the curve's start, rising."""
+    """Arcs, metres from the curve's start, rising."""
     speeds: tuple[float, ...]
-    """At those arcs, m/s, positive."""
+    """Speeds at those arcs, m/s, positive."""
 
     def __post_init__(self):
         if len(self.arcs) != len(self.speeds) or not self.arcs:
@@ -34,12 +34,12 @@ class SpeedProfile:
 
     @staticmethod
     def constant(speed: float) -> "SpeedProfile":
-        """The same speed everywhere."""
+        """Make a profile of one speed."""
         return SpeedProfile((0.0,), (float(speed),))
 
     @staticmethod
     def parse(text: str) -> "SpeedProfile":
-        """`1.2`, or `0:1.0,5:2.5` for 1 m/s at the start rising to 2.5 m/s at 5 m."""
+        """Parse `1.2`, or `0:1.0,5:2.5` for 1 m/s at the start rising to 2.5 m/s at 5 m."""
         try:
             if ":" not in text:
                 return SpeedProfile.constant(float(text))
@@ -49,7 +49,7 @@ class SpeedProfile:
             raise RequestError(f"a speed is a number or ARC:SPEED,ARC:SPEED, got {text!r}") from None
 
     def at(self, arc: float) -> float:
-        """Speed at an arc, m/s."""
+        """Return the speed at an arc, m/s."""
         arcs, speeds = self.arcs, self.speeds
         if arc <= arcs[0]:
             return speeds[0]
@@ -64,18 +64,18 @@ class PathRequest:
     """Walk a curve from its first point at given speeds."""
 
     curve: Curve
-    """On the ground, or in space."""
+    """Curve to follow, on the ground or in space."""
     profile: SpeedProfile
     """Speed along it."""
     seconds: float | None = None
-    """Duration; None walks the curve once."""
+    """Duration, seconds; None walks the curve once."""
 
     def __post_init__(self):
         if self.seconds is not None and not 0 < self.seconds < float("inf"):
             raise RequestError(f"seconds must be positive, got {self.seconds:g}")
 
     def frames(self, fps: float, *, most: int = 3_600_000) -> int:
-        """How many frames it takes, at least two; RequestError beyond `most`."""
+        """Count the frames it takes, at least two; RequestError beyond `most`."""
         if self.seconds is not None:
             count = self.seconds * fps
         else:
@@ -87,9 +87,9 @@ class PathRequest:
         return max(2, round(count))
 
     def fitted(self, fps: float, *, slowest_share: float = 0.6) -> tuple["PathRequest", str | None]:
-        """The request with speeds lowered so that an open curve lasts for the whole duration, and a sentence if so.
+        """Lower speeds so that an open curve lasts for the whole duration; also return a note if any was lowered.
 
-        Speeds are lowered to `slowest_share` of the wanted ones at most; what is then left goes on straight.
+        Speeds are lowered to `slowest_share` of the requested ones at most; what is then left goes on straight.
         """
         if self.seconds is None or self.curve.closed:
             return self, None
@@ -105,7 +105,7 @@ class PathRequest:
         return PathRequest(self.curve, slower, self.seconds), note
 
     def arcs(self, frames: int, fps: float) -> Float[Tensor, " frames"]:
-        """Wanted arc at each frame, metres, the first 0: the integral of speed."""
+        """Return the target arc at each frame, metres, the first 0: the integral of speed."""
         arcs = [0.0]
         for _ in range(frames - 1):
             arcs.append(_advance_arc(self.profile, arcs[-1], 1 / fps))
@@ -119,7 +119,7 @@ def _advance_arc(profile: SpeedProfile, arc: float, seconds: float) -> float:
 
 
 def _count_frames(profile: SpeedProfile, length: float, fps: float, *, most: int) -> float:
-    """Frames until the arc is the curve's length; counts to `most` at most where speeds differ."""
+    """Count frames until the arc is the curve's length; counts to `most` at most where speeds differ."""
     if len(profile.speeds) == 1:
         return max(1, length / profile.speeds[0] * fps)
     if length / max(profile.speeds) * fps > most:

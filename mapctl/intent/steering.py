@@ -1,4 +1,4 @@
-"""What a driver asks for: commands over time, and how fast a wish may change (rnn paper, section 5.3)."""
+"""Steering: commands over time, and the targets that follow them at a limited rate (Wang et al. 2019, section 5.3)."""
 
 import math
 from bisect import bisect_right
@@ -8,27 +8,28 @@ from itertools import pairwise
 from mapctl.errors import RequestError
 
 STEP_LENGTHS = (0.3, 1.2)
-"""Metres between which steps can be asked for. Beyond them feet slide to meet the wish and speed is lost: at 1.2 m/s,
-planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 99 m the whole body slides at 9 m/s."""
+"""Shortest and longest step that can be asked for, metres. Beyond them feet slide to meet the target and speed is lost:
+at 1.2 m/s, planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 99 m the whole body slides at 9 m/s."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """One wish, held until the next one."""
+    """One steering command, held until the next one."""
 
     speed: float
-    """Over the ground, m/s; 0 is to stand."""
+    """Speed over the ground, m/s; 0 is to stand."""
     heading: float
     """Direction of travel, radians about +Y: 0 is +Z, pi/2 is +X. Where the speed is 0, where to face."""
     facing: float | None = None
-    """Where the hips face, radians; None is the direction of travel."""
+    """Facing of the hips, radians; None is the direction of travel."""
     turning: float | None = None
-    """Radians/s by which the direction of travel turns on and on, to the left where positive; `heading` then says
+    """Rate at which the direction of travel turns on and on, radians/s, to the left where positive; `heading` then says
     nothing but where to begin."""
     step_length: float | None = None
-    """From one foot's touch-down to the other's, metres; None leaves it to the prior."""
+    """Step length from one foot's touch-down to the other's, metres; None leaves it to the prior."""
     told: tuple[str, ...] = ()
-    """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the wishes."""
+    """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the other targets.
+    """
 
     def __post_init__(self):
         if not (math.isfinite(self.speed) and self.speed >= 0):
@@ -41,7 +42,7 @@ class Command:
                 raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
 
     def within(self, fastest: float, *, when: str = "") -> tuple["Command", list[str]]:
-        """The nearest command that can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.
+        """Limit the command to what can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.
 
         With a sentence for each number that changed; `when` (` at 3 s`) follows its name. An angle of more than a turn
         is the same direction, so nothing is said of it.
@@ -66,9 +67,9 @@ class CommandTrack:
     """Commands at rising times; before the first time the first command holds."""
 
     times: tuple[float, ...]
-    """Seconds."""
+    """Times, seconds."""
     commands: tuple[Command, ...]
-    """From those times on."""
+    """Commands from those times on."""
 
     def __post_init__(self):
         if not self.times or len(self.times) != len(self.commands):
@@ -78,15 +79,15 @@ class CommandTrack:
                 raise RequestError(f"the times of commands must rise, got {after:g} s after {before:g} s")
 
     def at(self, seconds: float) -> Command:
-        """The command that holds at a time."""
+        """Return the command that holds at a time."""
         return self.commands[max(0, bisect_right(self.times, seconds + 1e-9) - 1)]
 
     def arrivals(self, before: float, upto: float) -> list[float]:
-        """Times in (before, upto] at which a command came."""
+        """Return times in (before, upto] at which a command came."""
         return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
 
     def limit_speed(self, fastest: float) -> tuple["CommandTrack", list[str]]:
-        """The track with every command within what can be held, and a sentence for each number that was changed."""
+        """Limit every command to what can be held; also return a note for each number that was changed."""
         found = [
             command.within(fastest, when=f" at {time:g} s")
             for time, command in zip(self.times, self.commands, strict=True)
@@ -98,14 +99,14 @@ class CommandTrack:
 
 @dataclass(frozen=True)
 class SteeringLimits:
-    """How fast a wish may change; a jump in the command becomes the fastest change that these allow."""
+    """Limits on the rate of change of the target; a jump in the command becomes the fastest change that these allow."""
 
     acceleration: float = 2.0
-    """Of the speed, m/s^2, rising."""
+    """Largest rise of the speed, m/s^2."""
     braking: float = 2.0
-    """Of the speed, m/s^2, falling."""
+    """Largest fall of the speed, m/s^2."""
     turn_rate: float = 2.5
-    """Of the direction, radians/s. More than the one-second means of a walk's data show
+    """Largest turn rate of the direction, radians/s. More than the one-second means of a walk's data show
     (`DataLimits.turn_rate`): a reversal has to be faster."""
 
     def __post_init__(self):
@@ -116,22 +117,22 @@ class SteeringLimits:
 
 @dataclass(frozen=True)
 class SteeringTarget:
-    """What is wanted in one frame: a command that has come as far as the limits allow."""
+    """Target of one frame: a command that has come as far as the limits allow."""
 
     speed: float
-    """m/s."""
+    """Speed, m/s."""
     heading: float
-    """Radians, not wrapped."""
+    """Direction of travel, radians, not wrapped."""
     facing: float
-    """Radians, not wrapped."""
+    """Facing, radians, not wrapped."""
 
     @property
     def velocity(self) -> tuple[float, float]:
-        """x and z over the ground, m/s."""
+        """Target velocity over the ground, x and z, m/s."""
         return self.speed * math.sin(self.heading), self.speed * math.cos(self.heading)
 
     def step_toward(self, command: Command, limits: SteeringLimits, seconds: float) -> "SteeringTarget":
-        """The wish after so many seconds, as near the command as the limits allow."""
+        """Step the target toward the command for so many seconds, as far as the limits allow."""
         rise = min(limits.acceleration * seconds, max(-limits.braking * seconds, command.speed - self.speed))
         most = limits.turn_rate * seconds
         if command.turning is None:
@@ -142,7 +143,7 @@ class SteeringTarget:
         return SteeringTarget(self.speed + rise, turn, _step_angle_toward(self.facing, facing, most))
 
     def ahead(self, command: Command, limits: SteeringLimits, *, frames: int, fps: float) -> "list[SteeringTarget]":
-        """The wishes of the next frames if nothing else is asked."""
+        """Return the targets of the next frames if the command stays."""
         wishes, wish = [], self
         for _ in range(frames):
             wish = wish.step_toward(command, limits, 1 / fps)
@@ -151,11 +152,11 @@ class SteeringTarget:
 
 
 def _wrap_whole_turns(angle: float | None) -> float | None:
-    """Of a full turn or more what is left of it; other angles to the bit."""
+    """Remove whole turns from an angle; other angles stay to the bit."""
     return angle if angle is None or abs(angle) <= 2 * math.pi else math.remainder(angle, 2 * math.pi)
 
 
 def _step_angle_toward(angle: float, wanted: float, most: float) -> float:
-    """The angle turned toward another by at most so much, the short way."""
+    """Step an angle toward another by at most so much, the short way."""
     apart = math.remainder(wanted - angle, 2 * math.pi)
     return angle + min(most, max(-most, apart))

@@ -1,8 +1,8 @@
-"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, if wanted, facing_deg, turn_deg_s, step_m,
-gait and style.
+"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, optionally, facing_deg, turn_deg_s, step_m, gait
+and style.
 
-A line that leaves one of the wanted ones empty faces where it goes, goes straight, steps as it likes,
-and tells the prior nothing.
+A line that leaves an optional column empty faces where it goes, goes straight, has a free step length, and gives the
+prior no label.
 """
 
 import math
@@ -20,7 +20,7 @@ _MAX_SPEED, _MAX_TIME, _MAX_VALUE = 1000.0, 1e6, 1e6
 
 
 def read_commands(path: str | PathLike[str]) -> CommandTrack:
-    """The commands of a file. FileFormatError names file and line, and what was expected there."""
+    """Read the commands of a file. FileFormatError names file and line, and what was expected there."""
     lines = read_table(path, f"a CSV of the columns {','.join(_REQUIRED_COLUMNS)}")
     header, names = (lines[0][0], [word.lower() for word in lines[0][1]]) if lines else (1, [])
     missing = [name for name in _REQUIRED_COLUMNS if name not in names]
@@ -71,7 +71,7 @@ class _Line:
         )
 
     def angle(self, name: str) -> float | None:
-        """Radians; None where the line leaves it open."""
+        """Return an angle in radians; None where the line leaves it open."""
         return math.radians(self.value(name)) if self.words.get(name) else None
 
     def within(self, name: str, low: float, high: float) -> float:

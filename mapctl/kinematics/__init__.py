@@ -16,7 +16,7 @@ def forward_kinematics(
     root_position: Float[Tensor, "*batch 3"],
     local_quat_xyzw: Float[Tensor, "*batch joints 4"],
 ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch joints 4"]]:
-    """World positions (metres) and world rotations (xyzw) of every joint.
+    """Return the world positions (metres) and world rotations (xyzw) of every joint.
 
     `offsets` are the joints in their parents' frames; they may carry the batch's shape where bones are animated.
     Parents must precede their children.
@@ -33,7 +33,7 @@ def forward_kinematics(
 def local_from_world(
     parents: Sequence[int], world_quat_xyzw: Float[Tensor, "*batch joints 4"]
 ) -> Float[Tensor, "*batch joints 4"]:
-    """Rotations of every joint in its parent's frame, from world rotations."""
+    """Return rotations of every joint in its parent's frame, from world rotations."""
     local = [world_quat_xyzw[..., 0, :]]
     for joint in range(1, len(parents)):
         parent = world_quat_xyzw[..., parents[joint], :]
@@ -42,14 +42,14 @@ def local_from_world(
 
 
 def heading(hips_world_quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
-    """Facing angle about +Y in radians: 0 along +Z, +pi/2 along +X (canonical joint frames)."""
+    """Return the facing angle about +Y in radians: 0 along +Z, +pi/2 along +X (canonical joint frames)."""
     return rotations.split_heading(hips_world_quat_xyzw)[0]
 
 
 def positions_from_matrices(
     skeleton: Skeleton, local_matrix: Float[Tensor, "*batch joints 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:
-    """Joint positions (metres) relative to the root at the origin, from local rotation matrices.
+    """Return the joint positions (metres) relative to the root at the origin, from local rotation matrices.
 
     All joints of one depth are multiplied at once: a window of frames then takes a dozen tensor operations.
     """

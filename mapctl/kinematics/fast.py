@@ -42,7 +42,7 @@ _JOINTS = 1 + (LAYOUT.slices["joint_rotations"].stop - LAYOUT.slices["joint_rota
 
 
 def is_supported(features: Tensor, start: GroundPose, skeleton: Skeleton) -> bool:
-    """Whether the kernels take these: float32 batches on the CPU, and gradients to the features alone."""
+    """Return whether the kernels support these: float32 batches on the CPU, and gradients to the features alone."""
     known = (features, start.position_xz, start.heading)
     plain = all(values.dtype == torch.float32 and values.device.type == "cpu" for values in known)
     constant = not (start.position_xz.requires_grad or start.heading.requires_grad or skeleton.offsets.requires_grad)
@@ -54,7 +54,7 @@ def is_supported(features: Tensor, start: GroundPose, skeleton: Skeleton) -> boo
 def integrate_root_fast(
     features: Float[Tensor, "batch frames size"], start: GroundPose
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Root ground positions (metres) and headings (radians, not wrapped) by Eq. 4."""
+    """Integrate root ground positions (metres) and headings (radians, not wrapped): Wang et al. 2019, Eq. 4."""
     batch = len(features)
     return _Root.apply(
         features, start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
@@ -67,12 +67,12 @@ def compute_joints_world(
     heading: Float[Tensor, "batch frames"],
     skeleton: Skeleton,
 ) -> Float[Tensor, "batch frames joints 3"]:
-    """World joint positions, metres, of the root where `integrate_root_fast` puts it."""
+    """Compute the world joint positions, metres, of the root where `integrate_root_fast` puts it."""
     return _Body.apply(features, root_xz_world, heading, skeleton)
 
 
 def _contiguous_array(tensor: Tensor) -> np.ndarray:
-    """Contiguous, so that every kernel is compiled once."""
+    """Return a contiguous array, so that every kernel is compiled once."""
     return tensor.detach().contiguous().numpy()
 
 

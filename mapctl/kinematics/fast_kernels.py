@@ -17,7 +17,7 @@ _SERIES_THRESHOLD = 1e-2  # squared radians below which the series are exact to 
 
 @entry
 def root_forward(features, columns, start_xz, start_heading, ground, headings):
-    """Eq. 4 for features (batch, frames, size); fills ground (batch, frames, 2) and headings (batch, frames)."""
+    """Integrate features (batch, frames, size) by Eq. 4; fill ground (batch, frames, 2), headings (batch, frames)."""
     dx, dz, turn = columns.dx, columns.dz, columns.turn
     for b in range(len(features)):
         x, z, heading = np.float64(start_xz[b, 0]), np.float64(start_xz[b, 1]), np.float64(start_heading[b])
@@ -32,13 +32,13 @@ def root_forward(features, columns, start_xz, start_heading, ground, headings):
 
 @entry
 def root_backward(features, columns, start_heading, d_ground, d_headings, d_features):
-    """Adjoint of `root_forward`: fills the root's columns of d_features, which come in as zeros."""
+    """Apply the adjoint of `root_forward`; fill the root's columns of d_features, which come in as zeros."""
     dx, dz, turn = columns.dx, columns.dz, columns.turn
     for b in range(len(features)):
         heading = np.float64(start_heading[b])
         for t in range(features.shape[1]):
             heading += features[b, t, turn]
-        gx, gz, gh = 0.0, 0.0, 0.0  # on the place and the heading after the frame
+        gx, gz, gh = 0.0, 0.0, 0.0  # on the position and the heading after the frame
         for t in range(features.shape[1] - 1, -1, -1):
             now, out = features[b, t], d_features[b, t]
             gx, gz, gh = gx + d_ground[b, t, 0], gz + d_ground[b, t, 1], gh + d_headings[b, t]
@@ -50,7 +50,7 @@ def root_backward(features, columns, start_heading, d_ground, d_headings, d_feat
 
 @inner
 def rotation_series(square):
-    """sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of an angle a, from its square; smooth at 0."""
+    """Return sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of an angle a, from its square; smooth at 0."""
     if square < _SERIES_THRESHOLD:
         first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
         second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
@@ -63,7 +63,7 @@ def rotation_series(square):
 
 @inner
 def compose_rotation(world, above, x, y, z):
-    """world = above exp([x y z]): a frame turned by a rotation vector given in it (Rodrigues)."""
+    """Set world = above exp([x y z]): a frame rotated by a rotation vector given in it (Rodrigues)."""
     first, second, _ = rotation_series(x * x + y * y + z * z)
     r00, r11, r22 = 1.0 - second * (y * y + z * z), 1.0 - second * (x * x + z * z), 1.0 - second * (x * x + y * y)
     r01, r10 = second * x * y - first * z, second * x * y + first * z
@@ -78,7 +78,7 @@ def compose_rotation(world, above, x, y, z):
 
 @inner
 def fill_rotation_about_y(turn, heading):
-    """Rotation matrix of a turn about +Y."""
+    """Fill the matrix of a rotation about +Y."""
     sine, cosine = math.sin(heading), math.cos(heading)
     turn[0, 0], turn[0, 1], turn[0, 2] = cosine, 0.0, sine
     turn[1, 0], turn[1, 1], turn[1, 2] = 0.0, 1.0, 0.0
@@ -87,7 +87,7 @@ def fill_rotation_about_y(turn, heading):
 
 @entry
 def body_forward(features, columns, ground, headings, parents, offsets, places, world):
-    """Places (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint."""
+    """Fill positions (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint."""
     heading_frame = np.empty((3, 3))
     for b in range(len(features)):
         for t in range(features.shape[1]):
@@ -113,7 +113,8 @@ def body_forward(features, columns, ground, headings, parents, offsets, places, 
 
 @inner
 def rotation_vector_gradient(world, torque, x, y, z):
-    """Gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose, in its frame."""
+    """Return the gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose, in its
+    frame."""
     ux = world[0, 0] * torque[0] + world[1, 0] * torque[1] + world[2, 0] * torque[2]
     uy = world[0, 1] * torque[0] + world[1, 1] * torque[1] + world[2, 1] * torque[2]
     uz = world[0, 2] * torque[0] + world[1, 2] * torque[1] + world[2, 2] * torque[2]
@@ -128,7 +129,7 @@ def rotation_vector_gradient(world, torque, x, y, z):
 
 @entry
 def body_backward(features, columns, parents, offsets, world, d_places, d_features, d_ground, d_headings):
-    """Adjoint of `body_forward`, by forces and torques as in statics.
+    """Apply the adjoint of `body_forward`, by forces and torques as in statics.
 
     A gradient on a place is a force there. What a small turn of a joint does is the torque, about that joint, of the
     forces on all that hangs from it; both are summed from the leaves to the root. Fills the body's columns of

@@ -1,12 +1,11 @@
 """From joint positions to rotations on a skeleton whose bones keep their lengths: the one inverse kinematics.
 
-Joint by joint from the root down, each is turned as little as its children's directions ask for, from where its parent
-leaves it. What positions do not tell (how a bone is turned about itself, and joints without children) stays as it is in
-the motion that one starts from, but for the plane in which an elbow or a knee bends: a bent limb shows it.
+Joint by joint from the root down, each is rotated as little as its children's directions ask for, from where its parent
+leaves it. What positions do not tell (the rotation of a bone about itself, and joints without children) stays as it is
+in the initial motion, but for the plane in which an elbow or a knee bends: a bent limb shows it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,29 +13,13 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import Limb, Skeleton
 
-_BEND_THRESHOLD = 0.15  # sine of a limb's bend from which its plane is believed rather than not
+_BEND_THRESHOLD = 0.15  # sine of a limb's bend at which its plane counts half
 _TINY = 1e-9
 _STRAIGHT_MARGIN = 1e-4  # metres that a limb is kept from being straight
 _BEND_OFFSET = 0.003  # metres that an elbow or a knee is off the line before it shows where the limb bends to
 _TRUST_POWER = 8  # power of a bone's share of its length: nine tenths of it are half a reason to believe it
-
-
-@dataclass(frozen=True)
-class Limb:
-    """Two bones and what is at their end: an arm or a leg."""
-
-    upper: int
-    """Joint at which it begins."""
-    lower: int
-    """Elbow or knee, the only child of `upper`."""
-    end: int
-    """Hand or foot, the only child of `lower`."""
-    bend_direction: tuple[float, float, float]
-    """Which way the elbow or the knee of a straight limb would go, seen from `upper`."""
-    shown: bool = True
-    """Whether the motion that one starts from shows how it bends; if not, only the proposed elbow or knee tells."""
 
 
 def solve_inverse_kinematics(
@@ -48,12 +31,12 @@ def solve_inverse_kinematics(
     root_position: Float[Tensor, "frames 3"] | None = None,
     limbs: Sequence[Limb] = (),
 ) -> Float[Tensor, "frames joints 4"]:
-    """Local rotations (xyzw) with which the joints come nearest to the given places, metres.
+    """Solve for local rotations (xyzw) with which the joints come nearest to the target positions, metres.
 
     `start_quat_xyzw` are local rotations; those that are not `free` stay as they are. `root_position` is the first
-    joint's, if it is not its place. A limb that cannot reach points at its place. Of `limbs` the ends count, and
-    elbows and knees as far as their bones have their lengths (see `_reached`), and the first bone turns about itself
-    with the plane in which the limb bends. RequestError for other shapes.
+    joint's, if it is not its place. A limb that cannot reach points at its place. Of `limbs` the ends count, and elbows
+    and knees as far as their bones have their lengths (see `_reached`), and the first bone turns about itself with the
+    plane in which the limb bends. RequestError for other shapes.
     """
     frames, joints = places_world.shape[:2]
     if start_quat_xyzw.shape[:2] != (frames, joints) or joints != skeleton.num_joints:
@@ -94,7 +77,7 @@ def _solve_two_bones(
     places: Float[Tensor, "frames joints 3"],
     offsets: Float[Tensor, "joints 3"],
 ) -> Float[Tensor, "frames 2 3"]:
-    """Where the elbow or the knee is if the end is at its place, as far as the bones reach; and where the end then is.
+    """Return where elbow or knee is if the end is at its target, as far as the bones reach; and where the end then is.
 
     A proposal that is the mean of several poses has short bones, and a forearm that is short points anywhere, also
     where no arm bends to. So its place counts only as far as its bones have their lengths; what lacks is the way the
@@ -109,7 +92,7 @@ def _solve_two_bones(
     reach = far.clamp((long - short).abs() + _STRAIGHT_MARGIN, long + short - _STRAIGHT_MARGIN)
     knee = rotations.rotate(turn, upper.expand(len(turn), 3))
     foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(len(turn), 3))
-    towards = _shortest(foot, way)
+    towards = rotations.between_vectors(foot, way)
     usual = rotations.rotate(
         rotations.multiply(towards, turn), offsets.new_tensor(limb.bend_direction).expand(len(turn), 3)
     )
@@ -128,10 +111,10 @@ def _solve_two_bones(
 def _align_bones(
     turn: Float[Tensor, "frames 4"], bones: Sequence[Float[Tensor, "3"]], aims: Sequence[Float[Tensor, "frames 3"]]
 ) -> Float[Tensor, "frames 4"]:
-    """`turn`, turned on so that the bones point along the aims: one bone exactly, several in the least squares."""
+    """Rotate `turn` on so that the bones point along the aims: one bone exactly, several in the least squares."""
     pointing = [rotations.rotate(turn, bone.expand(len(turn), 3)) for bone in bones]
     if len(bones) == 1:
-        return rotations.multiply(_shortest(pointing[0], aims[0]), turn)
+        return rotations.multiply(rotations.between_vectors(pointing[0], aims[0]), turn)
     # Kabsch: the rotation that brings one set of vectors nearest to the other.
     product = sum(torch.einsum("ti,tj->tij", aim, bone) for aim, bone in zip(aims, pointing, strict=True))
     assert isinstance(product, Tensor)
@@ -149,7 +132,7 @@ def _align_bend_plane(
     places: Float[Tensor, "frames joints 3"],
     at: Float[Tensor, "frames 3"],
 ) -> Float[Tensor, "frames 4"]:
-    """`turn`, turned about its bone so that the child bends in the plane that its own child's place asks for."""
+    """Rotate `turn` about its bone so that the child bends in the plane that its own child's target asks for."""
     below = skeleton.children(child)
     if len(below) != 1:
         return turn
@@ -163,21 +146,7 @@ def _align_bend_plane(
     would, wanted = (torch.nn.functional.normalize(vector, dim=-1) for vector in (would, wanted))
     would, wanted = (vector - (vector * axis).sum(-1, keepdim=True) * axis for vector in (would, wanted))
     angle = torch.atan2((torch.linalg.cross(would, wanted) * axis).sum(-1), (would * wanted).sum(-1) + _TINY)
-    # A straight limb has no plane: the smaller of the two bends says how much is believed.
+    # A straight limb has no plane: the smaller of the two bends says how much it counts.
     bend = torch.minimum(would.norm(dim=-1), wanted.norm(dim=-1))
     believed = bend.square() / (bend.square() + _BEND_THRESHOLD**2)
     return rotations.multiply(rotations.from_rotation_vector(axis * (angle * believed)[:, None]), turn)
-
-
-def _shortest(start: Float[Tensor, "frames 3"], stop: Float[Tensor, "frames 3"]) -> Float[Tensor, "frames 4"]:
-    """The shortest turn from one direction to the other; none where one of them has no length."""
-    start, stop = (torch.nn.functional.normalize(vector, dim=-1) for vector in (start, stop))
-    cosine = (start * stop).sum(-1, keepdim=True)
-    axis = torch.linalg.cross(start, stop)
-    # Half a turn has no shortest way: any axis across will do.
-    across = torch.linalg.cross(start, start.abs().argmin(dim=-1, keepdim=True).eq(torch.arange(3)).to(start))
-    opposite = cosine < -1 + 1e-9
-    quat = torch.cat([torch.where(opposite, across, axis), torch.where(opposite, 0.0, 1 + cosine)], dim=-1)
-    still = (start.norm(dim=-1, keepdim=True) < 0.5) | (stop.norm(dim=-1, keepdim=True) < 0.5)
-    none = quat.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quat)
-    return torch.nn.functional.normalize(torch.where(still, none, quat), dim=-1)

@@ -1,9 +1,9 @@
-"""Whole-body inverse kinematics for single frames: hands and feet at wanted places, the rest of the body taking part.
+"""Whole-body inverse kinematics for single frames: hands and feet at target positions, with the rest of the body.
 
 Limbs alone reach as far as they are long. What lies beyond asks the trunk to lean, the shoulder girdle to follow, the
-hips to go down on bending knees, and a body that is on its way to be a little further. Of all these the least, weighed
-by how far each usually goes: the mode of a Gaussian over offsets of the pose, by damped Gauss-Newton steps. Arms and
-legs then bend exactly, by their two bones.
+hips to go down on bending knees, and a moving body to be a little further along. The smallest such change, weighed by
+how far each usually goes, is the mode of a Gaussian over offsets of the pose, found by damped Gauss-Newton steps. Arms
+and legs then bend exactly, by their two bones.
 """
 
 import math
@@ -14,26 +14,26 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets, check_limbs
+from mapctl.inbetweening.effector_targets import EffectorTargets, check_limbs
 from mapctl.kinematics import forward_kinematics, inverse
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 _TRUNK_JOINTS = tuple(CANONICAL.index(name) for name in ("hips", "spine", "chest", "leftShoulder", "rightShoulder"))
 _SIGMA_ROTATION = math.radians(12.0)
 _SIGMA_LEAN = 0.08
-"""Metres that hips go from where they are over feet that stay."""
+"""Standard deviation of the hips' offset over feet that stay, metres."""
 _SIGMA_REACH, _SIGMA_BALANCE = 0.004, 0.06  # metres
 _IS_FOOT = torch.tensor([float(name.endswith("Foot")) for name in LIMBS])
 _STRETCH_LIMIT = torch.where(_IS_FOOT > 0, 0.985, 0.9).double()
-"""Share of a limb's length from which on it asks the body to come nearer."""
+"""Share of a limb's length from which on its target asks the body to come nearer."""
 _FOLD_LIMIT = 0.3
-"""Share of a limb's length below which it asks the body to make room."""
+"""Share of a limb's length below which its target asks the body to make room."""
 _SOFTPLUS_WIDTH = 0.015  # metres over which either begins
 _MAX_STEPS, _DAMPING, _TOLERANCE = 40, 0.1, 1e-3  # the last in sigmas of an offset
 _DIFFERENCE_STEP = 1e-6  # metres and radians
 _MASS_JOINTS, _MASSES = [CANONICAL.index(name) for name in ("head", "chest", "hips")], torch.tensor([0.1, 0.4, 0.5])
-"""Roughly where the weight is that has to stay over the feet (Winter 2009, table 4.1)."""
+"""Parts of the body in its centre of mass, roughly, which has to stay over the feet (Winter 2009, table 4.1)."""
 _UPPER, _ENDS = ([getattr(limb, end) for limb in LIMBS.values()] for end in ("upper", "end"))
 
 
@@ -45,7 +45,7 @@ def reach_targets(
     moving: Bool[Tensor, " frames"],
     stray: Float[Tensor, " frames"],
 ) -> tuple[Motion, Float[Tensor, "frames 3"]]:
-    """A canonical motion whose poses, in the frames in which a hand or a foot is wanted somewhere, have it there.
+    """Solve for a canonical motion whose poses reach the targets of hands and feet, in the frames that have one.
 
     `turning` are joints that may turn and `moving` frames in which the hips may move; all else stays. By about `stray`
     (metres) the whole body, feet and all, may as well be elsewhere on the ground. Feet that are not wanted elsewhere
@@ -79,7 +79,7 @@ def _select_frames(motion: Motion, frames: Tensor) -> Motion:
 def _compute_offset_sigmas(
     turning: Bool[Tensor, "poses joints"], moving: Bool[Tensor, " poses"], stray: Float[Tensor, " poses"]
 ) -> Float[Tensor, "poses offsets"]:
-    """Of shift (x, z), lean (x, y, z) and the turns of `_TURNING`; nothing for what may not move."""
+    """Return sigmas of shift (x, z), lean (x, y, z) and the rotations of `_TURNING`; 0 for what may not move."""
     step, lean = stray[:, None].expand(-1, 2), stray.new_full((len(stray), 3), _SIGMA_LEAN)
     turn = _SIGMA_ROTATION * turning[:, _TRUNK_JOINTS].to(stray).repeat_interleave(3, dim=1)
     return torch.cat([torch.cat([step, lean], dim=1) * moving[:, None], turn], dim=1)
@@ -91,9 +91,8 @@ def _minimise_offsets(
     wanted: Bool[Tensor, "poses limbs"],
     sigma: Float[Tensor, "poses offsets"],
 ) -> Float[Tensor, "poses offsets"]:
-    """The mode of  |x / sigma|^2 + |r(x)|^2,  r what limbs and balance ask for; Levenberg-Marquardt in its small dual
-    form, pose by pose: steps that do not help are damped more.
-    """
+    """Find the mode of  |x / sigma|^2 + |r(x)|^2,  r the reach and balance residual; Levenberg-Marquardt in its small
+    dual form, pose by pose: steps that do not help are damped more."""
     ask = _ReachResidual.of(part, goals, wanted)
     unit, damping = torch.zeros_like(sigma), sigma.new_full((len(sigma), 1, 1), _DAMPING)
     now = ask.residual(unit * sigma)
@@ -121,11 +120,11 @@ def _minimise_offsets(
 
 @dataclass(frozen=True, eq=False)
 class _ReachResidual:
-    """What is asked of poses: limbs that reach, legs that reach the ground, weight over the feet."""
+    """Residual of poses: limbs that reach, legs that reach the ground, weight over the feet."""
 
     part: Motion
     before: Float[Tensor, "poses joints 3"]
-    """World places of its joints."""
+    """World positions of the poses' joints, metres."""
     goals: Float[Tensor, "poses limbs 3"]
     wanted: Float[Tensor, "poses limbs"]
     lengths: Float[Tensor, " limbs"]
@@ -139,12 +138,12 @@ class _ReachResidual:
     def jacobian(
         self, x: Float[Tensor, "poses offsets"], now: Float[Tensor, "poses residuals"]
     ) -> Float[Tensor, "poses residuals offsets"]:
-        """By differences: in double precision good to six digits, and all of them are one batch."""
+        """Return the Jacobian by differences, all in one batch: in double precision good to six digits."""
         shifted = x[None] + _DIFFERENCE_STEP * torch.eye(x.shape[1], dtype=x.dtype)[:, None]
         return ((self.residual(shifted) - now) / _DIFFERENCE_STEP).permute(1, 2, 0)
 
     def residual(self, x: Float[Tensor, "*more poses offsets"]) -> Float[Tensor, "*more poses residuals"]:
-        """By limb, how much too far and too near its place is for it; and how far the weight has left the feet."""
+        """Return by limb how much too far and too near its target is; and how far the weight has left the feet."""
         root, quats, shift = _apply_offsets(x, self.part.root_position, self.part.local_quat_xyzw)
         skeleton = self.part.skeleton
         places = forward_kinematics(skeleton.offsets.to(root), skeleton.parents, root, quats)[0]
@@ -167,7 +166,7 @@ def _soft_excess(value: Tensor) -> Tensor:
 def _apply_offsets(
     x: Float[Tensor, "*more poses offsets"], root: Float[Tensor, "poses 3"], quats: Float[Tensor, "poses joints 4"]
 ) -> tuple[Tensor, Tensor, Float[Tensor, "*more poses 3"]]:
-    """Root and rotations with their offsets, and the shift of the whole body."""
+    """Apply offsets to root and rotations; also return the shift of the whole body, metres."""
     shift = torch.stack([x[..., 0], torch.zeros_like(x[..., 0]), x[..., 1]], dim=-1)
     turns = rotations.from_rotation_vector(x[..., 5:].unflatten(-1, (-1, 3)))
     quats = quats.expand(*x.shape[:-1], *quats.shape[-2:]).clone()
@@ -187,7 +186,7 @@ def bend_limbs(
     wanted: Bool[Tensor, "poses joints"],
     turning: Bool[Tensor, "poses joints"],
 ) -> Motion:
-    """Poses with feet, and with hands that are wanted, at the places `ends` (world, metres), as far as limbs reach.
+    """Bend limbs so that feet, and hands with a target, are at `ends` (world, metres), as far as limbs reach.
 
     Feet lie as they lay `before`, and arms of which nothing is wanted hang as they hung; joints that are not `turning`
     stay.
@@ -218,7 +217,7 @@ def _world_rotations(motion: Motion) -> Float[Tensor, "poses joints 4"]:
 def _keep_orientation(
     motion: Motion, joint: int, orientation: Float[Tensor, "poses 4"], chosen: Bool[Tensor, " poses"]
 ) -> Motion:
-    """The motion with a joint oriented so in the world, in the chosen poses."""
+    """Give a joint this orientation in the world, in the chosen poses."""
     above = _world_rotations(motion)[:, motion.skeleton.parents[joint]]
     local = rotations.multiply(rotations.inverse(above), orientation)
     quats = motion.local_quat_xyzw.clone()

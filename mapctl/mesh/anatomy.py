@@ -1,4 +1,4 @@
-"""Where a moving skeleton's hips, head and soles are, on any rig: by names, bones and how it moves."""
+"""Hips, head and soles of a moving skeleton of any rig: by names, bones and movement."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class Foot:
     toe_axes: Array
     """(3, 3) the same in the toe joint's frame."""
     heights: tuple[float, float]
-    """Of ankle and ball over the sole, metres."""
+    """Heights of ankle and ball over the sole, metres."""
 
 
 class Anatomy:
@@ -58,31 +58,31 @@ class Anatomy:
         self.joints = motion.num_joints
         self.rotations = rotations.to_matrix(motion.joint_rotations()).numpy()
         joints, parents = motion.joint_positions().numpy(), motion.skeleton.parents
-        self.scale = _leg_length(joints[0], parents, classify_joints(motion.skeleton)) / _STANDARD_LEG
+        self.scale = _thigh_and_shin_length(joints[0], parents, classify_joints(motion.skeleton)) / _STANDARD_LEG
         self.points = _add_tips(motion, joints, self.rotations, self.scale)
         self.hips = _hips_joint(motion)
 
     @property
     def hips_world(self) -> Array:
-        """(frames, 3) metres."""
+        """Return hips positions (frames, 3), metres."""
         return self.points.world[:, self.hips]
 
     @property
     def seen(self) -> Array:
-        """(frames, n, 3) hips and all below, metres; a root on the floor is not part of the body."""
+        """Return positions (frames, n, 3) of hips and all below, metres, without a root on the floor."""
         return self.points.world[:, self.hips :]
 
     def find(self, part: Part, side: Side = Side.MIDDLE) -> int | None:
-        """The first joint of a part and side, None if the rig has none."""
+        """Find the first joint of a part and side, None if the rig has none."""
         wanted = Role(side, part)
         return next((k for k in range(self.joints) if self.points.roles[k] == wanted), None)
 
     def children(self, point: int) -> Iterator[int]:
-        """Points below a point, joints before far ends."""
+        """Yield the points below a point, joints before far ends."""
         return (k for k, parent in enumerate(self.points.parents) if parent == point)
 
     def left(self, part: Part) -> Array:
-        """(frames, 3) unit vectors from a part's right joint to its left; the hips' x axis without such."""
+        """Return unit vectors (frames, 3) from a part's right joint to its left; the hips' x axis without such."""
         pair = self.find(part, Side.LEFT), self.find(part, Side.RIGHT)
         if None in pair:
             return self.rotations[:, self.hips, :, 0]
@@ -90,7 +90,7 @@ class Anatomy:
 
     @cached_property
     def forward(self) -> Array:
-        """(frames, 3) where the body faces, level with the ground."""
+        """Return unit vectors (frames, 3) along which the body faces, level with the ground."""
         return unit(np.cross(self.left(Part.UPPER_LEG), _UP))
 
     @cached_property
@@ -132,23 +132,24 @@ class Anatomy:
         )
 
     def _flat_frames(self, ankle: int, ball: int) -> Array:
-        """Frames in which the foot most likely stands flat: ankle and ball together at their lowest."""
+        """Return frames in which the foot most likely stands flat: ankle and ball together at their lowest."""
         height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
         return height <= np.quantile(height, 0.1)
 
     def _height(self, point: int, flat: Array) -> float:
-        """Of a point over the ground y = 0 in the flat frames, kept to what a foot can have."""
+        """Return the height of a point over the ground y = 0 in the flat frames, metres, limited to what a foot can
+        have."""
         low, high = 0.02 * self.scale, 0.14 * self.scale
         return float(np.clip(np.median(self.points.world[flat, point, 1]), low, high))
 
     def _to_joint_frame(self, joint: int, vector: Array) -> Array:
-        """World vectors (frames, 3) or (3,) in a joint's frame."""
+        """Transform world vectors, (frames, 3) or (3,), to a joint's frame."""
         every = np.broadcast_to(vector, (len(self.rotations), 3))
         return np.einsum("fji,fj->fi", self.rotations[:, joint], every)
 
 
 def _axes_from(*, up: Array, forward: Array) -> Array:
-    """Columns left, up, forward; up is kept."""
+    """Return axes with columns left, up, forward; up is kept."""
     across = np.cross(up, forward)
     if np.linalg.norm(across) < 1e-6 * np.linalg.norm(forward) + 1e-12:
         across = np.array([1.0, 0.0, 0.0])  # any will do where the motion does not tell
@@ -162,8 +163,8 @@ def _hips_joint(motion: Motion) -> int:
         return 0  # of an unknown rig: its root
 
 
-def _leg_length(rest: Array, parents: tuple[int, ...], found: tuple[Role, ...]) -> float:
-    """Thigh plus shin, metres; a leg that cannot be found has the standard length."""
+def _thigh_and_shin_length(rest: Array, parents: tuple[int, ...], found: tuple[Role, ...]) -> float:
+    """Return the length of thigh plus shin, metres; the standard length where no leg is found."""
     for foot, role in enumerate(found):
         if role.part is Part.FOOT:
             knee = parents[foot]

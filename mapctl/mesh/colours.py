@@ -32,7 +32,7 @@ SHADOW = "#1c2430"
 
 
 def rgb(colour: str) -> np.ndarray:
-    """A name of ACTORS or `#rrggbb` as three numbers; RequestError otherwise."""
+    """Parse a name of ACTORS or `#rrggbb` to three numbers, 0 to 1; RequestError otherwise."""
     code = ACTORS.get(colour, colour)
     try:
         if len(code) != 7 or not code.startswith("#"):
@@ -43,10 +43,10 @@ def rgb(colour: str) -> np.ndarray:
 
 
 def default_colour(actor: int) -> str:
-    """The colour of the n-th actor that asked for none."""
+    """Return the colour of the n-th actor that has none of its own."""
     return list(ACTORS)[actor % len(ACTORS)]
 
 
 def blend_colours(colour: np.ndarray, other: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """`share` of the other colour in the first."""
+    """Blend `share` of the other colour into the first."""
     return colour + (other - colour) * share

@@ -77,27 +77,27 @@ class Mannequin:
         return len(self.anatomy.points.world)
 
     def boxes(self, frame: int) -> list[RoundedBoxes]:
-        """Limbs and trunk, skull and shoes in one frame."""
+        """Return limbs and trunk, skull and shoes in one frame."""
         feet = [_shoe(self.anatomy, foot, frame) for foot in self.anatomy.feet]
         head = self.anatomy.find(Part.HEAD)
         skull = [] if head is None else [_skull(self.anatomy, head, frame, self.colour)]
         return [self._capsules(frame), *skull, *feet]
 
     def joints(self) -> list[Array]:
-        """For each of `boxes`, the joint that carries each of its parts."""
+        """Return for each of `boxes` the joints that carry its parts."""
         anatomy = self.anatomy
         head = anatomy.find(Part.HEAD)
         skull = [] if head is None else [np.array([head, head])]
         return [self.bones.ends[:, 0], *skull, *(np.array(_carrier_joints(anatomy, foot)) for foot in anatomy.feet)]
 
     def surface(self, frame: int) -> Surface:
-        """The whole body in one frame."""
+        """Return the whole body in one frame."""
         boxes = self.boxes(frame)
         names = ("centre", "frame", "half", "radius", "squash", "rgb")
         return RoundedBoxes(*(np.concatenate([getattr(box, name) for box in boxes]) for name in names)).surface()
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
-        """All bones with those of head and feet: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3)."""
+        """Return all bones with those of head and feet: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3)."""
         ends, radius, rgb = self._sticks
         return self.anatomy.points.world[frame, ends], radius, rgb
 
@@ -148,7 +148,8 @@ def _build_bones(anatomy: Anatomy, colour: Array) -> Bones:
 
 
 def _is_drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
-    """Not what leads from a floor root to the hips, not what skull and shoes show, nothing without length."""
+    """Return whether a bone is drawn: none from a floor root to the hips, none within skull and shoes, none without
+    length."""
     if parent < 0 or child <= anatomy.hips or anatomy.points.roles[parent].part in _BOXED:
         return False
     length = np.linalg.norm(anatomy.points.world[0, child] - anatomy.points.world[0, parent])
@@ -156,7 +157,7 @@ def _is_drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
 
 
 def _trunk_shares(anatomy: Anatomy) -> Array:
-    """Every point's share of the way from hips to neck along the bones; 0 for legs, 1 for arms and head."""
+    """Return every point's share of the way from hips to neck along the bones; 0 for legs, 1 for arms and head."""
     points, top = anatomy.points, anatomy.find(Part.NECK)
     top = anatomy.find(Part.HEAD) if top is None else top
     way = np.zeros(len(points.parents))
@@ -170,7 +171,7 @@ def _trunk_shares(anatomy: Anatomy) -> Array:
 
 
 def _is_link(anatomy: Anatomy, child: int, parent: int) -> bool:
-    """Whether a bone leads from the trunk to a limb."""
+    """Return whether a bone leads from the trunk to a limb."""
     below, above = anatomy.points.roles[child], anatomy.points.roles[parent]
     return above.part in _TRUNK_PARTS and (below.part in _LINKS) and below.side is not Side.MIDDLE
 
@@ -206,7 +207,7 @@ def _limb_colour(side: Side) -> Array:
 
 
 def _skull(anatomy: Anatomy, head: int, frame: int, colour: Array) -> RoundedBoxes:
-    """A head with a dark visor where it faces."""
+    """Return a head with a dark visor where it faces."""
     scale, turn = anatomy.scale, anatomy.rotations[frame, head] @ anatomy.head_axes
     middle = anatomy.points.world[frame, head] + turn @ np.array([0.0, 0.085, 0.012]) * scale
     visor = middle + turn @ np.array([0.0, 0.014, 0.021]) * scale
@@ -221,12 +222,12 @@ def _skull(anatomy: Anatomy, head: int, frame: int, colour: Array) -> RoundedBox
 
 
 def _lighten(colour: Array) -> Array:
-    """Of the head and neck, a little lighter than the trunk."""
+    """Return the colour of head and neck, a little lighter than the trunk."""
     return colours.blend_colours(colour, np.ones(3), 0.18)
 
 
 def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
-    """Heel to ball and, where there are toes, ball to tip; soles on the ground when the foot is flat."""
+    """Build heel to ball and, where there are toes, ball to tip; soles on the ground when the foot is flat."""
     world, scale = anatomy.points.world[frame], anatomy.scale
     turn, boxes = anatomy.rotations[frame, foot.ankle] @ foot.axes, []
     reach = _forward_reach(turn, world[foot.ball] - world[foot.ankle]) + (0.03 if foot.tip is None else 0.01) * scale
@@ -243,22 +244,22 @@ def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
 
 
 def _forward_reach(turn: Array, vector: Array) -> float:
-    """How far a vector reaches along the foot, metres."""
+    """Return how far a vector reaches along the foot, metres."""
     return float(turn[:, 2] @ vector)
 
 
 def _sole(joint: Array, turn: Array, floor: float, along: tuple[float, float], thick: float, scale: float):
-    """Centre, frame and half extents of a box with its floor over a joint and its reach along it, metres."""
+    """Return the centre, frame and half extents of a box with its floor over a joint and its reach along it, metres."""
     middle = np.array([0.0, floor + thick * scale / 2, sum(along) / 2])
     half = np.array([0.045 * scale, thick * scale / 2, (along[1] - along[0]) / 2])
     return joint + turn @ middle, turn, np.maximum(half - _EDGE * scale, 0.0)
 
 
 def _carrier_joints(anatomy: Anatomy, foot: Foot) -> list[int]:
-    """The joints that carry the boxes of a shoe: ankle, and the toes if the rig has them."""
+    """Return the joints that carry the boxes of a shoe: ankle, and the toes if the rig has them."""
     return [foot.ankle] if foot.tip is None else [foot.ankle, foot.ball if foot.ball < anatomy.joints else foot.ankle]
 
 
 def _foot_bones(foot: Foot) -> list[tuple[int, int]]:
-    """Ankle to ball, and ball to tip if the rig has toes."""
+    """Return the bone from ankle to ball, and from ball to tip if the rig has toes."""
     return [(foot.ankle, foot.ball)] + ([] if foot.tip is None else [(foot.ball, foot.tip)])

@@ -29,7 +29,7 @@ class Surface:
 
 
 def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
-    """One surface of all, faces in the order given. All are lit or none is."""
+    """Merge surfaces into one, faces in the order given; all are lit or none is."""
     counts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     lit = surfaces[0].normals is not None
     return Surface(
@@ -42,7 +42,8 @@ def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
 
 @cache
 def unit_sphere(around: int = 16, up: int = 10) -> tuple[Array, Array]:
-    """Unit sphere (n, 3) and its triangles; no vertex lies on a coordinate plane, so that each has an octant.
+    """Return the unit sphere (n, 3) and its triangles; no vertex lies on a coordinate plane, so that each has an
+    octant.
 
     `around` must be divisible by 4 and `up` even. The axis is y.
     """
@@ -78,7 +79,7 @@ class RoundedBoxes:
     """(parts, 3) sRGB."""
 
     def surface(self) -> Surface:
-        """All boxes as one lit surface."""
+        """Return all boxes as one lit surface."""
         sphere, faces = unit_sphere()
         octant = np.sign(sphere)
         radius = np.where(sphere[:, 1] < 0, self.radius[:, :1], self.radius[:, 1:])[..., None]
@@ -96,7 +97,7 @@ class RoundedBoxes:
 
 
 def frame_along(axis: Array, across: Array) -> Array:
-    """(..., 3, 3) rotations whose y column is `axis` and whose x column is as near to `across` as can be."""
+    """Return (..., 3, 3) rotations whose y column is `axis` and whose x column is as near to `across` as can be."""
     y = unit(np.where(np.linalg.norm(axis, axis=-1, keepdims=True) > 1e-9, axis, np.array([0.0, 1.0, 0.0])))
     z = np.cross(across, y)
     fallback = np.cross(np.where(np.abs(y[..., :1]) < 0.7, np.array([1.0, 0, 0]), np.array([0, 0, 1.0])), y)
@@ -105,5 +106,5 @@ def frame_along(axis: Array, across: Array) -> Array:
 
 
 def unit(vector: Array) -> Array:
-    """Vectors of length one; zero stays zero."""
+    """Normalise vectors to length one; zero stays zero."""
     return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)

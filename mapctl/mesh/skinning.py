@@ -30,7 +30,7 @@ class Skin:
 
 
 def build_skin(motion: Motion, colour: str = "slate") -> Skin:
-    """The body of a motion; feet are told flat by its frames, so it should hold more than one step.
+    """Build the body of a motion; its frames show when feet are flat, so it should hold more than one step.
 
     `colour` is the torso's: a name of `colours.ACTORS` or `#rrggbb`; RequestError otherwise.
     """
@@ -53,7 +53,7 @@ def build_skin(motion: Motion, colour: str = "slate") -> Skin:
 
 
 def at_rest(skeleton: Skeleton = CANONICAL) -> Motion:
-    """One frame of a skeleton in its rest pose, the lowest joint as high as a toe joint of a flat foot."""
+    """Return one frame of a skeleton in its rest pose, the lowest joint as high as a toe joint of a flat foot."""
     still = torch.zeros(1, skeleton.num_joints, 4, dtype=torch.float64)
     still[..., 3] = 1.0
     motion = Motion(skeleton, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), still)

@@ -1,4 +1,4 @@
-"""Measures of a motion, exactly as the design's section 6 defines them; names carry their units.
+"""Measures of a motion; names carry their units.
 
 A measure that a clip cannot give (sway of one second, contact speed without a contact) is NaN.
 """
@@ -22,14 +22,14 @@ _CM = 100.0
 def measure(
     motion: Motion, curve: Curve | None = None, *, speed: float | None = None, joint: str | None = None
 ) -> dict[str, float]:
-    """Measures of one motion by name.
+    """Measure one motion, by name of the measure.
 
     Always: skate_cm_s, skate_ratio, contact_speed_cm_s, planted_share, penetration_cm, float_cm, jitter_m_s3,
-    speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm, and sway_cm: from the straight
-    line between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, likewise
-    path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s) wanted_m and progress_ratio too.
-    `joint` names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or
-    feet cannot be told, unknown joints and motions of one frame.
+    speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm, and sway_cm: from the straight line
+    between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, likewise
+    path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s) wanted_m and progress_ratio too. `joint`
+    names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or feet cannot be
+    told, unknown joints and motions of one frame.
     """
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
@@ -93,7 +93,7 @@ class MeasureStatistics(NamedTuple):
 
 
 def compute_reference(motions: Iterable[Motion]) -> dict[str, MeasureStatistics]:
-    """Mean, 2nd and 98th percentile of every measure over clips, to print beside ours.
+    """Compute mean, 2nd and 98th percentile of every measure over clips, to print beside ours.
 
     NaN is left out: clips that cannot give a measure. RequestError for no clips at all.
     """

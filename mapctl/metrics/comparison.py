@@ -1,4 +1,4 @@
-"""Motions made comparable: measures depend on the joints, on which way is up and on the frame rate that they see."""
+"""Motions made comparable: measures depend on the joints, the up axis and the frame rate."""
 
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -11,7 +11,7 @@ _RATE_TOLERANCE = 0.02  # share of the reference's rate within which measures ar
 
 
 def make_comparable(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[str, ...]]:
-    """The motion as the reference values of mocap were measured: canonical joints, Y up, 30 frames a second.
+    """Convert a motion to what reference values of mocap were measured on: canonical joints, Y up, 30 frames a second.
 
     Frames are left out of faster motions; slower ones stay, since nothing is known between their frames. Sentences tell
     what could not be made so: a rig that is not known stays as it is in the file. `rig` wins over what would be

@@ -19,9 +19,8 @@ SWAY_SECONDS = 0.35
 def compute_path_error(
     places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames"]:
-    """Distance of each place to where the walk is on the curve, between its ends, metres; without height for a ground
-    curve. `arcs` come from `track`: the nearest place of all may belong to another branch.
-    """
+    """Compute the distance of each position to the curve at the walk's arc, between the curve's ends, metres; without
+    height for a ground curve. `arcs` come from `track`: the nearest point of all may belong to another branch."""
     on_it = arcs if curve.closed else arcs.clamp(0, curve.length)
     apart = curve.point(on_it) - (places[:, ::2] if places.shape[1] > curve.dims else places)
     return apart.norm(dim=-1)
@@ -30,7 +29,7 @@ def compute_path_error(
 def compute_low_pass_error(
     places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
 ) -> Float[Tensor, "frames"]:
-    """Size of the sideways offset after a Gaussian of 0.5 s, metres.
+    """Compute the size of the sideways offset after a Gaussian of 0.5 s, metres.
 
     The offset is smoothed and not the walk, which would shrink on every bend. `arcs` come from `track`.
     """
@@ -38,7 +37,7 @@ def compute_low_pass_error(
 
 
 def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECONDS) -> float:
-    """Root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
+    """Return the root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
     kernel = gaussian_kernel(seconds, fps)
     reach = len(kernel) // 2
     if len(offset) <= 2 * reach + 4:
@@ -49,7 +48,7 @@ def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECO
 
 
 def straight_offset(ground: Float[Tensor, "frames 2"]) -> Float[Tensor, "frames"]:
-    """Distance of a walk (x, z) from the line piece between its ends, metres; left is positive."""
+    """Return the distance of a walk (x, z) from the line piece between its ends, metres; left is positive."""
     along = ground[-1] - ground[0]
     apart = ground - ground[0]
     share = ((apart @ along) / along.square().sum().clamp_min(1e-12)).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""How well a steered character did what it was told: speed and direction of its slow velocity against the commands."""
+"""Command tracking of a steered character: speed and direction of its slow velocity against the commands."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
-from mapctl import contacts
+from mapctl import contacts, rotations
 from mapctl.intent.steering import Command, CommandTrack
 from mapctl.joint_roles import find_feet
 from mapctl.metrics.realism.gait import step_lengths
@@ -17,24 +17,24 @@ from mapctl.motion import Motion
 
 _SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
-_HOLD_SECONDS = 0.4  # seconds for which a wish must hold to count as reached
+_HOLD_SECONDS = 0.4  # seconds for which a command must hold to count as reached
 _NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
 
 
 @dataclass(frozen=True, eq=False)
 class LowPassVelocity:
-    """Slow velocity of the hips, frame by frame."""
+    """Low-pass velocity of the hips, frame by frame."""
 
     seconds: Float[ndarray, " frames"]
-    """Time of each frame."""
+    """Time of each frame, seconds."""
     speed: Float[ndarray, " frames"]
-    """m/s."""
+    """Speed over the ground, m/s."""
     direction: Float[ndarray, " frames"]
-    """Radians about +Y; of no meaning where the speed is near 0."""
+    """Direction of travel, radians about +Y; meaningless where the speed is near 0."""
 
 
 def compute_low_pass_velocity(motion: Motion) -> LowPassVelocity:
-    """Slow velocity of a motion's root over the ground (Gaussian of 0.25 s)."""
+    """Compute the slow velocity of a motion's root over the ground (Gaussian of 0.25 s)."""
     fps = float(motion.fps)
     ground = motion.joint_positions()[:, 0, ::2].numpy()
     velocity = gaussian_filter1d(np.gradient(ground, axis=0) * fps, _SLOW_SECONDS * fps, axis=0, mode="nearest")
@@ -43,7 +43,7 @@ def compute_low_pass_velocity(motion: Motion) -> LowPassVelocity:
 
 
 def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
-    """A row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
+    """Measure a row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
 
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
     it never was), steady_speed_mps (net way over time; the mean speed while turning), steady_heading_error_deg and
@@ -73,7 +73,7 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
 
 
 def _step_length_by_frame(motion: Motion) -> Float[ndarray, " frames"]:
-    """Length of the step that ends in a frame, metres; NaN where none does."""
+    """Return the length of the step that ends in a frame, metres; NaN where none does."""
     toes = motion.joint_positions()[:, list(find_feet(motion.skeleton))]
     return step_lengths(toes[..., ::2], contacts.detect_contacts(toes, float(motion.fps)), float(motion.fps)).numpy()
 
@@ -81,7 +81,7 @@ def _step_length_by_frame(motion: Motion) -> Float[ndarray, " frames"]:
 def _find_time_reached(way: LowPassVelocity, part: ndarray, began: float, command: Command, fps: float) -> float | None:
     near = np.abs(way.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
     if command.speed > 0 and command.turning is None:
-        near &= np.abs(_wrapped(way.direction - command.heading)) < _NEAR_ANGLE
+        near &= np.abs(rotations.wrap_angle(way.direction - command.heading)) < _NEAR_ANGLE
     at = np.flatnonzero(part)
     for first in at:
         if near[first : min(first + round(_HOLD_SECONDS * fps), at[-1] + 1)].all():
@@ -102,17 +102,13 @@ def _measure_steady_errors(
         rate = math.degrees(float(turned[-1] - turned[0])) * fps / (len(frames) - 1)
         return found | {"steady_speed_mps": float(way.speed[frames].mean()), "steady_turn_deg_s": rate}
     step = (ground[frames[-1]] - ground[frames[0]]) * fps / (len(frames) - 1)
-    off = math.degrees(float(_wrapped(math.atan2(step[0], step[1]) - command.heading)))
+    off = math.degrees(float(rotations.wrap_angle(math.atan2(step[0], step[1]) - command.heading)))
     found["steady_speed_mps"] = float(np.linalg.norm(step))
     return found | {"steady_heading_error_deg": off if command.speed > 0 else None}
 
 
-def _wrapped(angle):
-    return (angle + math.pi) % (2 * math.pi) - math.pi
-
-
 def sample_commands(track: CommandTrack, seconds: Sequence[float]) -> tuple[list[float], list[float]]:
-    """The commanded speed (m/s) and heading (radians; NaN while it is to turn on and on) at each time."""
+    """Sample the commanded speed (m/s) and heading (radians; NaN while it is to turn on and on) at each time."""
     commands = [track.at(time) for time in seconds]
     return [command.speed for command in commands], [
         command.heading if command.turning is None else math.nan for command in commands

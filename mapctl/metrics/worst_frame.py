@@ -1,4 +1,4 @@
-"""What a viewer sees first: the fastest hand, the hardest jolt, and how long a body goes on feet that do not carry it.
+"""Worst frames: the fastest hand, the hardest jolt, and how long a body moves on feet that do not carry it.
 
 Means hide all three: a hand that jumps by half a metre in one frame of two hundred moves the mean by nothing.
 """
@@ -17,16 +17,16 @@ _MOVING_SPEED = 0.3  # m/s of the hips
 
 
 class Peaks(NamedTuple):
-    """Of hands and feet, hips held still."""
+    """Peaks of hands and feet relative to the hips."""
 
     step: float
-    """Largest way in a thirtieth of a second, metres."""
+    """Largest displacement in a thirtieth of a second, metres."""
     acceleration: float
-    """Largest, m/s^2."""
+    """Largest acceleration, m/s^2."""
 
 
 def measure_peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"], fps: float) -> Peaks:
-    """Of world positions in metres; 0 for what so few frames do not show."""
+    """Measure peaks of world positions in metres; 0 for what too few frames show."""
     seen = ends - hips[:, None]
     steps, bends = (torch.diff(seen, n=order, dim=0).norm(dim=-1) for order in (1, 2))
     return Peaks(
@@ -37,10 +37,9 @@ def measure_peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "fra
 def find_unsupported(
     toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
 ) -> Bool[Tensor, " steps"]:
-    """Whether, on the way to each frame but the first, the hips go over the ground while no toe is planted and the
-    lower one is near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's
-    own 5th percentile.
-    """
+    """Return by frame but the first whether the hips move over the ground while no toe is planted and the lower one is
+    near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's own 5th
+    percentile."""
     height = (toes[..., 1] - contacts.estimate_floor_heights(toes))[1:]
     speed, pace = (torch.diff(places[..., ::2], dim=0).norm(dim=-1) * fps for places in (toes, hips))
     planted = ((height < _LOW) & (speed < _SLOW)).any(dim=1)
@@ -50,7 +49,7 @@ def find_unsupported(
 def measure_longest_unsupported(
     toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
 ) -> float:
-    """Seconds of the longest stretch of `unsupported`."""
+    """Measure the longest run of `unsupported`, seconds."""
     longest = run = 0
     for bad in find_unsupported(toes, hips, fps).tolist():
         run = run + 1 if bad else 0

@@ -10,7 +10,8 @@ from torch import Tensor
 def pairwise_weights(
     count: int, sigma: float, dtype: torch.dtype, device: torch.device | None = None
 ) -> Float[Tensor, "count count"]:
-    """How much each frame has to do with each other: 1 with itself; `sigma` is in frames. Memory is count squared."""
+    """Return Gaussian weights between all pairs of frames, 1 with itself; `sigma` is in frames. Memory is count
+    squared."""
     frame = torch.arange(count, dtype=dtype, device=device)
     return torch.exp(-0.5 * ((frame[:, None] - frame) / sigma).square())
 
@@ -18,13 +19,19 @@ def pairwise_weights(
 def averaging_matrix(
     count: int, sigma: float, dtype: torch.dtype, device: torch.device | None = None
 ) -> Float[Tensor, "count count"]:
-    """Row t averages the frames around t, normalised over the frames there are; `sigma` is in frames."""
+    """Return a matrix whose row t averages frames around t, normalised over existing frames; `sigma` is in frames."""
     weight = pairwise_weights(count, sigma, dtype, device)
     return weight / weight.sum(dim=-1, keepdim=True)
 
 
+def unit_variance_matrix(count: int, sigma: float, dtype: torch.dtype) -> Float[Tensor, "count count"]:
+    """Return a matrix that smooths white noise to unit variance in every row; `sigma` is in frames."""
+    weight = pairwise_weights(count, sigma, dtype)
+    return weight / weight.square().sum(dim=-1, keepdim=True).sqrt()
+
+
 def kernel(sigma: float, side: int) -> Float[Tensor, " taps"]:
-    """2 * side + 1 weights that add up to one, the middle one the greatest; `sigma` is in frames."""
+    """Return 2 * side + 1 weights that sum to one, the middle one the greatest; `sigma` is in frames."""
     weight = torch.exp(-0.5 * (torch.arange(-side, side + 1, dtype=torch.float64) / sigma).square())
     return weight / weight.sum()
 
@@ -32,9 +39,8 @@ def kernel(sigma: float, side: int) -> Float[Tensor, " taps"]:
 def convolve(
     values: Float[Tensor, "frames *width"], taps: Float[Tensor, " taps"], ends: Literal["nothing", "repeated"]
 ) -> Float[Tensor, "frames *width"]:
-    """Each frame as the mean of those around it that a kernel's `taps`, odd in number, say; beyond the ends there is
-    nothing, or the outermost frame again and again.
-    """
+    """Average the frames around each frame by a kernel's `taps`, odd in number; beyond the ends there is nothing, or
+    the outermost frame repeated."""
     side = len(taps) // 2
     channels = values.flatten(1).T[:, None] if values.ndim > 1 else values[None, None]
     if ends == "repeated":
@@ -44,12 +50,12 @@ def convolve(
 
 
 def gaussian_kernel(seconds: float, fps: float) -> Float[Tensor, "taps"]:
-    """Weights that sum to one; `seconds` is the standard deviation."""
+    """Return kernel weights that sum to one; `seconds` is the standard deviation."""
     return kernel(seconds * fps, int(3 * seconds * fps))
 
 
 def low_pass(values: Float[Tensor, "frames"], *, seconds: float, fps: float) -> Float[Tensor, "frames"]:
-    """The smoothed signal, every frame of it: near the ends the weights are those of the frames there are."""
+    """Smooth a signal, every frame of it: near the ends the weights are those of the frames there are."""
     kernel = gaussian_kernel(seconds, fps)
     both = torch.stack([values, torch.ones_like(values)], dim=-1)
     summed, weight = convolve(both, kernel, "nothing").unbind(dim=-1)

@@ -1,4 +1,4 @@
-"""Intervals of a mask over frames: where it is true, the nearest frames where it was, and values filled in between."""
+"""Intervals of a mask over frames: runs of true, the nearest frames that are true, and interpolation between them."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from mapctl import rotations
 
 
 def true_intervals(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, int, int]]:
-    """Column, first frame and one past the last of each run of true, column by column."""
+    """Yield column, first frame and one past the last of each run of true, column by column."""
     edge = torch.zeros(1, mask.shape[1], dtype=torch.int8)
     change = torch.diff(mask.to(torch.int8), dim=0, prepend=edge, append=edge).T
     starts, stops = (change == 1).nonzero(), (change == -1).nonzero()
@@ -19,7 +19,7 @@ def true_intervals(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, 
 
 
 def fill_missing(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
-    """Frames that were not seen, straight between those around them; beyond the first and last seen, as these are."""
+    """Fill frames that were not observed linearly between those around them; hold first and last beyond."""
     before, after = last_observed(seen), next_observed(seen)
     start = torch.take_along_dim(values, before[..., None], dim=1)
     stop = torch.take_along_dim(values, after[..., None], dim=1)
@@ -29,14 +29,14 @@ def fill_missing(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor,
 
 
 def fill_missing_angle(angle: Float[Tensor, "batch frames"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
-    """Angles, radians, not wrapped; frames that were not seen are `filled` the short way round."""
-    # Unseen frames may show anything: whole turns are counted from one seen frame to the next.
+    """Fill angles, radians, not wrapped, as `fill_missing` does, along the shorter arc."""
+    # Frames that were not observed may hold anything: whole turns are counted from one observed frame to the next.
     held = torch.take_along_dim(angle, last_observed(seen), dim=1)
     return fill_missing(rotations.unwrap_angle(held)[..., None], seen)[..., 0]
 
 
 def last_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
-    """For each frame the last one at or before it that was seen; before the first of them, that one."""
+    """Return for each frame the last observed one at or before it; before the first of them, that one."""
     frame = torch.arange(seen.shape[1], device=seen.device)
     last = torch.where(seen, frame, -1).cummax(dim=1).values
     first = torch.where(seen.any(dim=1), seen.to(torch.uint8).argmax(dim=1), 0)
@@ -44,5 +44,5 @@ def last_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch fram
 
 
 def next_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
-    """For each frame the first one at or after it that was seen; after the last of them, that one."""
+    """Return for each frame the first observed one at or after it; after the last of them, that one."""
     return seen.shape[1] - 1 - last_observed(seen.flip(1)).flip(1)

@@ -10,7 +10,7 @@ JitDecorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
-    """(entry, inner): decorators for functions that Python calls, and for those that only compiled code calls.
+    """Make (entry, inner): decorators for functions that Python calls, and for those that only compiled code calls.
 
     `relaxed` names LLVM's fast-math flags; NaN and infinity keep their meaning while `nnan` and `ninf` are not among
     them. Inner functions go without the wrappers for Python, which makes the first use quicker.
@@ -27,7 +27,7 @@ def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
 
 
 def _tolerate_full_disk(compiled: Any) -> Any:
-    """Where the disk is full that numba keeps compiled code on, the next start takes longer; nothing fails."""
+    """Ignore a full disk where numba keeps compiled code: the next start takes longer, nothing fails."""
     cache = compiled._cache
     keep = cache.save_overload
 
@@ -40,6 +40,6 @@ def _tolerate_full_disk(compiled: Any) -> Any:
 
 
 def _njit(**options: Any) -> JitDecorator:
-    """numba's decorator, whose overloads no type checker follows."""
+    """Return numba's decorator, whose overloads no type checker follows."""
     compiler: Any = njit
     return compiler(**options)

@@ -1,4 +1,4 @@
-"""The smoothest offsets of some frames: least second differences, and each frame held as firmly as it is told."""
+"""The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight says."""
 
 import numpy as np
 import torch
@@ -7,27 +7,27 @@ from numpy import ndarray
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
-_CONSTRAINT_WEIGHT = 1e9  # how much more a value that is told counts than smoothness
+_CONSTRAINT_WEIGHT = 1e9  # how much more a given value counts than smoothness
 SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
-"""Of three frames in a second difference."""
+"""Weights of three frames in a second difference."""
 
 
 def find_overlapping_differences(start: int, stop: int, frames: int) -> range:
-    """First frames of the second differences, of a motion of so many frames, that take in some of start to stop."""
+    """Find the first frames of the second differences, of a motion of so many frames, that take in some of start to
+    stop."""
     return range(max(0, start - 2), min(frames - 2, stop))
 
 
 def fade_weight(seconds: float, fps: float) -> float:
-    """How firmly frames are held at nothing where offsets are to fade away over this time."""
+    """Return how firmly frames are held at 0 where offsets are to fade away over this time."""
     return 1.0 / max(1.0, seconds * fps) ** 4
 
 
 def solve_offsets(
     right: Float[ndarray, "count width"], firm: float | Float[ndarray, " count"], *, start: int, frames: int
 ) -> Float[ndarray, "count width"]:
-    """Offsets o of frames from `start` on, with  (D'D + diag(firm)) o = right,  D the second differences of a motion of
-    so many frames, of which all others have no offset.
-    """
+    """Solve for offsets o of frames from `start` on, with  (D'D + diag(firm)) o = right,  D the second differences of a
+    motion of so many frames, of which all others have no offset."""
     count = len(right)
     first = np.array(find_overlapping_differences(start, start + count, frames), dtype=int) - start
     bands = np.zeros((3, count))
@@ -42,9 +42,8 @@ def solve_offsets(
 def interpolate_offsets(
     values: Float[Tensor, "frames width"], firm: Bool[Tensor, " frames"], *, seconds: float, fps: float
 ) -> Float[Tensor, "frames width"]:
-    """The smoothest offsets that are the values in the frames that are firm, and fade to nothing away from them over
-    about so many seconds: a value v then asks for an acceleration of v / seconds^2.
-    """
+    """Interpolate the smoothest offsets that have the values in the frames that are firm, and fade to 0 away from them
+    over about so many seconds: a value v then asks for an acceleration of v / seconds^2."""
     count = len(values)
     if count < 3:
         return torch.where(firm[:, None], values, 0.0)

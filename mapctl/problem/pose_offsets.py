@@ -45,8 +45,7 @@ class PoseOffsets:
 
     @cached_property
     def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
-        weight = gaussian.pairwise_weights(len(self.sigma), self.smooth, self.sigma.dtype)
-        return weight / weight.square().sum(dim=-1, keepdim=True).sqrt()
+        return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
 
     def initial(self, warm_start: Float[Tensor, "ahead width"]) -> Float[Tensor, "1 unknowns"]:
         """The proposal itself, whatever the last window found: that has moved what these offsets are smoothed with."""

@@ -1,4 +1,4 @@
-"""What a capture shows, what it does not, and how noisy it is."""
+"""Recordings of motion: their masks, artefacts, noise, spikes and gaps, and how they are split into frequency bands."""
 
 from mapctl.numerics.intervals import fill_missing, last_observed, next_observed
 from mapctl.recording.proposal import CaptureProposal

@@ -1,4 +1,4 @@
-"""What was wrong with a recording, as a list that a person can read."""
+"""Artefacts of a recording, as a list that a person can read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 from mapctl.numerics.intervals import true_intervals
 
 NOISE_DEG, NOISE_CM = 0.5, 0.2
-"""Noise below this is not worth a line: optical capture has as much."""
+"""Least noise that is listed, degrees and centimetres: optical capture has as much."""
 _SKATE_SPEED = 0.2  # m/s that a planted toe moves by, over some frames, before it is said to slide
 _FLOAT_HEIGHT = 0.03  # metres that it is above its rest height
 _MIN_FRAMES = 3  # frames of either
@@ -18,26 +18,26 @@ _MIN_FRAMES = 3  # frames of either
 
 @dataclass(frozen=True)
 class Artefact:
-    """One thing that was wrong."""
+    """One artefact of a recording."""
 
     joint: str
-    """Of the recording's rig."""
+    """Name of the joint on the recording's rig."""
     start: int
     """First frame, from 0."""
     stop: int
-    """One past the last."""
+    """One past the last frame."""
     kind: str
     """noise, spike, dropout, slide or float."""
     amount: float
-    """How much: the noise's sigma, the height of a spike or of a floating toe, the way of a slide; 0 of a dropout."""
+    """Noise's sigma, height of a spike or of a floating toe, distance of a slide; 0 for a dropout."""
     unit: str
-    """Of the amount."""
+    """Unit of the amount."""
 
 
 def list_noise(
     names: Sequence[str], angles: Float[Tensor, " joints"], root: float, *, travels: int, frames: int
 ) -> list[Artefact]:
-    """Joints whose angles shake (radians), and the place of the joint that travels (metres)."""
+    """List joints whose angles are noisy (radians), and the position of the travelling joint (metres)."""
     degrees = torch.rad2deg(angles).tolist()
     found = [
         Artefact(name, 0, frames, "noise", amount, "deg")
@@ -52,7 +52,7 @@ def list_noise(
 def list_spikes(
     names: Sequence[str], spikes: Bool[Tensor, "frames joints"], away: Float[Tensor, "frames joints"], unit: str
 ) -> list[Artefact]:
-    """Spikes, and how far each lies from what replaced it."""
+    """List spikes, and how far each is from what replaced it."""
     return [
         Artefact(names[joint], start, stop, "spike", float(away[start:stop, joint].max()), unit)
         for joint, start, stop in true_intervals(spikes)
@@ -60,7 +60,7 @@ def list_spikes(
 
 
 def list_dropouts(names: Sequence[str], dropouts: Bool[Tensor, "frames joints"]) -> list[Artefact]:
-    """Where joints were not seen."""
+    """List where joints were not observed."""
     return [Artefact(names[joint], start, stop, "dropout", 0.0, "") for joint, start, stop in true_intervals(dropouts)]
 
 
@@ -72,7 +72,7 @@ def list_foot_artefacts(
     rest_height: float,
     fps: float,
 ) -> list[Artefact]:
-    """Planted toes that slide, and planted toes in the air; world positions, metres, at any rate."""
+    """List planted toes that slide, and planted toes in the air; world positions, metres, at any rate."""
     steps = torch.diff(toes[..., ::2], dim=0, prepend=toes[:1, :, ::2]).norm(dim=-1)
     slides = planted & (steps * fps > _SKATE_SPEED)
     floats = planted & (toes[..., 1] > rest_height + _FLOAT_HEIGHT)

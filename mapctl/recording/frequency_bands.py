@@ -1,7 +1,7 @@
-"""Recordings at other rates than the prior's: what is slower than it can hold, and what is faster.
+"""Recordings at other rates than the prior's, split into a band that is slow enough for it, and a fast one.
 
-The slow band is what the prior is shown at its own rate; what it changes is carried back smoothly. The fast band is
-kept as far as it is more than the noise, moment by moment and joint by joint, so that a true kick survives.
+The prior is given the slow band at its own rate; its change is upsampled smoothly. The fast band is kept as far as it
+is more than the noise, moment by moment and joint by joint, so that a true kick survives.
 """
 
 import math
@@ -20,7 +20,7 @@ from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 
 CROSSOVER_HZ = 10.0
-"""Between the bands: two thirds of what the prior's rate can hold, so that a spline carries the slow one back whole."""
+"""Edge between the bands, Hz: two thirds of what the prior's rate can hold, so that a spline restores the slow one."""
 _FILTER_ORDER = 6
 _POWER_SECONDS = 0.15  # seconds over which the fast band is compared with the noise
 _NOISE_FACTOR = 3.0  # times the noise's power that the fast band has before half of it is kept
@@ -28,14 +28,14 @@ _NOISE_FACTOR = 3.0  # times the noise's power that the fast band has before hal
 
 @dataclass(frozen=True, eq=False)
 class FrequencyBands:
-    """A motion on canonical joints, split."""
+    """A motion on canonical joints, split into bands."""
 
     slow: Motion
-    """At the recording's rate, without what is faster than `CROSSOVER_HZ`."""
+    """Motion at the recording's rate, without what is faster than `CROSSOVER_HZ`."""
     fast_angles: Float[Tensor, "frames joints 3"]
-    """What the slow band's joints turn by to be the recording's: rotation vectors in their own frames."""
+    """Rotation vectors, radians, from the slow band's joints to the recording's, in their own frames."""
     fast_root: Float[Tensor, "frames 3"]
-    """What the recording's hips lie beside the slow band's, metres."""
+    """Offset of the recording's hips from the slow band's, metres."""
 
     @property
     def whole(self) -> bool:
@@ -44,16 +44,17 @@ class FrequencyBands:
 
     @property
     def exact(self) -> bool:
-        """Whether the prior is shown the recording's own frames: none is then mixed with its neighbours."""
+        """Whether the prior is given the recording's own frames: none is then blended with its neighbours."""
         return self.slow.fps == PRIOR_FPS
 
     def noise_at_prior_rate(self, sigma: Tensor) -> Tensor:
-        """White noise at the prior's rate that is as dense, below the edge, as the recording's of this sigma."""
+        """Return the sigma of white noise at the prior's rate that is as dense, below the crossover, as the
+        recording's."""
         return sigma * min(1.0, PRIOR_FPS / float(self.slow.fps)) ** 0.5
 
     def at_prior_rate(self) -> Motion:
-        """The slow band at the prior's rate, to its very end: a last frame that falls between two is followed by one
-        more, in which the motion holds. What is changed there is else only held on to, and noise that differs stays.
+        """Resample the slow band to the prior's rate, to its very end: a last frame that falls between two is followed
+        by one more, in which the motion holds. What is changed there is else only held, and noise that differs stays.
         """
         slow, last = self.slow, (self.slow.num_frames - 1) * PRIOR_FPS / self.slow.fps
         beyond = math.ceil((math.ceil(last) - last) * slow.fps / PRIOR_FPS)
@@ -63,11 +64,12 @@ class FrequencyBands:
 
     @property
     def within(self) -> int:
-        """How many frames at the prior's rate lie within the recording."""
+        """Number of frames at the prior's rate that lie within the recording."""
         return int((self.slow.num_frames - 1) * PRIOR_FPS / self.slow.fps) + 1
 
     def recombine(self, shown: Motion, cleaned: Motion, sigma: Float[Tensor, " joints"], sigma_root: float) -> Motion:
-        """The slow band changed as `shown` (see `at_prior_rate`) was to `cleaned`, and what the fast one has of motion.
+        """Change the slow band as `shown` (see `at_prior_rate`) was to `cleaned`, and add what the fast band has of
+        motion.
 
         Sigmas are the recording's own, at its own rate.
         """
@@ -86,9 +88,8 @@ class FrequencyBands:
     def _upsample_with_residual(
         self, shown: Motion
     ) -> tuple[Motion, Float[Tensor, "frames joints 3"], Float[Tensor, "frames 3"]]:
-        """What was shown, at the recording's rate, and how the recording differs from it: not from the slow band, of
-        whose noise near the edge a spline through fewer frames would leave some.
-        """
+        """Return `shown` at the recording's rate, and the recording's residual from it: not from the slow band, of
+        whose noise near the crossover a spline through fewer frames would leave some."""
         if self.whole or shown.num_frames < 2:
             return self.slow, self.fast_angles, self.fast_root
         quats = torch.nn.functional.normalize(self._upsample_to_recording(shown.local_quat_xyzw), dim=-1)
@@ -98,7 +99,7 @@ class FrequencyBands:
         return base, angles, self.slow.root_position + self.fast_root - base.root_position
 
     def _upsample_to_recording(self, change: Float[Tensor, "shown *width"]) -> Float[Tensor, "frames *width"]:
-        """From the prior's rate to the recording's."""
+        """Upsample from the prior's rate to the recording's."""
         seconds = torch.arange(len(change), dtype=torch.float64) / PRIOR_FPS
         return upsample(change, seconds, fps=float(self.slow.fps), frames=self.slow.num_frames)
 
@@ -106,7 +107,7 @@ class FrequencyBands:
 def upsample(
     values: Float[Tensor, "shown *width"], seconds: Float[Tensor, " shown"], *, fps: float, frames: int
 ) -> Float[Tensor, "frames *width"]:
-    """Values at these times, which rise, at a rate of so many frames, by a cubic spline; held beyond the last."""
+    """Interpolate values at rising times, for so many frames a second, by a cubic spline; hold beyond the last."""
     if len(values) < 2:
         return values.expand(frames, *values.shape[1:])
     times = seconds.numpy()
@@ -115,7 +116,7 @@ def upsample(
 
 
 def split_bands(motion: Motion) -> FrequencyBands:
-    """The bands of a motion whose quaternions' signs are continuous; at the prior's rate or less all of it is slow."""
+    """Split a motion with continuous quaternion signs into bands; at the prior's rate or less all of it is slow."""
     fps, quats = float(motion.fps), motion.local_quat_xyzw
     if _is_slow(fps) or motion.num_frames < 3 * _FILTER_ORDER:
         slow = Motion(motion.skeleton, motion.fps, motion.root_position, quats)
@@ -137,9 +138,8 @@ def split_bands(motion: Motion) -> FrequencyBands:
 
 
 def _extend_ends(values: np.ndarray, about: int) -> np.ndarray:
-    """Frames put before and after, turned about what the `about` outermost ones say of the ends: a filter that begins
-    at the first frame itself would take its noise for motion.
-    """
+    """Extend a signal by frames before and after, reflected about what the `about` outermost ones say of the ends: a
+    filter that begins at the first frame itself would take its noise for motion."""
     about = min(about, len(values) - 1)
     side = min(3 * about, len(values) - 1)
 
@@ -153,12 +153,12 @@ def _extend_ends(values: np.ndarray, about: int) -> np.ndarray:
 
 
 def _is_slow(fps: float) -> bool:
-    """Whether the prior's rate holds all that is in the recording."""
+    """Return whether the prior's rate holds all that is in the recording."""
     return fps <= 1.05 * PRIOR_FPS
 
 
 def _apply_wiener_gain(values: Float[Tensor, "frames joints 3"], noise: Tensor, moment: float) -> Tensor:
-    """Values by the share of their power, about each frame, that noise of this variance does not explain."""
+    """Scale values by the share of their power, about each frame, that noise of this variance does not explain."""
     power = values.square().mean(dim=-1, keepdim=True)
     side = max(1, round(moment / 2))
     near = gaussian.convolve(power, gaussian.kernel(side, 2 * side), "repeated")

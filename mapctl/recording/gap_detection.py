@@ -1,4 +1,4 @@
-"""Gaps that nobody marked: joints that leap or freeze, and bodies that freeze and then go on elsewhere."""
+"""Detection of gaps that nobody marked: joints that leap or freeze, and bodies that freeze and then go on elsewhere."""
 
 import torch
 from jaxtyping import Bool
@@ -14,7 +14,7 @@ _FROZEN_SECONDS = 0.1  # that nothing at all moves, by a hair, in a motion that 
 
 
 def find_gaps(motion: Motion) -> tuple[Mask, ...]:
-    """What of a motion is missing, by looking at it; RequestError if nothing is."""
+    """Find the gaps of a motion that nobody marked; RequestError if there are none."""
     frozen = _find_frozen_frames(motion)
     masks = [Mask(ALL, start, stop) for _, start, stop in true_intervals(frozen[:, None])]
     examined = inspect_recording(motion)
@@ -31,7 +31,7 @@ def find_gaps(motion: Motion) -> tuple[Mask, ...]:
 
 
 def _find_frozen_frames(motion: Motion) -> Bool[Tensor, " frames"]:
-    """Frames that repeat the one before them to the bit, in runs; the one before them is the last true one."""
+    """Find runs of frames that repeat the one before them to the bit; that one is the last true one."""
     values = [motion.local_quat_xyzw.flatten(1), motion.root_position, *motion.moving_offsets.values()]
     whole = torch.cat(values, dim=1)
     still = torch.zeros(len(whole), dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Look a recording over: which joints leap or stand still when they should not, and how noisy the rest is."""
+"""Inspection of a recording: which joints leap or stand still when they should not, and how noisy the rest is."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,41 +19,41 @@ _FROZEN_SECONDS = 0.1  # that a joint which moves otherwise does not move at all
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """A recording on its own rig, and what of it is to be believed."""
+    """A recording on its own rig, with masks of its artefacts."""
 
     motion: Motion
-    """The recording."""
+    """The recording, unchanged."""
     spikes: Bool[Tensor, "frames joints"]
-    """Where a joint leaps."""
+    """Whether a joint's rotation is a spike."""
     dropouts: Bool[Tensor, "frames joints"]
-    """Where a joint is masked, or stands perfectly still though it moves otherwise."""
+    """Whether a joint is masked, or stands perfectly still though it moves otherwise."""
     spikes_root: Bool[Tensor, " frames"]
-    """Where the root's place leaps."""
+    """Whether the root's position is a spike."""
     dropouts_root: Bool[Tensor, " frames"]
-    """Where the root's place is masked."""
+    """Whether the root's position is masked."""
     noise: Float[Tensor, " joints"]
-    """Of each of a joint's three angles, radians."""
+    """Noise sigma of each of a joint's three angles, radians."""
     noise_root: float
-    """Of each coordinate, metres."""
+    """Noise sigma of each coordinate of the root, metres."""
     travels: int
-    """The joint whose place that is: the root, or the one below it that is moved instead."""
+    """Index of the joint that travels: the root, or the one below it that is moved instead."""
 
     @property
     def seen(self) -> Bool[Tensor, "frames joints"]:
-        """What is neither."""
+        """Observation mask of rotations: neither spike nor missing."""
         return ~(self.spikes | self.dropouts)
 
     @property
     def seen_root(self) -> Bool[Tensor, " frames"]:
-        """What is neither, of the root's place."""
+        """Observation mask of the root's position: neither spike nor missing."""
         return ~(self.spikes_root | self.dropouts_root)
 
     def place(self, motion: Motion) -> Float[Tensor, "frames 3"]:
-        """Of the joint that travels, in a motion of this rig, metres."""
+        """Return the position of the travelling joint in a motion of this rig, metres."""
         return motion.moving_offsets[self.travels] if self.travels else motion.root_position
 
     def slice(self, start: int, stop: int) -> "Inspection":
-        """Frames start to stop; the noise stays that of the whole."""
+        """Return frames start to stop; the noise stays that of the whole."""
         part = slice(start, stop)
         return replace(
             self,
@@ -65,7 +65,7 @@ class Inspection:
         )
 
     def repaired(self) -> Motion:
-        """The recording with what is not to be believed filled in: straight between the frames around it."""
+        """Return the recording with artefacts filled in, interpolated from the frames around them."""
         motion, seen = self.motion, self.seen
         quats = rotations.make_sign_continuous(_hold_last_observed(motion.local_quat_xyzw, seen))
         steps = fill_missing(quats.transpose(0, 1), seen.T).transpose(0, 1)
@@ -93,14 +93,15 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     noise, noise_root = estimate_angle_noise(quats, ~dropouts), estimate_position_noise(place, ~dropouts_root)
     spikes = find_angle_spikes(quats, noise) & ~dropouts
     spikes_root = find_position_spikes(place, noise_root) & ~dropouts_root
-    # Each spike spoils the differences of the frames around it.
+    # Each spike corrupts the differences of the frames around it.
     noise = estimate_angle_noise(quats, ~(dropouts | spikes))
     noise_root = estimate_position_noise(place, ~(dropouts_root | spikes_root))
     return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
 
 
 def _find_frozen_joints(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor, "frames joints"]:
-    """Runs in which nothing of a joint's rotation changes, not even by rounding, of joints that move most of the time.
+    """Find runs in which nothing of a joint's rotation changes, not even by rounding, of joints that move most of the
+    time.
 
     A whole body that stands still is a paused recording, or a stand: it is left alone.
     """
@@ -119,6 +120,6 @@ def _find_frozen_joints(quats: Float[Tensor, "frames joints 4"], fps: float) -> 
 
 
 def _hold_last_observed(quats: Tensor, seen: Tensor) -> Tensor:
-    """What was seen last, where nothing is seen: signs are then chosen between frames that count."""
+    """Hold the last observed rotation where nothing is observed: signs are then chosen between frames that count."""
     nearest = last_observed(seen.T).T
     return torch.take_along_dim(quats, nearest[..., None], dim=0)

@@ -1,4 +1,5 @@
-"""Masks: what of a recording its user says not to believe. CSV with the columns joint, start, stop."""
+"""Masks: the frames and joints of a recording that its user marks as unreliable. CSV with the columns joint, start,
+stop."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -22,19 +23,20 @@ from mapctl.retarget.rigs import Rig
 _COLUMNS = ("joint", "start", "stop")
 _FRAME = re.compile(r"[+-]?[0-9]{1,12}")
 ALL, ROOT = "*", "root position"
-"""Names that stand for everything, and for the place of the root."""
+"""Names of masks that stand for everything, and for the position of the root."""
 
 
 @dataclass(frozen=True)
 class Mask:
-    """Frames in which a joint is not to be believed."""
+    """Frames in which a joint counts as missing."""
 
     joint: str
-    """Of the recording's own rig or canonical, in any case; `*` for all of it, `root position` for where it is."""
+    """Joint name on the recording's own rig or canonical, in any case; `*` for all of it, `root position` for the
+    root's."""
     start: int
     """First frame, from 0."""
     stop: int
-    """One past the last."""
+    """One past the last frame."""
 
 
 def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
@@ -61,7 +63,8 @@ def _parse_mask(path: str | PathLike[str], line: int, names: Sequence[str], word
 
 
 def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ...]:
-    """What a file marks as lost. A joint that travels beside the body's own travel is lost with its place."""
+    """Return masks of what a file marks as missing. A joint that travels beside the body's own travel is lost with its
+    position."""
     travels, joints = travelling_joint(motion), missing.rotations.clone()
     below = motion.skeleton.children(0)
     if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
@@ -74,14 +77,14 @@ def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ..
 
 
 def travelling_joint(motion: Motion) -> int:
-    """The joint whose place is that of the body: the root, or the first below a root that stays where it is."""
+    """Return the joint whose position is that of the body: the root, or the first below a root that stays still."""
     moving = [joint for joint, values in motion.moving_offsets.items() if bool((values != values[0]).any())]
     stays = bool((motion.root_position == motion.root_position[0]).all())
     return min(moving) if stays and moving else 0
 
 
 def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
-    """Which joints (frames, joints) and root places (frames,) are masked.
+    """Expand masks to masked joints (frames, joints) and root positions (frames,), checked.
 
     RequestError for joints that the rig has not (with the nearest that it has), frames beyond the end, and joints of
     which nothing would be left.
@@ -97,7 +100,7 @@ def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, T
 
 
 def expand_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
-    """Masked joints (frames, joints) and root places (frames,)."""
+    """Expand masks to masked joints (frames, joints) and root positions (frames,)."""
     names = motion.skeleton.names
     masks = resolve_joint_names(motion, masks)
     joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
@@ -113,7 +116,7 @@ def expand_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]
 
 
 def resolve_joint_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None = None) -> tuple[Mask, ...]:
-    """The masks with every joint by the name that the motion's own rig has for it.
+    """Rename the masks' joints to the names of the motion's own rig.
 
     `rig` wins over what would be recognised. RequestError, with the nearest names, for joints that it has not.
     """
@@ -123,19 +126,19 @@ def resolve_joint_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None =
 
 
 def slice_masks(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
-    """The masks of frames start to stop, counted from there."""
+    """Return the masks of frames start to stop, counted from there."""
     clipped = [Mask(m.joint, max(m.start, start) - start, min(m.stop, stop) - start) for m in masks]
     return tuple(mask for mask in clipped if mask.start < mask.stop)
 
 
 def trim_masks_before(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
-    """The masks as far as they hold from that frame on."""
+    """Return the masks as far as they hold from that frame on."""
     cut = [Mask(m.joint, max(m.start, frame), m.stop) for m in masks]
     return tuple(mask for mask in cut if mask.start < mask.stop)
 
 
 def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
-    """The motion with what is masked of its first frames taken from a clean version of them.
+    """Return the motion with what is masked of its first frames taken from a clean version of them.
 
     So that a joint which is lost for long is known by what was made of it before.
     """

@@ -1,4 +1,4 @@
-"""How noisy a recording is, told from the recording alone.
+"""Estimation of a recording's noise from the recording alone.
 
 People move slowly beside a camera's noise from frame to frame, so a high difference of a channel is nearly all noise.
 Its median over time says how much, untroubled by spikes and by the moments of a landing.
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mapctl import rotations
 
-_ORDERS = (4, 3, 2)  # of the differences, the first that enough runs of frames have been seen for
+_ORDERS = (4, 3, 2)  # of the differences, the first that enough runs of frames are observed for
 _MIN_WINDOWS = 12  # runs
 _MAD_TO_SIGMA = 1.4826  # of a normal number's size
 
@@ -20,8 +20,8 @@ _MAD_TO_SIGMA = 1.4826  # of a normal number's size
 def estimate_angle_noise(
     quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
 ) -> Float[Tensor, " joints"]:
-    """White noise of each of a joint's three angles, radians; 0 of a recording too short to tell. A joint that is never
-    seen for some frames on end is taken to be as noisy as the others.
+    """Estimate the white noise of each of a joint's three angles, radians; 0 for a recording too short. A joint that is
+    never observed for some frames on end is taken to be as noisy as the others.
 
     Between two frames a joint turns by what it moved and by the difference of their noise.
     """
@@ -33,14 +33,14 @@ def estimate_angle_noise(
 
 
 def estimate_position_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:
-    """White noise of each coordinate, in the places' unit; 0 of a recording too short to tell."""
+    """Estimate the white noise of each coordinate, in the positions' unit; 0 for a recording too short."""
     return float(_estimate_sigma(places[:, None], seen[:, None], differenced=0).nan_to_num(0.0))
 
 
 def _estimate_sigma(
     values: Float[Tensor, "some joints 3"], seen: Bool[Tensor, "frames joints"], *, differenced: int
 ) -> Tensor:
-    """By joint, from differences of the highest order that there are enough runs for; NaN where there are not.
+    """Estimate sigma by joint, from differences of the highest order with enough runs; NaN where there are not.
 
     `values` are differences of that order already.
     """
@@ -63,7 +63,7 @@ def _differences(values: Tensor, order: int) -> Tensor:
 
 
 def _observed_windows(seen: Bool[Tensor, "frames joints"], length: int) -> Bool[Tensor, "runs joints"]:
-    """Whether each run of `length` frames was seen throughout."""
+    """Return whether each run of `length` frames was observed throughout."""
     if len(seen) < length:
         return seen[:0]
     return seen.unfold(0, length, 1).all(dim=-1)
@@ -72,7 +72,7 @@ def _observed_windows(seen: Bool[Tensor, "frames joints"], length: int) -> Bool[
 def _robust_sigma(
     differences: Float[Tensor, "runs joints 3"], used: Bool[Tensor, "runs joints"]
 ) -> Float[Tensor, " joints"]:
-    """From the median along each of a joint's principal axes: a rig near gimbal lock shakes about two of them only."""
+    """Return sigma from the median along a joint's principal axes: near gimbal lock only two of them are noisy."""
     size = differences.norm(dim=-1)
     size = torch.where(used, size, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
     # Spikes would turn the axes their way.

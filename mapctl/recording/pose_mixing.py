@@ -1,7 +1,6 @@
-"""A pose mixed into the frames after it: how much of it is left in each, told from all joints at once.
+"""Estimation of a pose blended into the frames after it: its weight in each frame, from all joints at once.
 
-Each frame is the pose, the motion and one share that all joints have gone from the one to the other: what noise spoils
-in a joint, the others tell.
+Each frame is the pose, the motion and one weight that all joints share: what noise hides in a joint, the others show.
 """
 
 import math
@@ -27,7 +26,7 @@ def estimate_blend_weights(
     noise: Float[Tensor, " joints"],
     counts: Bool[Tensor, "frames joints"],
 ) -> Float[Tensor, " frames"]:
-    """How much of the way from the pose to the motion ahead each frame has gone, 0 to 1.
+    """Estimate the blend weight of each frame, 0 at the pose to 1 at the motion ahead.
 
     By least squares over the joints, without those that go another way, and as evenly over time as noise makes it;
     after the last frame all of it has been gone.
@@ -48,7 +47,7 @@ def estimate_blend_weights(
 
 
 def blend_poses(pose: Tensor, ahead: Tensor, share: Float[Tensor, " frames"]) -> Float[Tensor, "frames joints 4"]:
-    """The pose and the motion mixed, the short way."""
+    """Blend the pose and the motion along the shortest arc."""
     turn = rotations.from_rotation_vector(share[:, None, None] * _relative_rotation_vector(pose, ahead))
     return rotations.multiply(pose.expand_as(turn), turn)
 
@@ -62,10 +61,9 @@ def estimate_geodesic_deviation(
     whole: Float[Tensor, "frames joints"],
     counts: Bool[Tensor, "frames joints"],
 ) -> Float[Tensor, "frames joints 3"]:
-    """By how much the way from pose to motion leaves the short one, as Euler angles mixed one by one do: one bow a
-    joint, highest half-way, and what else there is in most frames, as far as they stand out of the noise. `whole` is
-    how long the short way is, radians.
-    """
+    """Estimate how far the path from pose to motion leaves the shortest arc, as Euler angles blended one by one do: one
+    bow a joint, highest half-way, and what else there is in most frames, as far as it exceeds the noise. `whole` is the
+    length of the shortest arc, radians."""
     shape = (4 * share * (1 - share))[:, None, None]
     rest, trust = _relative_rotation_vector(along, seen), counts[..., None].double()
     noise = _floor_noise(noise)
@@ -87,18 +85,18 @@ def estimate_geodesic_deviation(
 
 
 def angle_between(first: Tensor, second: Tensor) -> Tensor:
-    """Angles between rotations, radians."""
+    """Return angles between rotations, radians."""
     return _relative_rotation_vector(first, second).norm(dim=-1)
 
 
 def extrapolate_linear(values: Float[Tensor, "frames *width"], first: int, count: int, *, upto: int) -> Tensor:
-    """Frames 1 to `upto`, by the line through so many frames from `first` on."""
+    """Extrapolate frames 1 to `upto` by the line through so many frames from `first` on."""
     weights = torch.stack([linear_fit_weights(count, float(frame - first)) for frame in range(1, upto + 1)])
     return torch.einsum("kn,n...->k...", weights, values[first : first + count])
 
 
 def linear_fit_weights(count: int, at: float) -> Float[Tensor, " count"]:
-    """What the line through values at 0, 1, ... is at some place, as weights of those values."""
+    """Return the weights of values at 0, 1, ... in the value `at` of the line through them."""
     place = torch.arange(count, dtype=torch.float64)
     middle = place.mean()
     spread = (place - middle).square().sum().clamp_min(1.0)
@@ -106,14 +104,14 @@ def linear_fit_weights(count: int, at: float) -> Float[Tensor, " count"]:
 
 
 def _floor_noise(noise: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
-    """Of joints that never move, and seem to have none, as much as is at all likely."""
+    """Give joints that never move, and seem to have no noise, as much as is at all likely."""
     known = noise[noise > 0]
     usual = float(known.median()) / 2 if len(known) else 0.0
     return noise.clamp_min(max(usual, _MIN_NOISE))
 
 
 def _smooth_weights(share: Float[Tensor, " frames"], known: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """Shares, known to 1 / sqrt(known), made even: from 0 before the first to 1 after the last."""
+    """Smooth weights known to 1 / sqrt(known): from 0 before the first to 1 after the last."""
     count = len(share)
     second = torch.zeros(count, count + 2, dtype=share.dtype)
     for row in range(count):
@@ -124,5 +122,5 @@ def _smooth_weights(share: Float[Tensor, " frames"], known: Float[Tensor, " fram
 
 
 def _relative_rotation_vector(start: Tensor, stop: Tensor) -> Tensor:
-    """Rotation vectors from one to the other, in the first's frame."""
+    """Return rotation vectors from one to the other, in the first's frame."""
     return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start).expand_as(stop), stop))

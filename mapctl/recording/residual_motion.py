@@ -1,9 +1,9 @@
-"""What a proposal leaves out of a capture and noise does not explain is motion, and goes back in.
+"""Motion in the residual that a proposal leaves of a capture, beyond what noise explains, and its restoration.
 
-The rest between a capture and what a model makes of it should be white noise of known power. Where the model is out of
-its depth the rest holds motion too, slower than the noise. How much smoothing brings that back is told, moment by
-moment and joint by joint, by Stein's unbiased estimate of the risk (see mapctl.recording.sure_smoothing): none, where
-the model is right; a plain low-pass filter of the capture itself, where the model knows nothing.
+The residual between a capture and a model's proposal should be white noise of known power. Where the model is out of
+its depth the residual holds motion too, slower than the noise. How much smoothing brings that back is estimated, moment
+by moment and joint by joint, by Stein's unbiased estimate of the risk (see mapctl.recording.sure_smoothing): none,
+where the model is right; a plain low-pass filter of the capture itself, where the model knows nothing.
 """
 
 import torch
@@ -13,8 +13,8 @@ from torch import Tensor
 from mapctl.numerics import gaussian
 
 _WIDTHS = (0.6, 0.8, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)  # frames, sigma of the smoothing
-_RISK_FRAMES = 20.0  # frames, sigma, over which the risk is told
-_PENALTY = 0.1  # of the noise's power, that a return must gain: the risk itself is told with an error
+_RISK_FRAMES = 20.0  # frames, sigma, over which the risk is estimated
+_PENALTY = 0.1  # of the noise's power, that a return must gain: the risk itself is estimated with an error
 _CAUTION = 0.5  # and this share of the noise that it would bring back
 _TEMPERATURE = 0.06  # of the noise's power, between choices that are as good as equal
 
@@ -22,9 +22,8 @@ _TEMPERATURE = 0.06  # of the noise's power, between choices that are as good as
 def restore_residual_motion(
     rest: Float[Tensor, "frames joints 3"], seen: Bool[Tensor, "frames joints"], sigma: Float[Tensor, " joints"]
 ) -> tuple[Float[Tensor, "frames joints 3"], Float[Tensor, "frames joints"]]:
-    """What of the rest goes back, and the share of smoothing in each place: 0 where the model is believed, 1 where it
-    is not. `sigma` is the noise of each of the three numbers; where it is nil nothing goes back.
-    """
+    """Return what of the residual goes back, and the share of smoothing by frame and joint: 0 where the model is
+    trusted, 1 where it is not. `sigma` is the noise of each of the three numbers; where it is 0 nothing goes back."""
     known = seen.to(rest)[..., None]
     rest = rest * known
     noise = 3 * sigma.square().clamp_min(1e-12)
@@ -45,7 +44,7 @@ def restore_residual_motion(
 
 
 def _local_mean(values: Float[Tensor, "frames joints 1"], known: Float[Tensor, "frames joints 1"]) -> Tensor:
-    """Over about a moment, of what is known."""
+    """Average what is known over `_RISK_FRAMES`."""
     kernel = gaussian.kernel(_RISK_FRAMES, round(2 * _RISK_FRAMES))
     weight = gaussian.convolve(known, kernel, "nothing")
     return gaussian.convolve(values * known, kernel, "nothing") / weight.clamp_min(1e-6)

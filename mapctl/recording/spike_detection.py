@@ -1,4 +1,4 @@
-"""Frames that leap: single ones, or two in a row, that lie far from all around them."""
+"""Detection of spikes: single frames, or two in a row, that lie far from all around them."""
 
 import math
 
@@ -8,16 +8,16 @@ from torch import Tensor
 
 from mapctl import rotations
 
-_MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are seen
+_MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are detected
 _STEP_FRAMES = 6  # frames on either side that tell how fast a joint is moving
 MIN_SPIKE_SIGMAS = 5.0
-"""Of the noise, that a spike lies away from the median of its surroundings at least."""
+"""Least distance of a spike from the median of its surroundings, in sigmas of the noise."""
 MIN_SPIKE_DEG = 12.0
-"""And so many degrees, or as many centimetres: less is left to what treats noise."""
+"""Least height of a spike, degrees, or as many centimetres: less is left to what treats noise."""
 _RESIDUAL_SIGMAS, _RESIDUAL_DEG = (
     4.8,
     3.0,
-)  # of a leap in the rest: one in 5,000 of normal noise is as far from its median
+)  # of a spike in the residual: one in 5,000 of normal noise is as far from its median
 _STEP_FACTOR = (
     2.0  # and so many times the usual way between frames about there: the turning point of a fast kick is none
 )
@@ -26,7 +26,7 @@ _STEP_FACTOR = (
 def find_angle_spikes(
     quats: Float[Tensor, "frames joints 4"], sigma: Float[Tensor, " joints"]
 ) -> Bool[Tensor, "frames joints"]:
-    """Which joints leap in which frames; `sigma` is the noise of each angle, radians."""
+    """Find which joints spike in which frames; `sigma` is the noise of each angle, radians."""
     quats = rotations.make_sign_continuous(quats)
     middle = torch.nn.functional.normalize(_running_median(quats.flatten(1)).unflatten(1, quats.shape[1:]), dim=-1)
     away = _rotation_distance(middle, quats)
@@ -35,7 +35,7 @@ def find_angle_spikes(
 
 
 def find_position_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Bool[Tensor, " frames"]:
-    """In which frames the place leaps; metres."""
+    """Find the frames in which the position spikes; metres."""
     middle = _running_median(places)
     away = (places - middle).norm(dim=-1)
     usual = _mean_step(torch.diff(middle, dim=0).norm(dim=-1)[:, None])[:, 0]
@@ -45,24 +45,22 @@ def find_position_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Boo
 def find_residual_spikes(
     rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"]
 ) -> Bool[Tensor, "frames joints"]:
-    """Where what is left of a capture beside a model of it leaps: rotation vectors, radians. Without the motion itself
-    a spike stands out more clearly; `sigma` is the noise of each of the three numbers.
-    """
+    """Find spikes in the residual of a capture beside a model of it: rotation vectors, radians. Without the motion
+    itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers."""
     middle = _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])
     return (rest - middle).norm(dim=-1) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
 
 
 def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
-    """Over `_SPAN` frames; beyond the ends they are mirrored, since repeated, an outermost frame that leaps would be
-    its own median.
-    """
+    """Return the running median over `_MEDIAN_FRAMES`; the ends are mirrored, since repeated, an outermost frame that
+    spikes would be its own median."""
     side, last = _MEDIAN_FRAMES // 2, len(values) - 1
     frame = last - (last - torch.arange(-side, len(values) + side).abs()).abs()
     return values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
 
 
 def _mean_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames joints"]:
-    """Mean way between frames about each frame, of the medians."""
+    """Return the mean step between frames about each frame, of the medians."""
     if len(steps) == 0:
         return steps.new_zeros(1, steps.shape[1])
     padded = torch.nn.functional.pad(steps.T, (_STEP_FRAMES, _STEP_FRAMES - 1), mode="replicate")
@@ -70,6 +68,6 @@ def _mean_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames jo
 
 
 def _rotation_distance(start: Float[Tensor, "frames joints 4"], stop: Float[Tensor, "frames joints 4"]) -> Tensor:
-    """Between two rotations, radians."""
+    """Return the angle between two rotations, radians."""
     dots = (start * stop).sum(-1).abs().clamp(max=1)
     return 2 * torch.arccos(dots)

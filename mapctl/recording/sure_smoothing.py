@@ -1,7 +1,7 @@
-"""Smoothing as wide as the noise asks for: Gaussian, its width by Stein's unbiased estimate of the risk (SURE).
+"""Smoothing as wide as the noise asks for: Gaussian, its width by Stein's unbiased estimate of the risk (Stein 1981).
 
-C. Stein, "Estimation of the mean of a multivariate normal distribution", 1981: the squared error of a linear smoother
-is, but for a constant, its squared change of the data plus twice the noise's variance times its trace.
+The squared error of a linear smoother is, but for a constant, its squared change of the data plus twice the noise's
+variance times its trace.
 """
 
 import torch
@@ -18,9 +18,8 @@ _KERNEL_SIGMAS = 3.0  # sigmas that a kernel has on either side
 def smooth_rotations(
     quats: Float[Tensor, "frames joints 4"], sigma: Float[Tensor, " joints"]
 ) -> Float[Tensor, "frames joints 4"]:
-    """Each joint's rotations over time, smoothed; `sigma` is the noise of each angle, radians. Without noise nothing
-    is changed.
-    """
+    """Smooth each joint's rotations over time; `sigma` is the noise of each angle, radians. Without noise nothing is
+    changed."""
     quats = rotations.make_sign_continuous(quats)
     best = quats.clone()
     # A quaternion's components have half of the angle's noise.

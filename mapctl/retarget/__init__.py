@@ -20,6 +20,7 @@ from mapctl.retarget.joint_matching import Match, correct_sides, match
 from mapctl.retarget.pose_axes import RigPoses, find_up_axis
 from mapctl.retarget.reference_pose import (
     TPose,
+    align_bone,
     classify_reference_pose,
     find_rest_facing,
     find_tpose,
@@ -50,7 +51,7 @@ class RigMap:
     idle_quat_xyzw: Float[Tensor, "rigged 4"] | None = None
     """Local rotations at rest of joints that are no canonical one; None where they are all zero."""
     match: Match | None = None
-    """How the joints were told, and how sure that is."""
+    """Which of the rig's joints is which, and how sure that is."""
     up: str = "y"
     """Axis of the file's world that points up."""
     facing: str = "z"
@@ -64,7 +65,7 @@ class RigMap:
 
 
 def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
-    """Tell the rig's joints, find its T-pose and measure its bones; RequestError where its joints cannot be told.
+    """Identify the rig's joints, its T-pose and its bones; RequestError where its joints cannot be identified.
 
     What `rig` says is taken as it is; else presets are tried, and then names, tree and places (see
     mapctl.retarget.joint_matching). A `motion` of the skeleton shows which way is up, how knees bend, and whether it
@@ -81,7 +82,7 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
 
 
 def as_rig(rigmap: RigMap) -> Rig:
-    """The rig as it was found, so that parts of a clip are converted as the whole was.
+    """Return the rig as it was identified, so that parts of a clip are converted as the whole was.
 
     A part may lack the first frame that showed the T-pose, or the steps that showed how knees bend.
     """
@@ -100,12 +101,12 @@ def as_rig(rigmap: RigMap) -> Rig:
 
 
 def _set_hips_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
-    """The map, told whether the hips travel below the root; without a motion they may."""
+    """Return the map with whether the hips travel below the root; without a motion they may."""
     return rigmap if motion is None else replace(rigmap, hips_travel=_hips_joint(rigmap) in motion.moving_offsets)
 
 
 def _map_by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
-    """By the T-pose that the rig's table tells; None where it tells none, or its limbs would not lie as in one."""
+    """Map a rig by the T-pose in its table; None where it has none, or its limbs would not lie as in one."""
     rig, joint_of = found.rig, found.joint_of
     if not rig.has_tpose:
         return None
@@ -142,7 +143,7 @@ def _build_rig_map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
 
 
 def _is_canonical_pose(skeleton: Skeleton) -> bool:
-    """Whether limbs lie about as they do in the T-pose, and hang from their own side of a trunk that stands."""
+    """Return whether limbs lie about as they do in the T-pose, and hang from their own side of an upright trunk."""
     names = [side + part for side in ("left", "right") for part in ("LowerArm", "Hand", "LowerLeg", "Foot")]
     own, usual = skeleton.offsets, CANONICAL.offsets
     pairs = [(own[CANONICAL.index(name)], usual[CANONICAL.index(name)]) for name in names]
@@ -156,7 +157,7 @@ def _is_canonical_pose(skeleton: Skeleton) -> bool:
 
 
 def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap]:
-    """The motion in canonical joint frames with the performer's own bones, and the map that leads back.
+    """Return the motion in canonical joint frames with the performer's own bones, and the map that leads back.
 
     `rig` wins over what would be recognised (see `identify_rig`).
     """
@@ -178,7 +179,8 @@ def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap
 
 
 def rig_joint_positions(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:
-    """Where the rig's own joints are, by canonical joint, in a world that stands along Y; 0 for joints it lacks.
+    """Return positions of the rig's own joints, by canonical joint, metres, in a world with Y up; 0 for joints it
+    lacks.
 
     Joints that only the rig has, as those of twist, carry them elsewhere than the canonical motion tells.
     """
@@ -190,7 +192,7 @@ def rig_joint_positions(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames
 
 
 def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = None) -> Motion:
-    """The canonical motion on the rig. Joints the canonical skeleton lacks keep the original's rotation.
+    """Convert a canonical motion to the rig. Joints that the canonical skeleton lacks keep the original's rotation.
 
     Without an original of the same length they rest (fingers straight). The result carries the original's file layout.
     """
@@ -221,7 +223,7 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
 
 
 def _to_file_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
-    """Where the hips are to be, and which world rotation each joint of the rig is to have."""
+    """Return where the hips are to be, and the world rotation of each joint of the rig."""
     world, hips = motion.joint_rotations(), motion.root_position
     if rigmap.upright_quat_xyzw is not None:
         back = rotations.inverse(rigmap.upright_quat_xyzw)
@@ -269,7 +271,7 @@ def _table_tpose(rig: Rig, skeleton: Skeleton, joint_of: tuple[int | None, ...])
 
 
 def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
-    """Rotation whose first two columns point along x and (as nearly as they are square) y."""
+    """Return the rotation whose first two columns point along x and (as nearly as they are square) y."""
     first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
     second = torch.tensor(y, dtype=torch.float64)
     second = torch.nn.functional.normalize(second - first * (first @ second), dim=0)
@@ -277,29 +279,18 @@ def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
 
 
 def _straighten_bone(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
-    """The smallest rotation that lays the joint's bone along its canonical direction."""
+    """Return the smallest rotation that lays the joint's bone along its canonical direction."""
     child = CANONICAL.children(index)[0]
     rig_child = joint_of[child]
     if rig_child is None:
         raise RequestError(f"cannot straighten {CANONICAL.names[index]}: the rig has no joint after it")
     bone = torch.nn.functional.normalize(skeleton.offsets[rig_child], dim=0)
     aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
-    return _shortest_rotation(bone, aim)
-
-
-def _shortest_rotation(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation from one unit vector to another; of opposite ones, one of the half turns."""
-    axis, cosine = torch.linalg.cross(start, stop), start @ stop
-    if cosine < 0 and axis.norm() < 1e-9:
-        across = torch.nn.functional.one_hot(start.abs().argmin(), 3).to(start.dtype)
-        axis = torch.linalg.cross(start, across)
-        return rotations.rotation_vector_to_matrix(axis / axis.norm() * torch.pi)
-    sine = axis.norm().clamp_min(1e-12)
-    return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
+    return align_bone(bone, aim)
 
 
 def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:
-    """The joint of a motion's rig by canonical name, those that it has; none where the rig cannot be told."""
+    """Map canonical names to the joints of a motion's rig, those that it has; empty where the rig is not understood."""
     try:
         joint_of = identify_rig(motion.skeleton, rig, motion=motion).joint_of
     except RequestError:

@@ -16,7 +16,7 @@ _END_SITES = ("Toes", "Hand", "head")  # what an End Site of the joint above may
 def measure_bones(
     skeleton: Skeleton, joint_of: JointOf, tpose: Float[Tensor, "joints 4"], idle: Float[Tensor, "rigged 4"]
 ) -> Skeleton:
-    """The canonical skeleton with a rig's bones, metres.
+    """Measure a rig's bones on the canonical skeleton, metres.
 
     `tpose` holds world rotations by canonical joint, `idle` the local ones of joints that are no canonical one. A joint
     that the rig lacks is put where the End Site of the joint above is, between its neighbours, or, at the end of a
@@ -52,7 +52,7 @@ def measure_bones(
 def _estimate_position(
     c: int, joint_of: JointOf, spots: list[Tensor], known: Mapping[int, Tensor], ends: Mapping[int, Tensor]
 ) -> Float[Tensor, "3"]:
-    """A place for a joint that the rig lacks."""
+    """Estimate the position of a joint that the rig lacks, metres."""
     name, parent = CANONICAL.names[c], CANONICAL.parents[c]
     above, own = joint_of[parent], float(CANONICAL.offsets[c].norm())
     if name.endswith(_END_SITES) and above is not None and above in ends:
@@ -67,7 +67,7 @@ def _estimate_position(
 
 
 def _estimate_scale(spots: list[Tensor]) -> float:
-    """Of the performer to the canonical one: by how far the joints so far reach."""
+    """Estimate the performer's size relative to the canonical skeleton from the reach of the joints so far."""
     own = sum(float((spot - spots[CANONICAL.parents[c]]).norm()) for c, spot in enumerate(spots) if c)
     usual = float(CANONICAL.offsets[1 : len(spots)].norm(dim=-1).sum())
     return own / usual if own > 0 and usual > 0 else 1.0

@@ -2,8 +2,8 @@
 
 Rotations stay, but of legs: the hips go as far and as high as the legs' lengths and both ankles' heights ask for, each
 toe joint is as high over its own rest height as the giver's over his, in scale, and while a foot stands it moves as
-little as the giver's. Two-bone inverse kinematics brings the legs there. (The footsteps are kept as in Gleicher,
-"Retargetting motion to new characters", 1998, but joint by joint instead of by spacetime optimisation.)
+little as the giver's. Two-bone inverse kinematics brings the legs there. (The footsteps are kept as in Gleicher 1998,
+but joint by joint instead of by spacetime optimisation.)
 """
 
 from dataclasses import dataclass, replace
@@ -14,18 +14,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts, kinematics, rotations
-from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import SIDES, Stance
-from mapctl.skeleton import CANONICAL, Skeleton, leg_length
+from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, leg_length
 
 _HIP_JOINTS, _SHINS, _FEET, _TOES = (
     [CANONICAL.index(side + part) for side in SIDES] for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")
 )
-_MERGE_SECONDS = 0.2  # seconds between two contacts of one place that are one
+_MERGE_SECONDS = 0.2  # seconds between two contacts at one position that are one
 _MERGE_METRES = 0.06  # metres that such contacts are apart at most
 _FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
 _MAX_EXTENSION = 0.9995  # of the leg that one may be at most
@@ -42,23 +41,23 @@ _LOW_SHARE, _HIGH_SHARE = (
 )  # of the leg: over the floor from where on rotations begin to count, and until they alone do
 _SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed
 _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-_NOTED_METRES = 0.005  # metres that a foot misses its place by before it is worth a line
+_NOTED_METRES = 0.005  # metres that a foot misses its target by before it is worth a line
 
 
 @dataclass(frozen=True, eq=False)
 class RiggedCharacter:
-    """Who is to move: a rig with its performer's bones and stance."""
+    """The character that is to move: a rig with its performer's bones and stance."""
 
     rigmap: RigMap
     """The rig, and its bones on canonical joints."""
     stance: Stance
-    """How this performer stands."""
+    """Stance of this performer."""
     source: object | None = None
     """Layout and unit of the rig's file, which the result is written in."""
 
     @staticmethod
     def of(clip: Motion, rig: Rig | None = None) -> "tuple[Motion, RiggedCharacter]":
-        """A clip on canonical joints, and whose it is; RequestError where its joints cannot be told."""
+        """Return a clip on canonical joints, and its character; RequestError where its joints cannot be identified."""
         canonical, rigmap = to_canonical(clip, rig)
         return canonical, RiggedCharacter(rigmap, Stance.of(canonical, rigmap), clip.source)
 
@@ -74,11 +73,11 @@ class RiggedCharacter:
 
     @property
     def leveled(self) -> Skeleton:
-        """The same bones in that T-pose."""
+        """Canonical skeleton with this performer's bones in the T-pose whose feet lie flat."""
         return self.leveled_map.skeleton
 
     def on_rig(self, motion: Motion) -> Motion:
-        """A canonical motion of this body on its rig, in its file's layout; what is not canonical rests."""
+        """Put a canonical motion of this body on its rig, in its file's layout; joints that are not canonical rest."""
         return replace(from_canonical(motion, self.rigmap), source=self.source)
 
 
@@ -93,7 +92,7 @@ class RetargetedMotion:
 
 
 def retarget_motion(clip: Motion, body: RiggedCharacter, rig: Rig | None = None) -> RetargetedMotion:
-    """A clip of any rig on a body's bones, in the canonical joint frames of its rig. This is the one way there.
+    """Retarget a clip of any rig to a body's bones, in the canonical joint frames of its rig.
 
     A clip of the body's own skeleton comes as it is, to the bit. `rig` is the clip's, where it is not the one that
     would be recognised. RequestError where its joints cannot be told.
@@ -105,7 +104,7 @@ def retarget_motion(clip: Motion, body: RiggedCharacter, rig: Rig | None = None)
 
 
 def retarget_canonical(motion: Motion, giver: RiggedCharacter, body: RiggedCharacter) -> RetargetedMotion:
-    """The same of a motion (canonical joints, any part of a clip) whose giver is known."""
+    """Retarget a motion (canonical joints, any part of a clip) whose giver is known."""
     own = giver.stance.leveled(motion)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
     moved = _transfer_root(own, giver, body, scale)
@@ -116,8 +115,8 @@ def retarget_canonical(motion: Motion, giver: RiggedCharacter, body: RiggedChara
 
 
 def _transfer_root(own: Motion, giver: RiggedCharacter, body: RiggedCharacter, scale: float) -> Motion:
-    """The giver's rotations on the body's bones. The middle between the thighs goes its way in scale, as much higher as
-    ankles and floor ask for."""
+    """Put the giver's rotations on the body's bones. The middle between the thighs follows its trajectory in scale, as
+    much higher as ankles and floor ask for."""
     to_thighs = body.leveled.offsets[_HIP_JOINTS].mean(0) - scale * own.skeleton.offsets[_HIP_JOINTS].mean(0)
     turns = own.joint_rotations()[:, 0]
     # Hips are turned by noise; what they carry at another distance is not to shake for it.
@@ -131,16 +130,16 @@ def _transfer_root(own: Motion, giver: RiggedCharacter, body: RiggedCharacter, s
 
 
 def _ankle_height(toe_height: Float[Tensor, "2"], leveled: Skeleton) -> Float[Tensor, ""]:
-    """Height of the ankles over the floor while feet lie flat, metres, mean of both."""
+    """Return the height of the ankles over the floor while feet lie flat, metres, mean of both."""
     return (toe_height - leveled.offsets[_TOES, 1]).mean()
 
 
 def _ankle_targets(
     own: Motion, moved: Motion, giver: Stance, body: Stance, scale: float
 ) -> Float[Tensor, "frames 2 3"]:
-    """Where ankles are to be: with the toe joints as the giver's in scale, over their own rest heights, and moved over
-    the ground to where the body's rotations bring them, by as much throughout a contact. High over the floor rotations
-    alone count: a kick is a pose, and no place to be."""
+    """Return target ankle positions, metres: toe joints as the giver's in scale, over their own rest heights, and moved
+    over the ground to where the body's rotations bring them, by as much throughout a contact. High over the floor
+    rotations alone count: a kick is a pose, not a position."""
     toes, places = own.joint_positions()[:, _TOES], scale * own.joint_positions()[:, _FEET]
     shift = moved.joint_positions()[:, _TOES] - scale * toes
     for k, spans in enumerate(_contact_intervals(toes, own.fps)):
@@ -153,7 +152,7 @@ def _ankle_targets(
 
 
 def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "frames 2 3"]:
-    """From where the ankle would be, were the foot the giver's in scale, to where it is.
+    """Return the offset of the ankle from where it would be if the foot were the giver's in scale, metres.
 
     A foot whose heel is raised stands on its toes, one whose toes are raised on its heel, which the ankle is over: then
     the ankle goes the giver's way, as if the foot were flat.
@@ -170,13 +169,13 @@ def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tenso
 
 
 def _smootherstep(way: Tensor) -> Tensor:
-    """From 0 to 1 over 0 to 1, without a jump of the first two derivatives."""
+    """Ease from 0 to 1 over 0 to 1, with two continuous derivatives."""
     way = way.clamp(0, 1)
     return way**3 * (10 + way * (6 * way - 15))
 
 
 def _contact_intervals(toes: Float[Tensor, "frames 2 3"], fps) -> list[list[tuple[int, int]]]:
-    """First frames of contacts and one past their last ones, by foot; what is one stand, but for noise, is one."""
+    """Return by foot the first frames of contacts and one past their last, merged where noise alone parts them."""
     planted, apart = contacts.detect_contacts(toes, fps), _MERGE_SECONDS * float(fps)
     return [_merge_contacts(_planted_intervals(planted[:, k]), toes[:, k], apart) for k in range(toes.shape[1])]
 
@@ -200,8 +199,7 @@ def _merge_contacts(runs: list[tuple[int, int]], toe: Float[Tensor, "frames 3"],
 def _hold_through_contacts(
     shift: Float[Tensor, "frames 2"], spans: list[tuple[int, int]], fps: float
 ) -> Float[Tensor, "frames 2"]:
-    """The shift, of one value throughout each span (its mean there) and smooth from one to the next; low-passed where
-    there is no span at all."""
+    """Hold the shift at its mean throughout each span, smooth between spans; low-pass it without any span."""
     if not spans:
         return _low_pass(shift, 0.25 * fps)
     held = torch.empty_like(shift)
@@ -216,7 +214,7 @@ def _hold_through_contacts(
 
 
 def _low_pass(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Tensor, "frames columns"]:
-    """Gaussian low-pass over time, `sigma` in frames; ends held."""
+    """Low-pass values over time by a Gaussian of `sigma` frames; ends are held."""
     reach = max(1, round(3 * sigma))
     at = torch.arange(-reach, reach + 1, dtype=values.dtype)
     kernel = torch.exp(-0.5 * (at / max(sigma, 1e-6)) ** 2)
@@ -225,7 +223,7 @@ def _low_pass(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Te
 
 
 def _leg_extension(own: Motion) -> Float[Tensor, "frames 2"]:
-    """How straight the giver's legs are: hip joint to ankle over both bones' length."""
+    """Return how straight the giver's legs are: hip joint to ankle over both bones' length."""
     places = own.joint_positions()
     return (places[:, _FEET] - places[:, _HIP_JOINTS]).norm(dim=-1) / _leg_bone_lengths(own.skeleton)
 
@@ -235,7 +233,7 @@ def _leg_bone_lengths(skeleton: Skeleton) -> Float[Tensor, "2"]:
 
 
 def _lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
-    """Hips so much lower that legs reach the ankles' places no straighter than the giver's, or than most; smoothly."""
+    """Lower hips smoothly until legs reach the ankles' targets no straighter than the giver's, or than most."""
     ways = ankles - moved.joint_positions()[:, _HIP_JOINTS]
     most = _leg_bone_lengths(moved.skeleton) * stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION)
     level, down = ways[..., ::2].square().sum(-1), -ways[..., 1]
@@ -250,7 +248,7 @@ def _lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Flo
 
 
 def _reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
-    """Legs bent and turned so that ankles are at their places; feet keep how they are turned in the world."""
+    """Bend and rotate legs so that ankles reach their targets; feet keep their orientation in the world."""
     places, world = moved.joint_positions().clone(), moved.joint_rotations()
     at, most = places[:, _HIP_JOINTS], _MAX_EXTENSION * _leg_bone_lengths(moved.skeleton)
     ways = ankles - at
@@ -269,14 +267,14 @@ def _reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> 
 
 
 def _soft_clamp(far: Float[Tensor, "frames 2"], most: Float[Tensor, "2"]) -> Float[Tensor, "frames 2"]:
-    """How far an ankle may be: as far as it is, and ever less beyond what is nearly the most."""
+    """Return how far an ankle may be: as far as it is, and ever less beyond what is nearly the most."""
     soft = _SOFT_MARGIN * most
     over = (far - (most - soft)).clamp_min(0)
     return torch.minimum(far, most - soft) + soft * (1 - torch.exp(-over / soft))
 
 
 def _note_ankle_errors(done: Motion, ankles: Float[Tensor, "frames 2 3"]) -> tuple[str, ...]:
-    """A line on feet that are not where they were to be."""
+    """Note feet that miss their targets."""
     off = (done.joint_positions()[:, _FEET] - ankles).norm(dim=-1).amax(dim=-1)
     if float(off.max()) < _NOTED_METRES:
         return ()

@@ -1,4 +1,4 @@
-"""Somebody who stands on a rig that only its names and T-pose tell of: the canonical body, under the rig's names."""
+"""A standing clip for a rig of which only names and T-pose are known: the canonical body, under the rig's names."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -14,13 +14,13 @@ from mapctl.motion import Motion
 from mapctl.retarget.joint_matching import REQUIRED
 from mapctl.retarget.reference_pose import axis_vector, upright_rotation
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT, Skeleton
 
 _FPS, _FRAMES = Fraction(30), 30
 
 
 def make_tpose_clip(rig: Rig) -> Motion:
-    """A second of standing in the T-pose on the rig's joints, in its world and unit; toes on the floor.
+    """Make a second of standing in the T-pose on the rig's joints, in its world and unit; toes on the floor.
 
     Bones are the canonical body's, since a rig tells names and no lengths. RequestError where it does not name all that
     a rig must have.
@@ -42,20 +42,20 @@ def make_tpose_clip(rig: Rig) -> Motion:
 def _canonical_tpose() -> Motion:
     places = _tpose_positions()
     root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
-    root[:, 1] = TOE_REST_HEIGHT - places[CANONICAL.index("leftToes"), 1]
+    root[:, 1] = TOE_REST_HEIGHT - places[TOE_JOINTS[0], 1]
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     return Motion(CANONICAL, _FPS, root, still.expand(_FRAMES, CANONICAL.num_joints, 4).clone())
 
 
 def _tpose_positions() -> Float[Tensor, "joints 3"]:
-    """Of the canonical joints in the T-pose, from the hips."""
+    """Return canonical joint positions in the T-pose, from the hips, metres."""
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)
     root = torch.zeros(1, 3, dtype=torch.float64)
     return kinematics.forward_kinematics(CANONICAL.offsets, CANONICAL.parents, root, still)[0][0]
 
 
 def _build_skeleton(rig: Rig) -> Skeleton:
-    """The joints that the rig names, depth first, as files nest them."""
+    """Build the joints that the rig names, depth first, as files nest them."""
     places, order = _tpose_positions(), [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
     frames = {joint: _joint_frame(rig, CANONICAL.names[joint]) for joint in order}
     above = {joint: _named_ancestor(joint, rig) for joint in order}
@@ -78,7 +78,7 @@ def _depth_first(joint: int) -> list[int]:
 
 
 def _named_ancestor(joint: int, rig: Rig) -> int | None:
-    """The nearest canonical joint above that the rig names."""
+    """Return the nearest canonical joint above that the rig names."""
     parent = CANONICAL.parents[joint]
     while parent >= 0 and CANONICAL.names[parent] not in rig.joints:
         parent = CANONICAL.parents[parent]
@@ -86,8 +86,7 @@ def _named_ancestor(joint: int, rig: Rig) -> int | None:
 
 
 def _joint_frame(rig: Rig, name: str) -> Float[Tensor, "3 3"]:
-    """How a joint's frame is turned in the T-pose, in a world with Y up: as the table tells it, or as the file's axes
-    lie."""
+    """Return the rotation of a joint's frame in the T-pose, with Y up: by the table, or by the file's axes."""
     axes = rig.tpose.get(name)
     if axes:
         return retarget.frame_from_axes(axes["x"], axes["y"])

@@ -1,6 +1,6 @@
 """Which joint of any rig is which canonical one: by listed names, by the words in names, and by the tree.
 
-Sides are checked by the places of the joints where toes tell which way the body faces.
+Sides are checked by the positions of the joints where toes tell which way the body faces.
 """
 
 import re
@@ -17,7 +17,7 @@ from mapctl.retarget.rigs import Rig, known_rigs
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 MIN_SCORE = 0.6
-"""Score below which a rig is not believed to be understood."""
+"""Least score with which a rig counts as understood."""
 REQUIRED = (
     "hips",
     "spine",
@@ -42,8 +42,8 @@ class Match:
     joint_of: tuple[int | None, ...]
     """For each canonical joint the rig's joint, None where it has none."""
     score: float
-    """Mean over the canonical joints: 1 for one known by name, 0.7 by its place in the tree alone, 0.4 for one that a
-    rig may lack and this one does, 0 for one that it must have; times 0.9 where left and right are exchanged."""
+    """Mean over the canonical joints: 1 for one known by name, 0.7 by its position in the tree alone, 0.4 for one that
+    a rig may lack and this one does, 0 for one that it must have; times 0.9 where left and right are exchanged."""
     unmapped: tuple[str, ...]
     """Joints of the rig that are no canonical one, as fingers, twists and props."""
     sides_exchanged: bool = False
@@ -72,7 +72,7 @@ def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
 
 
 def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
-    """The match with left and right exchanged if the rig's names contradict the places of its joints."""
+    """Exchange left and right in the match if the rig's names contradict the positions of its joints."""
     zero = RigPoses.zero(skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     if not are_sides_swapped(zero, clip):
@@ -84,7 +84,7 @@ def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Ma
 
 
 def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
-    """Joints by a rig's names, in the version that fits best; spelling counts only where it must."""
+    """Match joints by a rig's names, in the version that fits best; spelling counts only where it must."""
     exact = {name: joint for joint, name in enumerate(skeleton.names)}
     plain = {normalise_name(name): joint for joint, name in reversed(list(enumerate(skeleton.names)))}
     listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
@@ -106,7 +106,7 @@ def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
 
 
 def _find_preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
-    """The listed rig that explains most of the skeleton, if one has all that is required."""
+    """Find the listed rig that explains most of the skeleton, if one has all that is required."""
     best, chosen, joints = 0.0, None, {}
     plain = {normalise_name(name) for name in skeleton.names}
     for rig in known_rigs():
@@ -125,7 +125,7 @@ def _find_preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
 
 
 def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, float]]:
-    """Joints by the words in their names, completed by the tree; and what each is worth."""
+    """Match joints by the words in their names, completed by the tree; also return what each is worth, 0 to 1."""
     found = dict(given)
     for name, joint in _match_by_words(skeleton, given.get("hips")).items():
         if joint not in found.values():
@@ -140,7 +140,7 @@ def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[
 
 
 def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
-    """Canonical joint by side and part that names tell, below the hips, top down."""
+    """Match canonical joints by the side and part that names tell, below the hips, top down."""
     if hips is None:
         try:
             hips = find_hips(skeleton)
@@ -198,7 +198,7 @@ def _match_limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
 
 
 def _assign_sides(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
-    """Limbs found by the tree alone, put on the side that their joints' names or else their places tell.
+    """Put limbs found by the tree alone on the side that their joints' names or else their positions tell.
 
     Without names, left is +X: where the rest pose faces elsewhere, the toes tell it (see `correct_sides`).
     """
@@ -223,7 +223,7 @@ def _assign_sides(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: S
 
 
 def _descendants(skeleton: Skeleton, joint: int) -> set[int]:
-    """The joint and all below it."""
+    """Return the joint and all below it."""
     found = {joint}
     for child, parent in enumerate(skeleton.parents):
         if parent in found:

@@ -1,4 +1,4 @@
-"""What a pose of an unknown rig tells by its joints' places: which way is up, forward and left."""
+"""The up, forward and left axes that a pose of an unknown rig shows by its joints' positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
 SAMPLES = 200
-"""Frames of a clip that are looked at, spread over it."""
+"""Number of frames of a clip that are looked at, spread over it."""
 _UPRIGHT_COSINE = 0.8  # cosine between an axis and the body that stands along it
 _MIN_HANDEDNESS = 0.3  # of the triple product left x up x toes, below which toes do not tell the facing
 
@@ -29,13 +29,13 @@ class RigPoses:
     turns: Float[Tensor, "poses joints 4"]
     """World rotations (xyzw)."""
     skeleton: Skeleton
-    """The rig's own."""
+    """Skeleton of the rig."""
     joint_of: tuple[int | None, ...]
-    """Which joint of the rig each canonical one is."""
+    """Index of the rig's joint for each canonical joint, or None."""
 
     @staticmethod
     def zero(skeleton: Skeleton, joint_of: JointOf) -> "RigPoses":
-        """All rotations zero."""
+        """Return the pose with all rotations zero."""
         still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
         root = torch.zeros(1, 3, dtype=torch.float64)
         return RigPoses(
@@ -44,28 +44,28 @@ class RigPoses:
 
     @staticmethod
     def of(motion: Motion, joint_of: JointOf) -> "RigPoses":
-        """Up to SAMPLES frames of a clip, the first among them."""
+        """Sample up to SAMPLES frames of a clip, the first among them."""
         picked = torch.linspace(0, motion.num_frames - 1, min(SAMPLES, motion.num_frames)).round().long()
         return RigPoses(
             motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton, tuple(joint_of)
         )
 
     def first(self) -> "RigPoses":
-        """The first pose alone."""
+        """Return the first pose alone."""
         return RigPoses(self.places[:1], self.turns[:1], self.skeleton, self.joint_of)
 
     def has(self, *names: str) -> bool:
-        """Whether the rig has all these canonical joints."""
+        """Return whether the rig has all these canonical joints."""
         return all(self.joint_of[CANONICAL.index(name)] is not None for name in names)
 
     def place(self, name: str) -> Float[Tensor, "poses 3"]:
-        """Of a canonical joint that the rig has."""
+        """Return the position of a canonical joint that the rig has, metres."""
         joint = self.joint_of[CANONICAL.index(name)]
         assert joint is not None
         return self.places[:, joint]
 
     def end(self, name: str) -> Float[Tensor, "poses 3"] | None:
-        """Of the End Site of a canonical joint, if there is one of some length."""
+        """Return the position of the End Site of a canonical joint, metres, if there is one of some length."""
         joint = self.joint_of[CANONICAL.index(name)]
         site = self.skeleton.end_offsets.get(self.skeleton.names[joint]) if joint is not None else None
         if joint is None or site is None or max(map(abs, site)) < 1e-4:
@@ -74,24 +74,26 @@ class RigPoses:
         return self.places[:, joint] + rotations.rotate(self.turns[:, joint], offset)
 
     def up(self) -> Float[Tensor, "poses 3"]:
-        """From the thighs to the upper arms, unit."""
+        """Return the unit vector from the thighs to the upper arms."""
         high = self.place("leftUpperArm") + self.place("rightUpperArm")
         return _unit(high - self.place("leftUpperLeg") - self.place("rightUpperLeg"))
 
     def left(self) -> Float[Tensor, "poses 3"]:
-        """From the right thigh to the left, square to `up`, unit; the upper arms where thighs are one."""
+        """Return the unit vector from the right thigh to the left, square to `up`; by the upper arms where thighs are
+        one."""
         across = self.place("leftUpperLeg") - self.place("rightUpperLeg")
         arms = self.place("leftUpperArm") - self.place("rightUpperArm")
         across = torch.where(across.norm(dim=-1, keepdim=True) > 1e-3, across, arms)
         return _unit(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
 
     def toes(self) -> Float[Tensor, "poses 3"]:
-        """From the feet to the toes or the feet's End Sites, unit; zero where there are none."""
+        """Return the unit vector from the feet to the toes or the feet's End Sites; zero where there are none."""
         ways = [self.way(side + "Foot") for side in ("left", "right")]
         return _unit(sum((way for way in ways if way is not None), torch.zeros_like(self.places[:, 0])))
 
     def way(self, name: str) -> Float[Tensor, "poses 3"] | None:
-        """From a canonical joint to the next one of its limb or trunk that the rig has, or its End Site; not unit.
+        """Return the vector, metres, from a canonical joint to the next one of its limb or trunk that the rig has, or
+        to its End Site.
 
         None where it lacks one of the two.
         """
@@ -104,13 +106,13 @@ class RigPoses:
         return None if stop is None else stop - self.place(name)
 
     def handedness(self) -> Float[Tensor, " poses"]:
-        """Left x up along the toes: 1 where sides are what their names say, -1 where they are exchanged."""
+        """Return left x up along the toes: 1 where sides are what their names say, -1 where they are exchanged."""
         toes, up = self.toes(), self.up()
         return (torch.linalg.cross(self.left(), up) * toes).sum(-1)
 
 
 def next_joint(name: str) -> str | None:
-    """The canonical joint that a bone leads to: the knee for the thigh; None for hips and for the ends of limbs."""
+    """Return the canonical joint that a bone leads to: the knee for the thigh; None for hips and ends of limbs."""
     below = {"spine": "chest", "chest": "neck", "neck": "head"}
     if name in ("hips", *below):
         return below.get(name)
@@ -119,7 +121,7 @@ def next_joint(name: str) -> str | None:
 
 
 def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
-    """Whether the joints that are called left are on the right, seen by the way that the toes point."""
+    """Return whether the joints named left are on the right, judged by the direction of the toes."""
     rest = float(zero.handedness()[0])
     if abs(rest) > _MIN_HANDEDNESS:
         return rest < 0
@@ -127,7 +129,7 @@ def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
 
 
 def find_up_axis(zero: RigPoses, clip: RigPoses | None) -> str:
-    """Y or Z, as the body stands in the clip, else in the zero pose; Y where neither tells.
+    """Find the up axis, Y or Z, of the body in the clip, else in the zero pose; Y where neither tells.
 
     Against the zero pose, and where that tells nothing, only a clip counts in which the body stands along Z all the
     time: people lie down, too.

@@ -1,4 +1,4 @@
-"""The T-pose of any rig: how each joint is turned in it, told by a table, or found from a pose that is near it.
+"""The T-pose of any rig: the rotation of each joint in it, from a table, or found from a pose that is near it.
 
 All rotations zero, or a clip's first frame, is the pose to begin from. It is turned upright and to face +Z; then each
 limb is laid along its canonical direction by the shortest arc, from the body outward. Feet stand as they stood.
@@ -14,7 +14,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.retarget.pose_axes import RigPoses, find_up_axis
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 
 _LIMBS = ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg")
 _SNAP = math.radians(20)  # a rest pose this near an axis stands and faces along it
@@ -32,14 +32,14 @@ _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass(frozen=True, eq=False)
 class TPose:
-    """How a rig stands when the canonical skeleton stands in its rest pose."""
+    """The rig's pose when the canonical skeleton stands in its rest pose."""
 
     quat_xyzw: Float[Tensor, "joints 4"]
     """World rotation of each canonical joint's rig joint, in a world with Y up."""
     idle_quat_xyzw: Float[Tensor, "rigged 4"]
     """Local rotations of the rig's joints at rest; what counts of it are joints that no canonical one stands for."""
     upright_quat_xyzw: Float[Tensor, "4"] | None
-    """Turns the file's world so that Y is up; None where it is."""
+    """Rotation that takes the file's world to Y up, xyzw; None where it is."""
     up: str
     """Axis of the file's world that points up."""
     facing: str
@@ -51,7 +51,7 @@ class TPose:
 
 
 def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig) -> TPose:
-    """The T-pose of a rig that no table tells; what the rig sets is not looked for."""
+    """Find the T-pose of a rig whose table has none; what the rig sets is not looked for."""
     up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
     upright = upright_rotation(up)
     base, found, facing = zero, "rest pose", None if rig.facing == "auto" else axis_vector(rig.facing)
@@ -73,7 +73,7 @@ def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig) -> TPose:
 
 
 def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str:
-    """Whether the first pose is a T-pose, an A-pose (arms anywhere between level and hanging), or neither.
+    """Classify the first pose as a T-pose, an A-pose (arms anywhere between level and hanging), or neither.
 
     `front` turns it to stand upright and face +Z.
     """
@@ -95,12 +95,12 @@ def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str
 
 
 def upright_rotation(up: str) -> Float[Tensor, "4"] | None:
-    """The rotation that turns a world so that Y is up; None where it is."""
-    return None if up == "y" else _matrix_to_quat(_shortest_rotation(axis_vector(up), axis_vector("y")))
+    """Return the rotation that turns a world so that Y is up; None where it is."""
+    return None if up == "y" else rotations.from_matrix(align_bone(axis_vector(up), axis_vector("y")))
 
 
 def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
-    """Whether the first pose is a T-pose as captures begin with: everything straight, arms level, legs vertical."""
+    """Return whether the first pose is a T-pose that captures begin with: all straight, arms level, legs vertical."""
     for side, sign in (("left", 1.0), ("right", -1.0)):
         for part, aim in (("Arm", axis_vector("x") * sign), ("Leg", -axis_vector("y"))):
             ways = [_bone_direction(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
@@ -110,17 +110,17 @@ def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
 
 
 def axis_vector(axis: str) -> Float[Tensor, "3"]:
-    """`-z` as a vector."""
+    """Return the vector of an axis by name, as `-z`."""
     return torch.tensor(_VECTORS[axis[-1]], dtype=torch.float64) * (-1 if axis.startswith("-") else 1)
 
 
 def find_rest_facing(zero: RigPoses) -> str:
-    """The axis that the pose with all rotations zero faces; `unknown` if it is along none."""
+    """Find the axis that the pose with all rotations zero faces; `unknown` if it is along none."""
     return nearest_axis_name(_facing_rotation(zero, None)[2])
 
 
 def nearest_axis_name(direction: Float[Tensor, "3"]) -> str:
-    """The axis that a unit vector points along; `unknown` if it is none."""
+    """Return the axis that a unit vector points along; `unknown` if it is none."""
     largest = int(direction.abs().argmax())
     if float(direction[largest].abs()) < math.cos(_SNAP):
         return "unknown"
@@ -128,7 +128,7 @@ def nearest_axis_name(direction: Float[Tensor, "3"]) -> str:
 
 
 def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 3"]:
-    """Turns the zero pose upright and toward +Z; its rows are where left, up and forward were."""
+    """Return the rotation of the zero pose to upright, facing +Z; its rows are where left, up and forward were."""
     up, left = _snap_to_axis(zero.up()[0]), zero.left()[0]
     if facing is not None and float(facing @ up) < 0.5:
         left = torch.linalg.cross(up, facing)
@@ -136,7 +136,7 @@ def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 
 
 
 def _first_frame_rotation(first: RigPoses, up: Tensor) -> Float[Tensor, "3 3"]:
-    """Turns a frame of a clip toward +Z; it stands as upright as its performer did."""
+    """Return the rotation of a clip's frame to face +Z; it stands as upright as its performer did."""
     return _body_frame(first.left()[0], up)
 
 
@@ -158,7 +158,7 @@ def _bone_direction(poses: RigPoses, name: str, front: Tensor) -> Float[Tensor, 
 def _lay_out_tpose(
     base: RigPoses, front: Tensor, stands: bool, *, pitch: float | None, twists: dict[str, float]
 ) -> Float[Tensor, "joints 4"]:
-    """World rotation of each canonical joint's rig joint, once the base pose has been laid out as a T-pose."""
+    """Return the world rotation of each canonical joint's rig joint once the base pose is laid out as a T-pose."""
     turns: list[Tensor] = []
     for index, name in enumerate(CANONICAL.names):
         part = name.removeprefix("left").removeprefix("right")
@@ -176,11 +176,11 @@ def _lay_out_tpose(
             and (limb or apart > _TRUNK_TOLERANCE)
             and part != "Hand"
         ):
-            above = _shortest_rotation(way, aim) @ above
+            above = align_bone(way, aim) @ above
         if name in twists:
             above = rotations.rotation_vector_to_matrix(aim * twists[name]) @ above
         turns.append(above)
-    still = [_matrix_to_quat(turn) for turn in turns]
+    still = [rotations.from_matrix(turn) for turn in turns]
     joints = [
         base.turns[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1]) for joint in base.joint_of
     ]
@@ -188,7 +188,7 @@ def _lay_out_tpose(
 
 
 def _lay_out_foot(base: RigPoses, name: str, above: Tensor, pitch: float | None) -> Tensor:
-    """A foot put flat on the floor, or toes laid level, where the base pose does not stand."""
+    """Lay a foot flat on the floor, or toes level, where the base pose does not stand."""
     way = base.way(name)
     if name.endswith("Toes") and way is None:
         way = base.way(name.replace("Toes", "Foot"))
@@ -197,11 +197,11 @@ def _lay_out_foot(base: RigPoses, name: str, above: Tensor, pitch: float | None)
     slope = _canonical_foot_pitch() if pitch is None else pitch
     slope = 0.0 if name.endswith("Toes") else slope
     aim = torch.tensor([0.0, -math.sin(slope), math.cos(slope)], dtype=torch.float64)
-    return _shortest_rotation(_unit(above @ way[0]), aim) @ above
+    return align_bone(_unit(above @ way[0]), aim) @ above
 
 
 def _canonical_direction(index: int) -> Float[Tensor, "3"]:
-    """Direction of the bone that begins at a canonical joint; zero for hips and for the ends of limbs."""
+    """Return the direction of the bone that begins at a canonical joint; zero for hips and for the ends of limbs."""
     name = CANONICAL.names[index]
     if name == "hips" or not CANONICAL.children(index):
         return torch.zeros(3, dtype=torch.float64)
@@ -209,13 +209,13 @@ def _canonical_direction(index: int) -> Float[Tensor, "3"]:
 
 
 def _canonical_foot_pitch() -> float:
-    _, y, z = CANONICAL.offsets[CANONICAL.index("leftToes")].tolist()
+    _, y, z = CANONICAL.offsets[TOE_JOINTS[0]].tolist()
     return math.atan2(-y, z)
 
 
 def _estimate_foot_pitch(clip: RigPoses | None, upright: Tensor | None) -> float | None:
-    """How far the foot's bone points below level while it stands flat, radians: by how much lower than the ankle the
-    toe comes over the clip."""
+    """Estimate how far the foot's bone points below level while it stands flat, radians, from how much lower than the
+    ankle the toe gets over the clip."""
     if clip is None or not clip.has("leftToes", "rightToes", "leftFoot", "rightFoot") or len(clip.places) < 10:
         return None
     up = axis_vector("y") if upright is None else rotations.rotate(rotations.inverse(upright), axis_vector("y"))
@@ -232,7 +232,7 @@ def _estimate_foot_pitch(clip: RigPoses | None, upright: Tensor | None) -> float
 
 
 def _untwist_tpose(base: RigPoses, front: Tensor, clip: RigPoses, upright: Tensor | None) -> Float[Tensor, "joints 4"]:
-    """The T-pose of a rig whose zero pose is none: bones tell all but how joints are turned about them.
+    """Return the T-pose of a rig whose zero pose is none: bones tell all but the rotation of joints about them.
 
     Over a clip the trunk's joints are hardly twisted, knees bend backward and elbows forward: what contradicts that is
     put right, from the hips outward.
@@ -256,7 +256,7 @@ def _untwist_tpose(base: RigPoses, front: Tensor, clip: RigPoses, upright: Tenso
 
 
 def _mean_twist(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> float:
-    """The turn about a joint's bone, radians, that takes away its mean twist against the joint above."""
+    """Return the rotation about a joint's bone, radians, that removes its mean twist against the joint above."""
     index = CANONICAL.index(name)
     above = CANONICAL.parents[index]
     while above > 0 and clip.joint_of[above] is None:
@@ -270,8 +270,8 @@ def _mean_twist(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None
 
 
 def _hinge_error(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> float | None:
-    """The turn about an upper limb's bone, radians, by which the joint below it bends as people's do; None if it hardly
-    bends."""
+    """Return the rotation about an upper limb's bone, radians, by which the joint below bends as people's do; None if
+    it hardly bends."""
     below = name.replace("Upper", "Lower")
     left = 1.0 if name.startswith("left") else -1.0
     wanted = axis_vector("x") if name.endswith("Leg") else -left * axis_vector("y")
@@ -285,7 +285,7 @@ def _hinge_error(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | Non
 
 
 def _canonical_rotations(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> Float[Tensor, "poses 4"]:
-    """World rotations of a canonical joint over a clip."""
+    """Return the world rotations of a canonical joint over a clip."""
     index, frames = CANONICAL.index(name), len(clip.turns)
     joint = clip.joint_of[index]
     assert joint is not None
@@ -294,7 +294,7 @@ def _canonical_rotations(clip: RigPoses, name: str, quats: Tensor, upright: Tens
 
 
 def _local_rotations(base: RigPoses) -> Float[Tensor, "rigged 4"]:
-    """Local rotations of the base pose."""
+    """Return the local rotations of the base pose."""
     parents, turns = base.skeleton.parents, base.turns[0]
     return torch.stack(
         [
@@ -304,24 +304,20 @@ def _local_rotations(base: RigPoses) -> Float[Tensor, "rigged 4"]:
     )
 
 
-def _shortest_rotation(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation from one unit vector to another; of opposite ones, the half turn about +Z if it is one.
+def align_bone(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Return the shortest rotation between unit vectors; of about opposite ones, the half turn about +Z if it is one.
 
-    Rigs whose bones all lie along one local axis keep their other axes so: a thigh that points up is turned down
-    sideways, not through a somersault, and its knee still bends backward.
+    Unlike `rotations.between_vectors`, it keeps the other axes of rigs whose bones all lie along one local axis: a
+    thigh that points up is rotated down sideways, not through a somersault, and its knee still bends backward.
     """
     axis, cosine = torch.linalg.cross(start, stop), start @ stop
     if cosine < 0 and axis.norm() < 0.1:
         across = axis_vector("z") if float(start[2].abs()) < 0.7 else axis_vector("y")
         half = torch.nn.functional.normalize(across - start * (across @ start), dim=0)
         over = rotations.rotation_vector_to_matrix(half * math.pi)
-        return _shortest_rotation(over @ start, stop) @ over
+        return align_bone(over @ start, stop) @ over
     sine = axis.norm().clamp_min(1e-12)
     return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
-
-
-def _matrix_to_quat(matrix: Tensor) -> Float[Tensor, "4"]:
-    return rotations.from_matrix(matrix)
 
 
 def _unit(vectors: Tensor) -> Tensor:

@@ -26,21 +26,21 @@ class Rig:
     """What is known of a rig before a file of it is opened."""
 
     name: str
-    """How users call it."""
+    """Name by which users call the rig."""
     joints: Mapping[str, str]
     """Canonical joint name to the rig's own."""
     tpose: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)
     """Canonical joint name to where the joint's local x and y axes point in the T-pose; the zero pose if absent."""
     straighten: tuple[str, ...] = ()
-    """Canonical joints whose bone is turned to its canonical direction in the T-pose."""
+    """Canonical joints whose bone is rotated to its canonical direction in the T-pose."""
     end_sites: tuple[str, ...] = ()
     """Canonical joints that the rig has only as the End Site of their canonical parent."""
     about: str = ""
-    """What the rig is, one line."""
+    """Description of the rig, one line."""
     aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Canonical joint name to the other names that versions of the rig use, one place a version."""
+    """Canonical joint name to the other names that versions of the rig use, one entry a version."""
     also: tuple[str, ...] = ()
-    """Further joints of the rig, by which it is told from its relatives."""
+    """Further joints of the rig, that distinguish it from its relatives."""
     up: str = "auto"
     """Axis of the file's world that points up: one of AXES; `auto` to find it."""
     facing: str = "auto"
@@ -62,17 +62,17 @@ class Rig:
 
     @property
     def has_tpose(self) -> bool:
-        """Whether the T-pose is told, so that it need not be found."""
+        """Whether the T-pose is given, so that it need not be found."""
         return bool(self.tpose or self.straighten or self.rest == "tpose") and self.rest in ("auto", "tpose")
 
     def fits(self, skeleton: Skeleton) -> bool:
-        """Whether the skeleton has every joint that the rig names, spelled as the rig does."""
+        """Return whether the skeleton has every joint that the rig names, spelled as the rig does."""
         return set(self.joints.values()) <= set(skeleton.names)
 
 
 @cache
 def known_rigs() -> tuple[Rig, ...]:
-    """Every rig in this folder, the canonical one first."""
+    """Return every rig in this folder, the canonical one first."""
     canonical = Rig(
         "canonical",
         {name: name for name in CANONICAL.names},
@@ -87,14 +87,14 @@ def known_rigs() -> tuple[Rig, ...]:
 
 
 def recognise(skeleton: Skeleton) -> Rig:
-    """The rig of a skeleton, listed or not; RequestError tells which canonical joints cannot be found."""
+    """Recognise the rig of a skeleton, listed or not; RequestError tells which canonical joints cannot be found."""
     from mapctl.retarget.joint_matching import match
 
     return match(skeleton).rig
 
 
 def load_rig(name_or_path: str | PathLike[str]) -> Rig:
-    """A preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
+    """Load a preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
     text, path = str(name_or_path), Path(name_or_path)
     for rig in known_rigs():
         if rig.name == text.lower():

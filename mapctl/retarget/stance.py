@@ -1,7 +1,7 @@
-"""How somebody stands: how high the toe joints are over the floor, and how feet and toes are turned while flat on it.
+"""How a performer stands: the height of the toe joints over the floor, and the tilt of feet and toes while flat on it.
 
 Both belong to the rig as much as bones do, and a T-pose alone does not tell them: a table may lay a foot along another
-performer's, and nobody's toe joints are on the floor. A clip tells them, where its feet stand; else the rest pose does.
+performer's, and nobody's toe joints are on the floor. A clip shows them, where its feet stand; else the rest pose does.
 """
 
 import math
@@ -21,7 +21,7 @@ _MAX_FLOOR_OFFSET = 0.15  # of the leg: toes that rest further from 0 do not sta
 _MAX_TOE_DIFFERENCE = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
 _FLAT_ANKLE_METRES = 0.01  # metres over its lowest that the ankle of a flat foot is
 _LOWEST_QUANTILE = 0.05  # quantile that is an ankle's lowest
-_MAX_TOE_DEPTH = 0.03  # metres that toes go through the floor at most, of which a clip is believed
+_MAX_TOE_DEPTH = 0.03  # metres that toes go through the floor at most, of a clip that counts
 _MIN_FLAT_SECONDS = 0.25  # seconds of a flat foot that tell how it is turned
 _MIN_TILT, _MAX_TILT = (
     math.radians(-12),
@@ -34,24 +34,26 @@ class Stance:
     """How one performer stands on a flat floor, in canonical joint frames; feet in the order left, right."""
 
     toe_height: Float[Tensor, "2"]
-    """Of the toe joints over the floor while they rest on it, metres: what one sees of a clip, its lowest."""
+    """Height of the toe joints over the floor while they rest on it, metres: as seen in a clip, its lowest."""
     flat_height: Float[Tensor, "2"]
-    """Of the toe joints over the floor while feet lie flat, metres: higher where toes go through the floor at times."""
+    """Height of the toe joints over the floor while feet lie flat, metres: higher where toes sink into the floor at
+    times."""
     tilt: Float[Tensor, "2 2"]
-    """By side, how far foot and toes point up while they lie flat, against the T-pose; radians."""
+    """Pitch of foot and toes by side, radians, positive up, against the T-pose while they lie flat."""
     floor: float = 0.0
     """Height of the clip's floor, metres: 0, but where all of it is above or below, as on a platform."""
 
     @staticmethod
     def at_rest(skeleton: Skeleton) -> "Stance":
-        """Of bones alone (canonical names): feet as they are in the T-pose, toes as high as the canonical in scale."""
+        """Return the stance of bones alone (canonical names): feet as in the T-pose, toes as high as the canonical in
+        scale."""
         scale = leg_length(skeleton) / leg_length(CANONICAL)
         height = torch.full((2,), TOE_REST_HEIGHT * scale, dtype=torch.float64)
         return Stance(height, height, torch.zeros(2, 2).double())
 
     @staticmethod
     def of(clip: Motion, rigmap: RigMap) -> "Stance":
-        """As a clip (canonical joints, from `to_canonical` with this map) shows it.
+        """Measure the stance of a clip (canonical joints, from `to_canonical` with this map).
 
         Toes rest at a low percentile of their own height. A foot is flat where the toe is planted and the ankle at its
         lowest, and what it is turned by then is the T-pose's error: a T-pose whose feet point down is common. One that
@@ -72,15 +74,15 @@ class Stance:
         return Stance(seen, laid, tilt)
 
     def leveled(self, motion: Motion) -> Motion:
-        """The same movement of bones whose T-pose has its feet flat: no joint moves, joint frames of feet turn."""
+        """Return the same movement with a T-pose whose feet are flat: no joint moves, joint frames of feet rotate."""
         return _rotate_foot_frames(motion, rotations.from_rotation_vector(_about_x(-self.tilt)))
 
     def restore_foot_tilt(self, motion: Motion) -> Motion:
-        """What `leveled` does, undone."""
+        """Undo `leveled`."""
         return _rotate_foot_frames(motion, rotations.from_rotation_vector(_about_x(self.tilt)))
 
     def leveled_map(self, rigmap: RigMap) -> RigMap:
-        """The way between the rig and canonical joints whose T-pose has its feet flat."""
+        """Return the map between the rig and canonical joints whose T-pose has its feet flat."""
         turns = _expand_to_joints(rotations.from_rotation_vector(_about_x(-self.tilt)))
         tpose = rotations.multiply(turns, rigmap.tpose_quat_xyzw)
         return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_rotate_bones(rigmap.skeleton, turns))
@@ -95,14 +97,14 @@ def _about_x(angle: Float[Tensor, "2 2"]) -> Float[Tensor, "2 2 3"]:
 
 
 def _expand_to_joints(turns: Float[Tensor, "2 2 4"]) -> Float[Tensor, "joints 4"]:
-    """Turns of feet and toes among those of all joints, which have none."""
+    """Put rotations of feet and toes among those of all joints, which have none."""
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(CANONICAL.num_joints, 1)
     still[_side_joints("Foot")], still[_side_joints("Toes")] = turns[:, 0], turns[:, 1]
     return still
 
 
 def _rotate_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skeleton:
-    """The bones that begin at each joint, turned."""
+    """Rotate the bones that begin at each joint."""
     parents = list(skeleton.parents)
     offsets = skeleton.offsets.clone()
     offsets[1:] = rotations.rotate(turns[parents[1:]], offsets[1:])
@@ -114,7 +116,7 @@ def _rotate_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skele
 
 
 def _rotate_foot_frames(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion:
-    """Other joint frames for feet and toes: what is in them turns, and they turn back."""
+    """Change the joint frames of feet and toes: what is in them is rotated, and they are rotated back."""
     by_joint = _expand_to_joints(turns)
     world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint).expand_as(motion.local_quat_xyzw))
     local = rotations.make_sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
@@ -122,7 +124,7 @@ def _rotate_foot_frames(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion
 
 
 def _detect_flat_feet(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
-    """Where feet lie flat; nowhere for a side that hardly ever does."""
+    """Detect where feet lie flat; nowhere for a side that hardly ever does."""
     ankles = clip.joint_positions()[:, _side_joints("Foot"), 1]
     flat = torch.zeros_like(planted)
     for k in range(2):
@@ -133,8 +135,8 @@ def _detect_flat_feet(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[T
 
 
 def _estimate_tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor, "2 2"]:
-    """Of foot and toes by side, median over the frames in which the foot is flat; of a side that has none, the other's;
-    0 where it is too much to be true."""
+    """Estimate the tilt of foot and toes by side, radians: its median over the frames in which the foot is flat; 0 for
+    a side that has none."""
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     turns = clip.joint_rotations()[:, [*_side_joints("Foot"), *_side_joints("Toes")]].reshape(-1, 2, 2, 4)
     up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))

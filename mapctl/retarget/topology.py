@@ -15,7 +15,7 @@ LimbPair = tuple[list[int], list[int]]
 
 
 def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
-    """Canonical joint name to the rig's joint, as far as the tree tells; empty where it is no human body's.
+    """Match canonical joint names to the rig's joints, as far as the tree tells; empty where it is no human body's.
 
     Which limb of a pair is the left one is not told: sides are to be checked by what else is known.
     """
@@ -62,7 +62,7 @@ class _JointTree:
             self.reach[joint] = max([ends.get(joint, 0.0), *below])
 
     def find_limb_pairs(self, joint: int) -> list[LimbPair]:
-        """Branches that are two limbs of one pair, bone for bone of about the same length; the longest pair first."""
+        """Find branches that are a pair of limbs, bone for bone of about the same length; the longest pair first."""
         found = []
         for k, first in enumerate(self.children[joint]):
             for second in self.children[joint][k + 1 :]:
@@ -73,7 +73,7 @@ class _JointTree:
         return [ways for _, ways in sorted(found)]
 
     def trace_limb_pair(self, first: int, second: int) -> LimbPair:
-        """Down two branches as long as they are alike; a sword in one hand is not."""
+        """Follow two branches down as long as they are alike; a sword in one hand is not."""
         ways = [first], [second]
         while True:
             ends = product(self.children[ways[0][-1]], self.children[ways[1][-1]])
@@ -85,26 +85,26 @@ class _JointTree:
                 way.append(joint)
 
     def are_alike(self, first: int, second: int) -> bool:
-        """Whether two bones are of about the same length."""
+        """Return whether two bones are of about the same length."""
         short, long = sorted((self.length[first], self.length[second]))
         return long <= _MAX_LENGTH_RATIO * short + 1e-6
 
     def chain(self, joint: int) -> list[int]:
-        """The joints from this one to the farthest leaf."""
+        """Return the joints from this one to the farthest leaf."""
         way = [joint]
         while self.children[way[-1]]:
             way.append(max(self.children[way[-1]], key=lambda child: self.length[child] + self.reach[child]))
         return way
 
     def below(self, joint: int) -> list[int]:
-        """The joint and all below it, parents first."""
+        """Return the joint and all below it, parents first."""
         found = [joint]
         for above in found:
             found.extend(self.children[above])
         return found
 
     def way(self, above: int, joint: int) -> list[int]:
-        """The joints below `above` on the way to a joint, and that joint."""
+        """Return the joints below `above` on the chain to a joint, and that joint."""
         way = []
         while joint != above:
             way.append(joint)
@@ -112,7 +112,7 @@ class _JointTree:
         return way[::-1]
 
     def limb(self, way: list[int], names: list[str]) -> dict[str, int]:
-        """Names of a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
+        """Name a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
         both = [self.length[way[k + 1]] + self.length[way[k + 2]] for k in range(len(way) - 2)]
         upper = max(range(len(both)), key=both.__getitem__)
         placed = {name: upper + k - 1 for k, name in enumerate(names)}

@@ -8,11 +8,11 @@ from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 
 UNKNOWN_RIG_NOTE = "the rig is not known, and so not which way is up: taken as it is, with Y up"
-"""What is to be said of a motion that cannot be put upright."""
+"""Note on a motion that cannot be put upright."""
 
 
 def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[str, ...]]:
-    """The motion on its own rig in a world with Y up, and a sentence where the rig is not known.
+    """Put a motion on its own rig upright, with Y up; also return a note where the rig is not known.
 
     Unchanged where Y is up already, or nothing is known.
     """

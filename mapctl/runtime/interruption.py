@@ -1,6 +1,6 @@
-"""Ctrl-C, SIGTERM and a terminal that closes end work alike, by KeyboardInterrupt; what must be whole holds them back.
+"""Ctrl-C, SIGTERM and a terminal that closes end work alike, by KeyboardInterrupt; saving defers them.
 
-`timeout`, job schedulers and impatient fingers send a signal twice: what comes within a second is one wish.
+`timeout`, job schedulers and impatient fingers send a signal twice: what comes within a second is one signal.
 """
 
 import signal
@@ -12,13 +12,13 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""What ends work. Those that a process was told to ignore (nohup) are left ignored."""
+"""Signals that end work. Those that a process was told to ignore (nohup) are left ignored."""
 REPEAT_SECONDS = 1.0
-"""Seconds."""
+"""Time within which signals count as one, seconds."""
 
 
 def raise_on_signals() -> list[int]:
-    """From here on every one of SIGNALS raises KeyboardInterrupt; the list gets the numbers of those that did.
+    """Raise KeyboardInterrupt from here on at every one of SIGNALS; the list gets the numbers of those that did.
 
     For a process' main thread.
     """
@@ -42,9 +42,9 @@ class DeferredSignals:
     """Signals that wait until what is under way is whole."""
 
     def __init__(self, before: dict[int, Any]):
-        """`before` holds the handlers that they would have gone to."""
+        """Take the handlers `before` that the signals would have gone to."""
         self.wanted: int | None = None
-        """The signal that waits."""
+        """Number of the signal that waits."""
         self._handlers, self._since = before, 0.0
         self._lets_through = self._defers_all = False
 
@@ -59,7 +59,7 @@ class DeferredSignals:
 
     @contextmanager
     def let_through(self) -> Iterator[None]:
-        """Within, signals go through at once, as does one that waits already."""
+        """Let signals through at once within, as well as one that waits already."""
         self._lets_through = True
         try:
             self.release()
@@ -69,7 +69,7 @@ class DeferredSignals:
 
     @contextmanager
     def defer_all(self) -> Iterator[None]:
-        """Within, signals wait however often they come: for saving, which is short."""
+        """Defer signals within however often they come: for saving, which is short."""
         self._defers_all = True
         try:
             yield
@@ -77,7 +77,7 @@ class DeferredSignals:
             self._defers_all = False
 
     def receive(self, number: int, _: FrameType | None) -> None:
-        """The handler. A second wish, more than a second after the first, is not held back."""
+        """Handle a signal; a second one, more than a second after the first, is not held back."""
         now, again = time.monotonic(), self.wanted is not None
         if not again:
             self.wanted, self._since = number, now
@@ -103,5 +103,5 @@ def defer_signals() -> Iterator[DeferredSignals]:
 
 
 def _handled_signals() -> list[int]:
-    """Those that are neither ignored nor in the hands of something that is not Python."""
+    """Return the signals that are neither ignored nor in the hands of something that is not Python."""
     return [number for number in SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]

@@ -1,4 +1,4 @@
-"""What passes between a character that is steered live and whoever shows it; neither knows the other."""
+"""The protocol between a character that is steered live and its viewer; neither knows the other."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,36 +22,36 @@ class FrameChunk:
     due: float
     """Value of time.perf_counter at which the first of them is to be seen."""
     seconds: float
-    """Of the stream, at that moment."""
+    """Time of the stream at that moment, seconds."""
     root: Float[ndarray, "frames 3"]
-    """Joint 0 in the world, metres."""
+    """Position of joint 0 in the world, metres."""
     quats: Float[ndarray, "frames joints 4"]
     """Local rotations, xyzw."""
     contacts: Float[ndarray, "frames 2"]
     """Left and right toe planted, 1 or 0."""
     forecast: Float[ndarray, "ahead joints 3"]
-    """World joint positions of the frames that would come next, metres."""
+    """World joint positions of the forecast frames, metres."""
     wish: tuple[float, float]
-    """Wanted velocity of the last frame, x and z, m/s."""
+    """Target velocity of the last frame, x and z, m/s."""
     energies: Mapping[str, float]
     """Mean nats a frame by term, of the new frames."""
     spare: float
-    """Seconds between delivery and when the first frame had to be there; negative where it came late. Frames that came
-    very late are due anew, as soon as they are there."""
+    """Lateness, seconds from when the first frame was due to its delivery; negative where it came early. Frames that
+    came very late are due anew, as soon as they are there."""
     compute_seconds: float
-    """Seconds of the step."""
+    """Compute time of the step, seconds."""
     evaluations: int
-    """Of energy and gradient in the step."""
+    """Evaluations of energy and gradient in the step."""
     notes: tuple[str, ...] = ()
-    """What was ordered since the last step and could not be done, or not as it was asked; a sentence each."""
+    """Notes on commands since the last step that could not be obeyed, or not as given."""
 
     @property
     def late_frames(self) -> int:
-        """Frames that came after they were due."""
+        """Number of frames that came after they were due."""
         return sum(self.spare + k / PRIOR_FPS < 0 for k in range(len(self.root)))
 
     def motion(self, skeleton: Skeleton) -> Motion:
-        """The frames as a motion of that skeleton."""
+        """Return the frames as a motion of that skeleton."""
         return Motion(skeleton, Fraction(PRIOR_FPS), torch.from_numpy(self.root), torch.from_numpy(self.quats))
 
 
@@ -60,10 +60,10 @@ class LiveCharacter(Protocol):
     """A character that moves by itself in real time and takes orders at any moment."""
 
     skeleton: Skeleton
-    """Its bones."""
+    """Skeleton of the character."""
 
     def command(self, command: Command) -> None:
-        """Obey this from now on, and follow no path; as far as it can, which `FrameChunk.notes` tell."""
+        """Obey this command from now on, as far as possible (`FrameChunk.notes` tell), and follow no path."""
         ...
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
@@ -75,13 +75,13 @@ class LiveCharacter(Protocol):
         ...
 
     def reset(self) -> None:
-        """Begin anew where it first stood; also who is no more."""
+        """Restart from the initial pose; also a character that has ended."""
         ...
 
     def poll(self) -> list[FrameChunk]:
-        """What was delivered since the last call, oldest first. MapctlError if the character is no more."""
+        """Return what was delivered since the last call, oldest first. MapctlError if the character has ended."""
         ...
 
     def close(self) -> None:
-        """End it; harmless the second time."""
+        """End the character; harmless the second time."""
         ...

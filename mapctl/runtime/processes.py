@@ -12,7 +12,7 @@ from typing import Any
 
 
 def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
-    """A new process that runs `target`, and ends when this one does. Ctrl-C is for the one who started it, not for it.
+    """Start a process that runs `target`, and ends when this one does. Ctrl-C is for the parent, not for it.
 
     A terminal sends Ctrl-C to all of its processes. One that is still importing would say so with a traceback, long
     before `target` could look away; so it is born with the signal blocked, which no import undoes.
@@ -25,7 +25,7 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
 
 @contextmanager
 def reraise_ctrl_c() -> Iterator[None]:
-    """A Ctrl-C that somebody in here swallows is raised at the end.
+    """Raise at the end a Ctrl-C that something within swallows.
 
     Some packages catch everything while they are imported, and Python itself while it collects garbage.
     """
@@ -49,7 +49,7 @@ def reraise_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _defer_ctrl_c() -> Iterator[None]:
-    """A Ctrl-C that comes now is heard at the end; whoever is started now never hears of one.
+    """Defer a Ctrl-C to the end; a process that is started within never hears of one.
 
     The signal's mask is inherited by who is started. It does not keep Python from interrupting the main thread where
     another thread gets the signal, which would leave somebody half started, so the handler waits too.

@@ -1,4 +1,4 @@
-"""How much a solve may cost, and the meter that is asked before every evaluation."""
+"""Budget of a solve, and the meter that is asked before every evaluation."""
 
 import math
 import time
@@ -15,9 +15,9 @@ class Budget:
     evaluations: int | None = None
     """Evaluations of the energy, with or without gradient; a batch counts every candidate in it."""
     seconds: float | None = None
-    """Wall clock from the making of the meter, seconds."""
+    """Time from the making of the meter, seconds."""
     least: int = 0
-    """Evaluations that are allowed however late it is; of those that `evaluations` allows."""
+    """Number of evaluations allowed however late it is, within `evaluations`."""
 
     def __post_init__(self):
         for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds), ("least", self.least)):
@@ -25,7 +25,7 @@ class Budget:
                 raise RequestError(f"a budget's {name} must be 0 or more (or None for no limit), got {limit}")
 
     def within(self, seconds: float) -> "Budget":
-        """This budget, ending after so many seconds at the latest; infinity leaves it as it is."""
+        """Return this budget, ending after so many seconds at the latest; infinity leaves it as it is."""
         return replace(self, seconds=seconds if self.seconds is None else min(self.seconds, seconds))
 
 

@@ -1,10 +1,10 @@
-"""Limited-memory BFGS for a batch of independent problems (Nocedal and Wright, chapter 7).
+"""Limited-memory BFGS for a batch of independent problems (Nocedal and Wright 2006, chapter 7).
 
-Every problem is a coroutine of its own: it yields a point and is sent the energy and gradient there. The
-driver stacks the points, evaluates the batch once and hands the rows out. Problems so share evaluations and
-nothing else: a problem walks the same path, to the bit, whoever it is stacked with. Vectors live on the CPU
-in double precision (they are small beside an evaluation); points are rounded to the caller's precision, so
-that steps are differences of evaluated points.
+Every problem is a coroutine of its own: it yields a point and is sent the energy and gradient there. The driver stacks
+the points, evaluates the batch once and hands the rows out. Problems so share evaluations and nothing else: a problem
+walks the same path, to the bit, whatever it is stacked with. Vectors live on the CPU in double precision (they are
+small beside an evaluation); points are rounded to the caller's precision, so that steps are differences of evaluated
+points.
 """
 
 import math
@@ -44,15 +44,15 @@ class LbfgsSettings:
     """How the search goes and when it ends."""
 
     memory: int = 10
-    """Curvature pairs kept."""
+    """Number of curvature pairs kept."""
     max_iterations: int = 100
-    """Accepted steps; beyond them a problem is out of budget."""
+    """Largest number of accepted steps; beyond them a problem is out of budget."""
     gradient_tolerance: float = 1e-3
-    """Converged where no entry of the gradient is larger; energy per unit of the unknowns."""
+    """Gradient tolerance: converged where no entry is larger, energy per unit of the unknowns."""
     relative_energy_tolerance: float = 1e-6
-    """Converged where a step wins less than this share of max(|energy|, 1)."""
+    """Energy tolerance: converged where a step wins less than this share of max(|energy|, 1)."""
     armijo: float = 1e-4
-    """Share of the slope's promise that a step must keep."""
+    """Share of the slope's predicted decrease that a step must keep."""
     curvature: float = 0.9
     """Share of the starting slope that may be left at a step's end; between `armijo` and 1."""
     initial_step: float | None = None
@@ -60,7 +60,7 @@ class LbfgsSettings:
     max_step: float = math.inf
     """Longest step, Euclidean, unit of the unknowns."""
     max_trials: int = 12
-    """Trial steps in one line search."""
+    """Largest number of trial steps in one line search."""
 
     def __post_init__(self):
         if self.memory < 1 or self.max_iterations < 0 or self.max_trials < 1:
@@ -73,22 +73,22 @@ class LbfgsSettings:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsResult:
-    """The best finite point of each problem; the start where nothing finite was seen."""
+    """The best finite point of each problem; the start where nothing was finite."""
 
     x: Float[Tensor, "batch n"]
-    """Never worse than the start."""
+    """Best points (batch, n), never worse than the start."""
     energy: Float[Tensor, " batch"]
-    """There; infinity where no evaluation was finite, or none was allowed."""
+    """Energies at x; infinity where no evaluation was finite, or none was allowed."""
     start_energy: Float[Tensor, " batch"]
-    """At the start; infinity where it was not finite, or not evaluated."""
+    """Energies at the start; infinity where it was not finite, or not evaluated."""
     gradient_norm: Float[Tensor, " batch"]
     """Largest absolute entry of the gradient at x."""
     evaluations: Int[Tensor, " batch"]
-    """Made while the problem was running; the meter also counts the idle rows of finished problems."""
+    """Evaluations while the problem was running; the meter also counts the idle rows of finished problems."""
     iterations: Int[Tensor, " batch"]
-    """Accepted steps."""
+    """Number of accepted steps."""
     status: tuple[LbfgsStatus, ...]
-    """Why each problem ended."""
+    """Reason why each problem ended."""
 
 
 def minimise(
@@ -165,7 +165,7 @@ class _EvaluatedPoint:
 
 
 Search = Generator[Point, tuple[float, Vector]]
-"""Yields points, is sent energy and gradient."""
+"""Search of one problem: it yields points, and is sent energy and gradient."""
 
 
 class _Problem:
@@ -182,7 +182,7 @@ class _Problem:
         self.ask = next(self._search)
 
     def tell(self, energy: float, gradient: Vector):
-        """The evaluation of `ask`; of no interest to a finished problem."""
+        """Take the evaluation of `ask`; a finished problem ignores it."""
         if not self.running:
             return
         self.evaluations += 1
@@ -244,7 +244,7 @@ class _CurvaturePairs:
             self._pairs.append((step, change, product))
 
     def apply(self, gradient: Vector) -> Vector:
-        """Inverse Hessian times gradient: the two-loop recursion (Nocedal and Wright, algorithm 7.4)."""
+        """Apply the inverse Hessian to the gradient: two-loop recursion (Nocedal and Wright 2006, algorithm 7.4)."""
         result = gradient.copy()
         weights: list[float] = []
         for step, change, product in reversed(self._pairs):
@@ -258,7 +258,7 @@ class _CurvaturePairs:
 
 
 def _descent_direction(here: _EvaluatedPoint, pairs: _CurvaturePairs, length: float) -> tuple[Vector, float]:
-    """A descent direction and the first step along it; without a model, one of the given length."""
+    """Return a descent direction and the first step along it; without a model, one of the given length."""
     if pairs:
         direction = -pairs.apply(here.gradient)
         if -math.inf < direction @ here.gradient < 0:
@@ -270,7 +270,8 @@ def _descent_direction(here: _EvaluatedPoint, pairs: _CurvaturePairs, length: fl
 def _line_search(
     origin: _EvaluatedPoint, direction: Vector, first: float, settings: LbfgsSettings
 ) -> Generator[Point, tuple[float, Vector], _EvaluatedPoint | None]:
-    """A point with enough decrease and enough curvature for a pair (weak Wolfe); None where no trial gains.
+    """Find a point with enough decrease and enough curvature for a pair (weak Wolfe); None where no trial gains.
+
 
     `low` is the best step so far that decreases enough, `high` the shortest known to be too long.
     """
@@ -298,7 +299,7 @@ def _line_search(
 
 
 def _next_step(low: _EvaluatedPoint, high: _EvaluatedPoint | None) -> float:
-    """Within the bracket by cubic interpolation, kept off its ends; beyond `low` if none is too long."""
+    """Choose a step within the bracket by cubic interpolation, kept off its ends; beyond `low` if none is too long."""
     if high is None:
         return 4.0 * low.step
     width = high.step - low.step
@@ -308,7 +309,8 @@ def _next_step(low: _EvaluatedPoint, high: _EvaluatedPoint | None) -> float:
 
 
 def _cubic_minimum(a: _EvaluatedPoint, b: _EvaluatedPoint) -> float:
-    """Minimum, from a, of the cubic with the energies and slopes of both (Nocedal and Wright, 3.59)."""
+    """Return the minimum, from a, of the cubic with the energies and slopes of both (Nocedal and Wright 2006, Eq.
+    3.59)."""
     width = b.step - a.step
     bend = a.slope + b.slope - 3.0 * (b.energy - a.energy) / width
     square = bend * bend - a.slope * b.slope

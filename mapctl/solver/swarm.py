@@ -1,9 +1,9 @@
-"""Particle swarm (Kennedy and Eberhart 1995; rnn paper, section 5.2) by pyswarms, and a baseline of draws.
+"""Particle swarm (Kennedy and Eberhart 1995; Wang et al. 2019, section 5.2) by pyswarms, and a baseline of samples.
 
-pyswarms' own optimisers keep every iterate, draw first velocities from [0, 1] whatever the unit, and cannot
-stop at a budget; so its swarm, topologies and update rules are used, and the loop is here. Two more habits
-are contained: it sets up the process's logging (and a report.log in the working folder) at import and at
-every object made, and it draws from numpy's global random state.
+pyswarms' own optimisers keep every iterate, draw first velocities from [0, 1] whatever the unit, and cannot stop at a
+budget; so its swarm, topologies and update rules are used, and the loop is here. Two more habits are contained: it sets
+up the process's logging (and a report.log in the working folder) at import and at every object made, and it draws from
+numpy's global random state.
 """
 
 import logging.config
@@ -30,20 +30,20 @@ Bounds = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class SwarmSettings:
-    """Size and habits of a swarm; the default weights are the constriction of Clerc and Kennedy (2002)."""
+    """Size and weights of a swarm; the default weights are the constriction of Clerc and Kennedy 2002."""
 
     particles: int = 16
-    """Points evaluated at once; fewer where the budget has fewer left."""
+    """Number of points evaluated at once; fewer where the budget has fewer left."""
     iterations: int = 6
-    """Evaluations of the whole swarm."""
+    """Number of evaluations of the whole swarm."""
     inertia: float = 0.7298
     """Share of its velocity a particle keeps."""
     cognitive: float = 1.4962
     """Pull toward the particle's own best point."""
     social: float = 1.4962
-    """Pull toward the best point it knows of."""
+    """Pull toward the best point among its neighbours."""
     neighbours: int | None = None
-    """How many nearest particles it knows of, itself among them; None: all."""
+    """Number of nearest particles that share their best point, itself among them; None: all."""
 
     def __post_init__(self):
         if self.particles < 1 or self.iterations < 1:
@@ -59,11 +59,11 @@ class SwarmResult:
     """The best point found."""
 
     x: Float[Tensor, " n"]
-    """Never worse than the start."""
+    """Best point (n,), never worse than the start."""
     energy: float
-    """There; infinity where nothing finite was seen, or no evaluation was allowed (then x is the start)."""
+    """Energy at x; infinity where nothing finite was seen, or no evaluation was allowed (then x is the start)."""
     evaluations: int
-    """Points evaluated."""
+    """Number of points evaluated."""
     history: tuple[float, ...]
     """Best energy so far after every evaluation of the swarm."""
 
@@ -78,11 +78,11 @@ def run_swarm(
     meter: Meter | None = None,
     generator: torch.Generator,
 ) -> SwarmResult:
-    """Search from `start`, which is the first particle; the others begin at draws around it, all at rest.
+    """Search from `start`, which is the first particle; the others begin at samples around it, all at rest.
 
-    `spread` is the standard deviation of the draws, in units of the unknowns. The swarm stops before an
-    iteration that the meter cannot pay in full. The same generator state gives the same bits.
-    Raises RequestError where the start is no vector or out of bounds, or the cost answers in another shape.
+    `spread` is the standard deviation of the samples, in units of the unknowns. The swarm stops before an iteration
+    that the meter cannot pay in full. The same generator state gives the same bits. Raises RequestError where the start
+    is no vector or out of bounds, or the cost answers in another shape.
     """
     meter = Meter() if meter is None else meter
     track = _BestTracker(cost, start, meter)
@@ -112,7 +112,7 @@ def run_best_of_samples(
     meter: Meter | None = None,
     generator: torch.Generator,
 ) -> SwarmResult:
-    """The best of `count` points, evaluated at once: the start and draws around it; fewer on a short budget.
+    """Find the best of `count` points, evaluated at once: the start and samples around it; fewer on a short budget.
 
     Arguments and errors as in `swarm`, which it is held against.
     """
@@ -136,7 +136,7 @@ class _BestTracker:
         self._history: list[float] = []
 
     def evaluate(self, points: Float[Tensor, "particles n"]) -> np.ndarray | None:
-        """Energies, infinite where they are not finite; None where the budget does not pay for them."""
+        """Evaluate energies, infinite where they are not finite; None where the budget does not pay for them."""
         if not self._meter.take(len(points)):
             return None
         energies = self._cost(points.clone()).detach()
@@ -151,7 +151,7 @@ class _BestTracker:
         return _to_numpy(energies)
 
     def result(self) -> SwarmResult:
-        """So far."""
+        """Return the result so far."""
         return SwarmResult(self._x, self._energy, self._evaluations, tuple(self._history))
 
 
@@ -191,7 +191,7 @@ class _ParticleSwarm:
         )
 
     def move(self):
-        """New velocities and positions."""
+        """Move the particles; return new velocities and positions."""
         with _use_numpy_state(self._random):
             self._swarm.velocity = self._topology.compute_velocity(
                 self._swarm, None, self._velocity_handler, self._bounds
@@ -202,7 +202,7 @@ class _ParticleSwarm:
 def _sample_points(
     start: Tensor, spread: Tensor | float, bounds: Bounds | None, count: float, generator: torch.Generator
 ) -> Float[Tensor, "count n"]:
-    """The start and normal draws around it, inside the bounds."""
+    """Return the start and normal samples around it, inside the bounds."""
     if start.ndim != 1 or not start.is_floating_point():
         raise RequestError(f"a swarm starts from a vector of real numbers, got {tuple(start.shape)} {start.dtype}")
     noise = torch.randn(int(count), len(start), dtype=start.dtype, device=generator.device, generator=generator)
@@ -225,7 +225,7 @@ _LOGGING_LOCK = threading.Lock()
 
 @contextmanager
 def _suppress_logging_config() -> Generator[None, None, None]:
-    """While pyswarms is imported or its objects are made, what it configures is not applied."""
+    """Suppress what pyswarms configures while it is imported or its objects are made."""
     with _LOGGING_LOCK:
         configure = logging.config.dictConfig
         logging.config.dictConfig = lambda config: None
@@ -237,7 +237,7 @@ def _suppress_logging_config() -> Generator[None, None, None]:
 
 @contextmanager
 def _use_numpy_state(random: np.random.RandomState) -> Generator[None, None, None]:
-    """numpy's global draws come from `random` and move it on; afterwards the global state is as it was."""
+    """Use `random` for numpy's global draws within, and move it on; afterwards the global state is as it was."""
     before = np.random.get_state()
     np.random.set_state(random.get_state())
     try:

@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.skeleton import TOE_REST_HEIGHT
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import TOE_REST_HEIGHT, TOES
 from mapctl.terms.trial import Trial
 
 
@@ -39,7 +38,7 @@ class Clearance:
         return self._height_deficit(trial).amax(-1)
 
     def _height_deficit(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        toes = [trial.skeleton.index(name) for name in TOES]
+        toes = trial.skeleton.indices(TOES)
         speeds = torch.stack([torch.sqrt(trial.step(toe)[..., ::2].square().sum(-1) + 1e-12) for toe in toes], dim=-1)
         wanted = self.height * (speeds * trial.fps / self.speed).clamp(max=1)
         if self.share is not None:

@@ -6,11 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.skeleton import TOE_REST_HEIGHT
+from mapctl.skeleton import TOE_REST_HEIGHT, TOES
 from mapctl.terms.trial import Trial
-
-TOES = ("leftToes", "rightToes")
-"""The joints that the two contact bits speak of."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +38,7 @@ class FootContact:
         return (self._planted(trial) * self._speeds(trial)).amax(-1)
 
     def _toes(self, trial: Trial) -> list[int]:
-        return [trial.skeleton.index(name) for name in TOES]
+        return trial.skeleton.indices(TOES)
 
     def _speeds(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
         steps = torch.stack([trial.step(toe)[..., ::2] for toe in self._toes(trial)], dim=-2)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import TOES
 from mapctl.terms.trial import Trial
 
 TouchDown = tuple[int, int, int, int]
@@ -40,9 +40,9 @@ class StepLength:
         missed = torch.zeros_like(trial.features[..., 0])
         if not (touches := _find_touch_downs(trial)):
             return missed
-        toes = trial.joints_world[..., [trial.skeleton.index(name) for name in TOES], ::2]
+        toes = trial.joints_world[..., trial.skeleton.indices(TOES), ::2]
         if len(trial.before):
-            feet = trial.before[-1, [trial.skeleton.index(name) for name in TOES], ::2].to(toes.dtype)
+            feet = trial.before[-1, trial.skeleton.indices(TOES), ::2].to(toes.dtype)
             toes = torch.cat([feet.expand(len(toes), 1, 2, 2), toes], dim=1)
         shift = int(len(trial.before) > 0)
         clip, frame, foot, stood = torch.tensor(touches).T

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.contacts import support_speed
-from mapctl.skeleton import TOE_REST_HEIGHT
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import TOE_REST_HEIGHT, TOES
 from mapctl.terms.trial import Trial
 
 
@@ -35,6 +34,6 @@ class Support:
         return self._speed(trial)
 
     def _speed(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        toes = [trial.skeleton.index(name) for name in TOES]
+        toes = trial.skeleton.indices(TOES)
         steps = torch.stack([torch.sqrt(trial.step(toe)[..., ::2].square().sum(-1) + 1e-12) for toe in toes], dim=-1)
         return support_speed(trial.joints_world[..., toes, 1] - self.rest_height, steps * trial.fps)

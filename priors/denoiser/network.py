@@ -1,8 +1,9 @@
 """The denoiser: a network that proposes, for a noisy capture, the motion behind it and its contacts.
 
-An amortised posterior: trained on pairs of clean and spoilt motion, it gives in one pass what the sliding-window MAP
-then makes exact. Dilated residual convolutions over time, on what was seen, a smoothed version of it, what was not
-seen, and the noise's sigmas. Where noise is nil what was seen is returned: the change fades with the sigma.
+An amortised posterior: trained on pairs of clean and corrupted motion, it gives in one pass what the sliding-window MAP
+then makes exact. Dilated residual convolutions over time, on observed values, a smoothed version of them, the
+observation mask, and the noise's sigmas. Without noise the observed values are returned: the change fades with the
+sigma.
 """
 
 from dataclasses import dataclass, replace
@@ -28,7 +29,7 @@ _OUTPUT_CHANNELS = _ANGLE_CHANNELS + 1 + 3 + 2
 
 _SMOOTHING_SIGMA, _REFERENCE_SIGMA = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
 _NEGLIGIBLE_SIGMA, _NEGLIGIBLE_SIGMA_ROOT = 0.0044, 0.001  # radians and metres: noise that is as often true motion
-# One unit of what is seen and of what is changed, about their spread: radians, metres, metres a frame.
+# One unit of inputs and of outputs, about their standard deviation: radians, metres, metres a frame.
 _ANGLE_UNIT, _POSITION_UNIT, _VELOCITY_UNIT = 0.3, 0.02, 0.05
 _HIPS_HEIGHT = 0.85  # metres: height of the canonical skeleton's hips while it walks
 _CHUNK_FRAMES, _MARGIN_FRAMES = 512, 64  # frames cleaned at once, and beside them
@@ -39,11 +40,11 @@ class DenoiserConfig(NetworkConfig):
     """Shape of the network."""
 
     width: int = 192
-    """Channels."""
+    """Channels of the hidden layers."""
     kernel: int = 5
     """Frames that one convolution sees."""
     dilations: tuple[int, ...] = (1, 2, 4, 8, 1, 2, 4, 8)
-    """Of each residual block."""
+    """Dilation of each residual block, frames."""
 
     def __post_init__(self):
         if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
@@ -51,10 +52,10 @@ class DenoiserConfig(NetworkConfig):
 
 
 class DenoiserNetwork(nn.Module):
-    """A capture in, a proposal out. Untrained, it smooths."""
+    """Capture in, proposal out; untrained, it smooths."""
 
     def __init__(self, config: DenoiserConfig, *, bfloat16: bool = False):
-        """With `bfloat16` the convolutions compute in it; what they are given and give back does not."""
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
         self.config, self.reduced_precision = config, bfloat16
         self.first = nn.Conv1d(_INPUT_CHANNELS, config.width, config.kernel, padding=config.kernel // 2)
@@ -66,7 +67,7 @@ class DenoiserNetwork(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, capture: Capture) -> CaptureProposal:
-        """The proposal; frames that were not seen at all included."""
+        """Propose a motion, frames that were not observed at all included."""
         view = _CaptureView(capture)
         inputs = view.inputs().transpose(1, 2)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
@@ -78,7 +79,7 @@ class DenoiserNetwork(nn.Module):
 
 
 class _ResidualBlock(nn.Module):
-    """Normalise over channels, see neighbouring frames, mix; added to what came in."""
+    """Normalise over channels, convolve neighbouring frames, mix; added to the input."""
 
     def __init__(self, width: int, kernel: int, dilation: int):
         super().__init__()
@@ -94,12 +95,12 @@ class _ResidualBlock(nn.Module):
 
 
 class _CaptureView:
-    """A capture as the network sees it: in the slow frame of the hips, where place and heading do not matter."""
+    """A capture as the network's input: in the slow frame of the hips, where position and heading do not matter."""
 
     def __init__(self, capture: Capture):
         self.capture = capture
         sigma, sigma_root = capture.sigma, capture.sigma_root[:, None]
-        # The share of a sight that noise explains; of what was not seen, all of it.
+        # The share of an observation that noise explains; 1 for what was not observed.
         noise = (sigma.square() / (sigma.square() + _NEGLIGIBLE_SIGMA**2))[:, None]
         self.noise_share = torch.where(capture.seen, noise, 1.0)
         root = (sigma_root.square() / (sigma_root.square() + _NEGLIGIBLE_SIGMA_ROOT**2))[:, None]
@@ -121,13 +122,13 @@ class _CaptureView:
         self.slow_heading = _smooth(capture.heading[..., None], _REFERENCE_SIGMA)[..., 0]
         self.slow_root = _smooth(root, _REFERENCE_SIGMA)
         self.turn = (capture.heading - self.slow_heading)[..., None]
-        self.off = _rotate_about_y(root - self.slow_root, -self.slow_heading)
+        self.off = rotations.rotate_about_y(root - self.slow_root, -self.slow_heading)
 
     def inputs(self) -> Float[Tensor, "batch frames inputs"]:
-        """Everything in units of about one."""
+        """Encode the capture in units of about one."""
         capture = self.capture
         rate = _difference_frames(self.slow_heading[..., None])
-        way = _rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)
+        way = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)
         level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
         known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
         return torch.cat(
@@ -148,7 +149,7 @@ class _CaptureView:
         )
 
     def changed(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
-        """What was seen, smoothed and changed as far as it is in doubt."""
+        """Apply a change to the smoothed observation, as far as noise or gaps allow one."""
         angles, turn, off, contacts = change.split([_ANGLE_CHANNELS, 1, 3, 2], dim=-1)
         angles = self.angles + self.angle_noise_share * (
             _smooth(self.angles, _SMOOTHING_SIGMA) - self.angles + _ANGLE_UNIT * angles
@@ -157,7 +158,7 @@ class _CaptureView:
             _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + _ANGLE_UNIT * turn
         )
         off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + _POSITION_UNIT * off)
-        root = self.slow_root + _rotate_about_y(off, self.slow_heading)
+        root = self.slow_root + rotations.rotate_about_y(off, self.slow_heading)
         packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
         return CaptureProposal(BodyPose.unpack(packed), contacts)
 
@@ -167,14 +168,8 @@ def _difference_frames(values: Float[Tensor, "batch frames width"]) -> Float[Ten
     return torch.diff(values, dim=1, prepend=values[:, :1])
 
 
-def _rotate_about_y(vector: Float[Tensor, "batch frames 3"], angle: Float[Tensor, "batch frames"]) -> Tensor:
-    """Vectors turned about +Y."""
-    ground = rotations.rotate_ground(vector[..., ::2], angle)
-    return torch.stack([ground[..., 0], vector[..., 1], ground[..., 1]], dim=-1)
-
-
 def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[Tensor, "batch frames width"]:
-    """Gaussian along the frames, its weights adding up to one at the ends too."""
+    """Smooth by a Gaussian along the frames, its weights summing to one at the ends too."""
     weight = gaussian.averaging_matrix(values.shape[1], sigma, values.dtype, values.device)
     return torch.einsum("ts,bsw->btw", weight, values)
 
@@ -184,14 +179,14 @@ class ConvDenoiser:
     """A trained denoiser (see mapctl.protocols.Denoiser)."""
 
     name: str
-    """How it was asked for."""
+    """Name under which it was loaded."""
     network: DenoiserNetwork
-    """Weights."""
+    """Network with its weights."""
     card: checkpoints.Card
-    """What they are."""
+    """Card of the weights."""
 
     def clean(self, capture: Capture) -> CaptureProposal:
-        """The proposal for a capture of any length, piece by piece, each with a margin that it shares."""
+        """Propose the motion of a capture of any length, piece by piece, each with a margin that it shares."""
         pieces = []
         for start in range(0, capture.frames, _CHUNK_FRAMES):
             first, stop = max(0, start - _MARGIN_FRAMES), min(capture.frames, start + _CHUNK_FRAMES + _MARGIN_FRAMES)
@@ -206,7 +201,7 @@ class ConvDenoiser:
 
 
 def load(name: str) -> ConvDenoiser:
-    """The bundled denoiser by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
         network = DenoiserNetwork(DenoiserConfig.of_card(card.config))
         network.load_state_dict(tensors)

@@ -1,9 +1,9 @@
-"""Networks that fill position images: the paper's, its baselines, and ours.
+"""Networks that fill position images: those of Kaufmann et al. 2020, its baselines, and ours.
 
-All are given an image as rows over time, and give the rows of the whole motion. The paper's (infilling paper, section
-3.2) treats them as a picture, with filters over rows and frames, and makes the motion anew. Ours has the same five
-encoding and five decoding units, but its filters run over time alone and see all rows at once; it is told what is
-known, keeps that, changes straight lines in the gaps, and passes details across by skips.
+All are given an image as rows over time, and give the rows of the whole motion. That of Kaufmann et al. 2020, section
+3.2, treats them as a picture, with filters over rows and frames, and makes the motion anew. Ours has the same five
+encoding and five decoding units, but its filters run over time alone and see all rows at once; it is given the mask of
+known joints, keeps these, changes linear interpolation in the gaps, and passes details across by skips.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ class TemporalUNet(nn.Module):
         _initialise_zero(self.last)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch outputs frames"]:
-        """Changes of the rows, in their own units; nothing before training."""
+        """Return changes of the rows, in their own units; 0 before training."""
         hidden, kept = self.first(rows), []
         for level, unit in enumerate(self.down):
             hidden = unit(hidden)
@@ -51,7 +51,7 @@ class TemporalUNet(nn.Module):
 
 
 class _ResidualUnit(nn.Module):
-    """Two convolutions over time, added to what came in."""
+    """Two convolutions over time, added to the input."""
 
     def __init__(self, width: int, kernel: int):
         super().__init__()
@@ -67,9 +67,8 @@ class _ResidualUnit(nn.Module):
 
 
 class ImageAutoencoder(nn.Module):
-    """The paper's: 3x3 filters over rows and frames, pooling, strided de-convolutions; or its vanilla baseline, with a
-    single strided convolution in each unit.
-    """
+    """The autoencoder of Kaufmann et al. 2020: 3x3 filters over rows and frames, pooling, strided de-convolutions; or
+    its vanilla baseline, with a single strided convolution in each unit."""
 
     def __init__(self, widths: tuple[int, ...], *, vanilla: bool):
         super().__init__()
@@ -93,7 +92,7 @@ class ImageAutoencoder(nn.Module):
         _initialise_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
-        """The rows anew."""
+        """Return the rows anew."""
         hidden, sizes = rows[:, None], []
         for level, layer in enumerate(self.down):
             sizes.append(hidden.shape[-2:])
@@ -110,7 +109,7 @@ class ImageAutoencoder(nn.Module):
 
 
 class HoldenManifold(nn.Module):
-    """One layer over time, as Holden et al. 2016 learn their motion manifold (the paper's second baseline)."""
+    """One layer over time, the motion manifold of Holden et al. 2016 (second baseline of Kaufmann et al. 2020)."""
 
     def __init__(self, rows: int, width: int = 256, kernel: int = 25):
         super().__init__()
@@ -119,19 +118,19 @@ class HoldenManifold(nn.Module):
         _initialise_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
-        """The rows anew."""
+        """Return the rows anew."""
         hidden = max_pool1d(relu(self.encode(rows)), 2, ceil_mode=True)
         return self.decode(hidden.repeat_interleave(2, dim=-1)[..., : rows.shape[-1]])
 
 
 def _initialise_zero(layer: nn.Module) -> None:
-    """Its output is nothing, until training."""
+    """Initialise a layer so that its output is 0 until training."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
 
 
 def _initialise_glorot(network: nn.Module) -> None:
-    """Glorot and Bengio's weights, no biases (section 3.3)."""
+    """Initialise weights as Glorot and Bengio 2010, biases 0 (Kaufmann et al. 2020, section 3.3)."""
     for parameter in network.parameters():
         if parameter.dim() > 1:
             nn.init.xavier_uniform_(parameter)
@@ -140,7 +139,8 @@ def _initialise_glorot(network: nn.Module) -> None:
 
 
 PAPER_WIDTHS = (32, 64, 128, 256, 256)
-"""Channels of the paper's units, so that a sample of 240 frames becomes its 3 x 8 x 256 (section 3.2)."""
+"""Channels of each unit, so that a sample of 240 frames becomes its 3 x 8 x 256 (Kaufmann et al. 2020, section
+3.2)."""
 
 AUTOENCODERS: dict[str, Callable[[int], nn.Module]] = {
     "image": lambda rows: ImageAutoencoder(PAPER_WIDTHS, vanilla=False),

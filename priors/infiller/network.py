@@ -1,4 +1,4 @@
-"""The infiller: a convolutional network that proposes the frames and joints that a motion lacks (infilling paper)."""
+"""The infiller: a convolutional network that proposes missing frames and joints of a motion (Kaufmann et al. 2020)."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from priors.infiller.architectures import AUTOENCODERS, Architecture, TemporalUN
 _JOINTS = CANONICAL.num_joints
 _POSITION_ROWS, _REFERENCE_ROWS, _CONTACT_ROWS = 3 * _JOINTS, 3, 2
 IMAGE_ROWS = _POSITION_ROWS + _REFERENCE_ROWS + _CONTACT_ROWS
-"""Of an image: joint positions, the reference's velocities, contacts."""
+"""Rows of an image: joint positions, the reference's velocities, contacts."""
 _MASK_ROWS = _JOINTS + 1 + 2  # known, present, frames since and until any joint is known
 _VELOCITY_UNIT, _HEADING_UNIT = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
 _MAX_FRAMES_SINCE = 60  # frames beyond which it is all one how far a known frame is
@@ -29,11 +29,11 @@ class InfillerConfig(NetworkConfig):
     """Shape of the network."""
 
     architecture: Architecture = "skips"
-    """`skips` is ours, `image` the paper's, `vanilla` and `manifold` its baselines."""
+    """Architecture: `skips` is ours, `image` that of Kaufmann et al. 2020, `vanilla` and `manifold` its baselines."""
     widths: tuple[int, ...] = (128, 160, 192, 256, 256)
     """Channels of the units of `skips`; the others' are fixed."""
     kernel: int = 3
-    """Frames that a convolution of `skips` sees."""
+    """Width of a convolution of `skips`, frames."""
 
     def __post_init__(self):
         if self.architecture != "skips" and self.architecture not in AUTOENCODERS:
@@ -50,7 +50,7 @@ class InfillerNetwork(nn.Module):
     std: Tensor
 
     def __init__(self, config: InfillerConfig, *, bfloat16: bool = False):
-        """With `bfloat16` the convolutions compute in it; what they are given and give back does not."""
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
         self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean", torch.zeros(_JOINTS, 3))
@@ -64,7 +64,8 @@ class InfillerNetwork(nn.Module):
             self.net = AUTOENCODERS[config.architecture](IMAGE_ROWS)
 
     def forward(self, image: PositionImage) -> ProposedPositions:
-        """Ours keeps known places to the bit; an autoencoder makes all of them anew (section 4.2)."""
+        """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (Kaufmann et al. 2020,
+        section 4.2)."""
         shown = torch.where(image.ever_known[:, None, :, None], image.places, self.mean)
         rows = self._rows(image, shown)
         rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
@@ -79,7 +80,7 @@ class InfillerNetwork(nn.Module):
         return ProposedPositions(torch.where(image.known[..., None], image.places, shown + change), contacts)
 
     def _rows(self, image: PositionImage, shown: Tensor) -> Float[Tensor, "batch frames rows"]:
-        """Of about unit size; an autoencoder's unknown places are 0, their mean (section 3.3)."""
+        """Encode the image in about unit size; an autoencoder's unknown positions are 0, their mean (section 3.3)."""
         places = (shown - self.mean) / self.std
         if not self.keeps_observed:
             places = places * image.known[..., None]
@@ -91,14 +92,14 @@ class InfillerNetwork(nn.Module):
 
 
 def _encode_masks(image: PositionImage) -> Float[Tensor, "batch frames told"]:
-    """What is known, and how long ago and how soon anything is."""
+    """Encode which joints are known, and how many frames ago and ahead any is."""
     some = image.known.any(dim=-1)
     far = torch.stack([_count_frames_since(some), _count_frames_since(some.flip(1)).flip(1)], dim=-1)
     return torch.cat([image.known.to(far), image.present[..., None].to(far), far], dim=-1)
 
 
 def _count_frames_since(known: Tensor) -> Float[Tensor, "batch frames"]:
-    """Frames since a known one, as a share of those that matter; 1 where there was none."""
+    """Count frames since a known one, as a share of those that matter; 1 where there was none."""
     frame = torch.arange(known.shape[1], device=known.device)
     last = torch.where(known, frame, -_MAX_FRAMES_SINCE).cummax(dim=1).values
     return (frame - last).clamp(max=_MAX_FRAMES_SINCE) / _MAX_FRAMES_SINCE
@@ -109,15 +110,15 @@ class ConvInfiller:
     """A trained infiller (see mapctl.protocols.Inbetweener)."""
 
     name: str
-    """How it was asked for."""
+    """Name under which it was loaded."""
     network: InfillerNetwork
-    """In evaluation mode."""
+    """Network in evaluation mode."""
     card: checkpoints.Card
-    """What it was trained on."""
+    """Card of the weights."""
 
     @torch.no_grad()
     def propose(self, image: PositionImage) -> ProposedPositions:
-        """The whole motion, of any length: what the network makes of it and of its mirror image, on average."""
+        """Propose the whole motion, of any length: the mean of the outputs for it and for its mirror image."""
         one, other = self.network(image), self.network(image.mirrored())
         places = (one.places + mirror_positions(other.places)) / 2
         contacts = (one.contacts + other.contacts.flip(-1)) / 2
@@ -127,7 +128,7 @@ class ConvInfiller:
 
 
 def load(name: str = "infiller") -> ConvInfiller:
-    """The bundled infiller, or a trained one by its file or run folder; CheckpointError for anything else."""
+    """Load the bundled infiller, or a trained one by its file or run folder; CheckpointError for anything else."""
     with checkpoints.open_checkpoint(name, "infiller") as (tensors, card):
         network = InfillerNetwork(InfillerConfig.of_card(card.config))
         network.load_state_dict(tensors)

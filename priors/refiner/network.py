@@ -1,4 +1,5 @@
-"""The adversarial refiner: a residual LSTM that makes sampled motion look captured (rnn paper, section 4.2, Eq. 11).
+"""The adversarial refiner: a residual LSTM that makes sampled motion look captured (Wang et al. 2019, section 4.2, Eq.
+11).
 
 State and end effectors through a layer, an LSTM and a layer give what is added to the state. Two departures: the first
 layer also sees some frames ahead, since tremble cannot be told from motion without what follows; and the residual is
@@ -34,7 +35,7 @@ END_EFFECTORS = (
     "rightFoot",
     "rightToes",
 )
-"""Of the refiner and its critic: the paper's ends of the limbs, and knees, elbows and hips, which tremble too."""
+"""End effectors of the refiner and its critic: the limbs' ends of Wang et al. 2019, and joints that tremble too."""
 
 _CONTACT_LOGIT = 3.0  # log odds that a bit of the input is worth; the network may overrule it
 _CHUNK_FRAMES = 600  # frames refined at once
@@ -45,15 +46,15 @@ class RefinerConfig(NetworkConfig):
     """Shape of the network."""
 
     width: int = 256
-    """Units of the first layer (the paper's 500)."""
+    """Units of the first layer (Wang et al. 2019: 500)."""
     memory: int = 256
-    """Units of the LSTM (the paper's 1000)."""
+    """Units of the LSTM (Wang et al. 2019: 1000)."""
     lookahead: int = 4
-    """Frames ahead, and behind, that the first layer sees; 0 is the paper's."""
+    """Frames ahead, and behind, that the first layer sees; Wang et al. 2019: 0."""
     limit: float = 2.0
     """Bound of what is added, standard deviations of each feature."""
     joints: tuple[str, ...] = END_EFFECTORS
-    """End effectors that are seen."""
+    """Names of the joints whose positions and velocities are inputs."""
 
     def __post_init__(self):
         if min(self.width, self.memory) < 1 or self.lookahead < 0 or not self.limit > 0:
@@ -71,8 +72,8 @@ class RefinerNetwork(nn.Module):
     reach_std: Tensor
 
     def __init__(self, config: RefinerConfig, *, mean: Tensor, std: Tensor, reach_mean: Tensor, reach_std: Tensor):
-        """Statistics of the features (size,) and of `compute_end_effectors` (channels,); RuntimeError for other
-        widths."""
+        """Take statistics of the features (size,) and of `compute_end_effectors` (channels,); RuntimeError for other
+        widths. widths."""
         super().__init__()
         self.config = config
         reach = count_channels(config.joints)
@@ -98,7 +99,8 @@ class RefinerNetwork(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch given size"], memory: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Float[Tensor, "batch refined size"], tuple[Tensor, Tensor]]:
-        """Refined frames [lookahead + 1, given - lookahead), contact bits as probabilities, and the LSTM's memory."""
+        """Return refined frames [lookahead + 1, given - lookahead), contact bits as probabilities, and the LSTM's
+        memory."""
         reach = (compute_end_effectors(features, self.config.joints) - self.reach_mean) / self.reach_std
         seen = torch.cat([((features - self.mean) / self.std)[:, 1:], reach], dim=-1)
         hidden, after = self.lstm(torch.relu(self.first(seen.transpose(1, 2))).transpose(1, 2), memory)
@@ -115,14 +117,14 @@ class LstmRefiner(Refiner):
     """A trained refiner."""
 
     name: str
-    """How it was asked for."""
+    """Name under which it was loaded."""
     network: RefinerNetwork
-    """Weights."""
+    """Network with its weights."""
     card: checkpoints.Card
-    """What they are."""
+    """Card of the weights."""
 
     def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
-        """Consecutive pieces refined, `lookahead` frames behind their input, in memory that does not grow.
+        """Refine consecutive pieces, `lookahead` frames behind their input, in memory that does not grow.
 
         At both ends the motion is taken to go on as its outermost frame does.
         """
@@ -151,7 +153,7 @@ def _pad_ends(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterator[
 
 
 def load(name: str) -> LstmRefiner:
-    """A bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    """Load a bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "refiner") as (tensors, card):
         statistics = {part: tensors[part] for part in ("mean", "std", "reach_mean", "reach_std")}
         network = RefinerNetwork(RefinerConfig.of_card(card.config), **statistics)

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl import rotations
 from mapctl.features import PRIOR_FPS, GroundPose, ground_speed, integrate_root
 from mapctl.protocols import DataLimits, InitialStates
 from priors.lstm_gmm.network import LstmGmm, LstmState
@@ -47,7 +48,7 @@ def measure_data_limits(corpus: Corpus) -> DataLimits:
         velocity = ground[_SECOND:] - ground[:-_SECOND]  # metres in one second
         pace = velocity.norm(dim=-1)
         direction = torch.atan2(velocity[:, 0], velocity[:, 1])
-        turn = torch.remainder(direction[_SECOND:] - direction[:-_SECOND] + torch.pi, 2 * torch.pi) - torch.pi
+        turn = rotations.wrap_angle(direction[_SECOND:] - direction[:-_SECOND])
         speeds.append(pace)
         turns.append(turn.abs()[pace[_SECOND:] > 0.5])
     speeds, turns = torch.cat(speeds), torch.cat(turns)

@@ -11,10 +11,9 @@ from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.pose import BodyPose
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.corpus import Corpus, number_clip_folders
 
-_TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
 _CHUNK_FRAMES = 50_000  # frames
 
 
@@ -43,7 +42,7 @@ class Window:
             self.contacts,
             known=known,
             present=self.present,
-            toes=_TOES,
+            toes=TOE_JOINTS,
         )
 
 
@@ -95,8 +94,7 @@ class PositionWindows:
         local = torch.where(mirrored[:, None, None, None], local[:, :, self.mirror_joints], local) * flip[:, :, None]
         contacts = torch.where(mirrored[:, None, None], contacts.flip(-1), contacts)
         heading, ground = heading * side, ground * flip[..., ::2]
-        turned = rotations.rotate_ground(local[..., ::2], heading[..., None]) + ground[:, :, None]
-        places = torch.stack([turned[..., 0], local[..., 1], turned[..., 1]], dim=-1)
+        places = rotations.rotate_about_y(local, heading[..., None]) + rotations.lift_ground(ground)[:, :, None]
         quats = self.quats[index]
         over = quats[:, :, self.mirror_joints] * quats.new_tensor([1.0, -1.0, -1.0, 1.0])
         quats = torch.where(mirrored[:, None, None, None], over, quats)

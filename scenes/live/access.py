@@ -1,4 +1,4 @@
-"""Who may speak to the live viewer's server, and what becomes of those who speak nonsense.
+"""Access to the live viewer's server, and reports of what browsers send that cannot be understood.
 
 A browser lets every page that it shows, from anywhere, connect to a WebSocket on this machine; it only says where that
 page came from, in `Origin`. So the server has to look. `Host` tells a page of another name that was made to resolve to
@@ -26,7 +26,7 @@ _RequestHandler = Callable[[Any, Request], Response | None]
 
 
 def is_own_page(headers: Headers, port: int) -> bool:
-    """Whether a request is from a page of this server.
+    """Return whether a request is from a page of this server.
 
     It names this server as its host; it says no other origin; and it says this one if it wants a WebSocket, which
     browsers always do.
@@ -42,7 +42,7 @@ def is_own_page(headers: Headers, port: int) -> bool:
 
 @contextmanager
 def restrict_to_own_pages() -> Iterator[None]:
-    """A viser server that is made in here refuses all but its own pages, with status 403.
+    """Make a viser server that is started within refuse all but its own pages, with status 403.
 
     viser has no place to say so: it gives websockets neither `origins` nor a `process_request` of ours. What it calls
     is therefore replaced for as long as its server starts.
@@ -73,7 +73,7 @@ def _guard_request(answer: _RequestHandler, port: int) -> _RequestHandler:
 
 
 class ServerErrorReporter:
-    """What goes wrong within the server, over what a browser sent or while it went away, told in a line each.
+    """Reports one line for each error within the server, over what a browser sent or while it went away.
 
     asyncio and websockets would print tracebacks. Each message is a task and each browser a connection of its own, so
     nothing else ends with it.
@@ -104,6 +104,6 @@ class ServerErrorReporter:
 
 
 def format_error(error: object) -> str:
-    """An exception's kind and text, without line ends; 200 characters at most."""
+    """Format an exception's kind and text without line ends; 200 characters at most."""
     kind = f"{type(error).__name__}: " if isinstance(error, BaseException) else ""
     return f"{kind}{' '.join(str(error).split())}"[:200].rstrip(": ")

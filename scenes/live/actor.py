@@ -1,4 +1,4 @@
-"""One character on the stage: who moves it, what is shown of it, and what of it is kept."""
+"""One character on the stage: its mover, what is shown of it, and its recording."""
 
 from collections import deque
 
@@ -21,7 +21,7 @@ class LiveActor:
     def __init__(
         self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, orders: SteeringInputs
     ):
-        """`number` counts from 0; its nodes hang below the node `world`."""
+        """Set up character `number`, from 0, with its nodes below the node `world`."""
         self.name = f"character {number + 1}"
         self.character, self.orders, self.first = character, orders, orders
         self.pace = RealtimeMonitor()
@@ -35,11 +35,11 @@ class LiveActor:
         self._waiting: deque[tuple[float, FrameChunk, int]] = deque()
 
     def command(self) -> None:
-        """Tell the character its orders."""
+        """Send the character its orders."""
         self.character.command(self.orders.command)
 
     def reset(self) -> None:
-        """Begin anew with the first orders; a recording goes on."""
+        """Restart with the first orders; a recording goes on."""
         self._waiting.clear()
         self.orders, self.gone = self.first, ""
         self.pace.forget()

@@ -78,7 +78,7 @@ class LiveApp:
         return f"http://{HOST}:{self.server.get_port()}"
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Until `stop()` says so or Ctrl-C."""
+        """Run until `stop()` is true or Ctrl-C."""
         for tick in range(2**62):
             if stop():
                 return
@@ -216,11 +216,11 @@ class LiveApp:
         return self._members[self._chosen]
 
     def _enqueue(self, action: Callable[[], None]) -> None:
-        """Browsers speak on a thread of their own; what they ask for waits for the loop."""
+        """Enqueue what a browser asks for on its own thread, for the loop."""
         self._todo.put(action)
 
     def _run_safely(self, action: Callable[[], None]) -> None:
-        """Whatever goes wrong here is said, and is no reason not to go on."""
+        """Run an action; report whatever goes wrong, and go on."""
         try:
             action()
         except Exception as error:
@@ -260,7 +260,7 @@ class LiveApp:
                 self._gauges.add(delivered, PRIOR_FPS)
 
     def _run_housekeeping(self, now: float) -> None:
-        """What need not be done every time."""
+        """Do what need not be done every time."""
         self._gauges.show()
         self._notices.expire_refusal(now)
         if self._typed_at is not None and now - self._typed_at > _TYPING_SECONDS:
@@ -280,7 +280,7 @@ class LiveApp:
             self._notices.console(said or f"{member.name} keeps up again")
 
     def _draw_at(self, ray_origin: Any, ray_direction: Any) -> None:
-        """A point of the path where somebody clicked, a ray of two times three numbers if the browser is well."""
+        """Add a point to the path where somebody clicked: a ray of two times three numbers if the browser is well."""
 
         def added() -> None:
             ray = ground.parse_ray(ray_origin, ray_direction)
@@ -304,7 +304,8 @@ class LiveApp:
             self._notices.event("Nothing saved", format_error(error))
 
     def _send(self, made: RecordedFile, client: viser.ClientHandle | None) -> None:
-        """To the browser that asked; to all others if it is gone; to the current folder if nobody is left."""
+        """Send the file to the browser that asked; to all others if it is gone; to the current folder if nobody is
+        left."""
         others = self.server.get_clients()
         if client is None or client.client_id not in others:
             if not others:
@@ -316,7 +317,7 @@ class LiveApp:
 
 
 def _set_up_stage(server: viser.ViserServer) -> None:
-    """Up, theme and camera."""
+    """Set up axis, theme and camera."""
     server.scene.set_up_direction("+y")
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
     server.initial_camera.position = (2.2, 1.9, 4.2)

@@ -19,14 +19,14 @@ _DEFAULT_STEP_LENGTH = 0.65  # metres, where measured steps begin
 
 @runtime_checkable
 class ViewerActions(Protocol):
-    """What the panel can ask for."""
+    """Requests that the panel can make."""
 
     def order(self, **changes: Any) -> None:
         """Change the chosen character's orders, and show them; it leaves its path."""
         ...
 
     def typed(self, **changes: Any) -> None:
-        """The same from a control, which already shows it and may still be typed into."""
+        """Change orders from a control, which already shows them and may still be typed into."""
         ...
 
     def nudge(self, **by: float) -> None:
@@ -34,7 +34,7 @@ class ViewerActions(Protocol):
         ...
 
     def choose(self, character: int) -> None:
-        """Whose orders are shown and changed from now on."""
+        """Choose the character whose orders are shown and changed from now on."""
         ...
 
     def toggle_pause(self) -> None:
@@ -42,11 +42,11 @@ class ViewerActions(Protocol):
         ...
 
     def reset(self) -> None:
-        """Everybody begins anew."""
+        """Restart all characters."""
         ...
 
     def walk_path(self) -> None:
-        """The chosen character walks the drawn path."""
+        """Let the chosen character walk the drawn path."""
         ...
 
     def clear_path(self) -> None:
@@ -64,7 +64,7 @@ class ControlPanel:
     def __init__(
         self, gui: viser.GuiApi, deck: ViewerActions, *, characters: int, bounds: InputLimits, below: Callable[[], None]
     ):
-        """`below` adds what is shown below the controls that steer."""
+        """Build the controls; `below` adds what is shown below those that steer."""
         self._deck = deck
         self._who = None
         if characters > 1:

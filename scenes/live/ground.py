@@ -1,4 +1,4 @@
-"""What lies on the ground of the live viewer: grid, drawn path, planted feet, and the forecast of the next second."""
+"""Marks on the ground of the live viewer: grid, drawn path, planted feet, and the forecast of the next second."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -11,7 +11,7 @@ from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import TOES, Skeleton
 
 _PATH_HEIGHT, _MARK_HEIGHT = 0.012, 0.008  # metres over the ground, so that neither flickers
 _FIGURE_SHARES = (0.5, 1.0)  # shares of the forecast at which it is shown as a stick figure
@@ -21,7 +21,7 @@ _MAX_SHOWN_POINTS, _MAX_DRAWN_POINTS = 1500, 200  # points of a path as it is sh
 
 
 def add_grid(scene: viser.SceneApi, name: str) -> None:
-    """Squares of a metre, every fifth line stronger, as far as the eye goes."""
+    """Add squares of a metre, every fifth line stronger, as far as the eye goes."""
     scene.add_grid(
         name,
         plane="xz",
@@ -41,7 +41,7 @@ class GroundMarks:
 
     def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton):
         self._scene, self._name, self._parents = scene, name, skeleton.parents
-        self._toes = [skeleton.names.index(side) for side in ("leftToes", "rightToes")]
+        self._toes = skeleton.indices(TOES)
         vertices, faces = _build_disc()
         self._feet = [
             scene.add_mesh_simple(
@@ -58,14 +58,14 @@ class GroundMarks:
         ]
 
     def planted(self, joints: Array, contacts: Array) -> None:
-        """A disc below each toe (of joints (joints, 3)) whose contact (2,) is 1."""
+        """Show a disc below each toe (of joints (joints, 3)) whose contact (2,) is 1."""
         for foot, toe, contact in zip(self._feet, self._toes, contacts, strict=True):
             foot.visible = bool(contact > 0.5)
             if foot.visible:
                 foot.position = (joints[toe, 0], _MARK_HEIGHT, joints[toe, 2])
 
     def forecast(self, joints: Array) -> None:
-        """The hips' way over the ground and two stick figures of (frames, joints, 3)."""
+        """Show the hips' trajectory over the ground and two stick figures of (frames, joints, 3)."""
         if len(joints) < 2:
             return
         way = joints[:, 0] * np.array([1.0, 0.0, 1.0]) + np.array([0.0, _PATH_HEIGHT, 0.0])
@@ -85,14 +85,14 @@ class DrawnPath:
         self._shown: list[viser.SceneNodeHandle] = []
 
     def add(self, x: float, z: float) -> None:
-        """One more point, metres. RequestError where there are very many."""
+        """Add one more point, metres. RequestError where there are very many."""
         if len(self.points) >= _MAX_DRAWN_POINTS:
             raise RequestError(f"a drawn path has at most {_MAX_DRAWN_POINTS} points")
         self.points.append((x, z))
         self._redraw()
 
     def clear(self) -> None:
-        """No points."""
+        """Remove all points."""
         self.points.clear()
         self._redraw()
 
@@ -115,7 +115,7 @@ class DrawnPath:
 
 
 def parse_ray(origin: Any, direction: Any) -> Array:
-    """(2, 3) of what a browser says; RequestError where that is no ray near the stage."""
+    """Parse a ray (2, 3) from a browser; RequestError where it is none near the stage."""
     with suppress(TypeError, ValueError):
         ray = np.array([origin, direction], dtype=np.float64)
         if ray.shape == (2, 3) and np.isfinite(ray).all() and np.abs(ray).max() <= _MAX_COORDINATE:
@@ -124,7 +124,7 @@ def parse_ray(origin: Any, direction: Any) -> Array:
 
 
 def intersect_ground(origin: Array, direction: Array) -> tuple[float, float] | None:
-    """x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m."""
+    """Return the x and z where a ray (two of (3,)) meets y = 0; None where it does not, or beyond 100 m."""
     if direction[1] > -1e-3:
         return None
     far = -origin[1] / direction[1]

@@ -1,4 +1,4 @@
-"""What a character is told, and what it can be told: numbers and words of a page are checked here as they arrive."""
+"""Orders of a character and their limits: numbers and words of a page are checked here as they arrive."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,29 +8,29 @@ from typing import Any
 from mapctl.intent.steering import STEP_LENGTHS, Command
 
 UNCONDITIONED = "any"
-"""The choice that tells a prior nothing."""
+"""The choice that gives a prior no label."""
 _NUMBER_FIELDS = ("speed", "heading", "facing", "step_length")
 _WORDS_AND_UNITS = {"speed": ("speed", "m/s"), "step_length": ("step length", "m")}
 
 
 @dataclass(frozen=True)
 class SteeringInputs:
-    """What one character is to do, as the panel shows it."""
+    """Orders of one character, as the panel shows them."""
 
     speed: float = 1.2
-    """m/s."""
+    """Speed, m/s."""
     heading: float = 0.0
-    """Degrees; 0 is +Z, 90 is +X."""
+    """Direction of travel, degrees; 0 is +Z, 90 is +X."""
     facing: float | None = None
-    """Degrees; None faces where it goes."""
+    """Facing, degrees; None faces where it goes."""
     step_length: float | None = None
-    """Metres; None steps as the prior does."""
+    """Step length, metres; None leaves it to the prior."""
     told: Mapping[str, str] = field(default_factory=dict)
-    """By group of labels (gait, style) the one that is told."""
+    """Chosen label by group (gait, style)."""
 
     @property
     def command(self) -> Command:
-        """The same for a LiveCharacter."""
+        """Command for a LiveCharacter."""
         facing = None if self.facing is None else math.radians(self.facing)
         return Command(
             self.speed, math.radians(self.heading), facing, step_length=self.step_length, told=tuple(self.told.values())
@@ -39,29 +39,29 @@ class SteeringInputs:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A sentence for whoever asked for what cannot be."""
+    """A note for whoever asked for what cannot be done."""
 
     name: str
-    """Of the order."""
+    """Name of the order."""
     held: Any
-    """What holds instead."""
+    """Value that holds instead."""
     text: str
-    """With what is allowed."""
+    """Sentence with what is allowed."""
 
 
 @dataclass(frozen=True)
 class InputLimits:
-    """What can be asked of a prior."""
+    """Limits of what can be asked of a prior."""
 
     fastest: float
-    """m/s."""
+    """Fastest speed, m/s."""
     labels: Mapping[str, Sequence[str]]
-    """That it knows, by group."""
+    """Labels that the prior knows, by group."""
     steps: tuple[float, float] = STEP_LENGTHS
-    """Shortest and longest, metres."""
+    """Shortest and longest step, metres."""
 
     def changed(self, orders: SteeringInputs, changes: Mapping[str, Any]) -> tuple[SteeringInputs, list[Refusal]]:
-        """The orders after changes by name, each brought to the nearest that can be; what is no number changes nothing.
+        """Change orders by name, each limited to what can be done; what is no number changes nothing.
 
         `told` names a label by group, AS_IT_LIKES none; groups that it does not name stay as they are.
         """
@@ -91,7 +91,7 @@ class InputLimits:
         return (0.0, self.fastest) if name == "speed" else self.steps
 
     def _explain_refusal(self, name: str, asked: Any, held: Any) -> str | None:
-        """The sentence, None where it holds as it was asked."""
+        """Return the refusal, None where the order holds as it was asked."""
         if name == "told":
             return next(
                 (

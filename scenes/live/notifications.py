@@ -1,4 +1,4 @@
-"""What the live viewer says in words: in the page, for as long as it is true or takes to read, and on the console."""
+"""Notes of the live viewer: in the page, for as long as they hold or take to read, and on the console."""
 
 import sys
 import time
@@ -19,7 +19,7 @@ class Notifications:
     """Lasting states on top of the panel, refusals below the controls, events as notes that pass."""
 
     def __init__(self, server: viser.ViserServer):
-        """Make it where the lasting states are to be shown; `below` puts the refusals."""
+        """Put lasting states here; `below` puts the refusals."""
         self._server = server
         self._top = server.gui.add_markdown("", visible=False)
         self._refusals: viser.GuiMarkdownHandle | None = None
@@ -28,11 +28,11 @@ class Notifications:
         self._said: dict[str, float] = {}
 
     def below(self) -> None:
-        """Refusals are shown here."""
+        """Show refusals here."""
         self._refusals = self._server.gui.add_markdown("", visible=False)
 
     def state(self, key: str, text: str | None) -> None:
-        """Something that holds until another text, or None, is given under its key."""
+        """Set a state that holds until another text, or None, is given under its key."""
         if text is None:
             self._states.pop(key, None)
         else:
@@ -40,15 +40,14 @@ class Notifications:
         _set_text(self._top, "\n\n".join(f"⚠️ {text}" for text in self._states.values()))
 
     def show_refusals(self, refusals: list[Refusal]) -> None:
-        """What was asked for and cannot be."""
+        """Show what was asked for and cannot be done."""
         if refusals:
             self._shown = refusals[-1], time.perf_counter()
             self._show_refusal("\n\n".join(refusal.text for refusal in refusals))
 
     def held(self, name: str, value: object) -> None:
-        """An order as it was asked: what was refused of it before is no longer of interest, unless this is what came of
-        it (a field that is left puts itself right).
-        """
+        """Forget an order's refusal once it holds as asked, unless it is what came of the refusal (a field that is left
+        puts itself right)."""
         if self._shown is not None and self._shown[0].name == name and self._shown[0].held != value:
             self._show_refusal("")
 
@@ -58,7 +57,7 @@ class Notifications:
             self._show_refusal("")
 
     def event(self, title: str, body: str, *, console: bool = True) -> None:
-        """Something that happened, in every browser; the same once in a while only."""
+        """Show an event in every browser; the same once in a while only."""
         if not self._is_new(f"{title} {body}"):
             return
         if console:
@@ -68,14 +67,14 @@ class Notifications:
                 client.add_notification(title, body, auto_close_seconds=_EVENT_SECONDS)
 
     def fault(self, error: BaseException) -> None:
-        """An error of the project's own, or of an input that nobody thought of; everything goes on."""
+        """Report an error of the project's own, or of an unforeseen input; everything goes on."""
         if isinstance(error, MapctlError):
             self.event("Not done", str(error))  # what was asked cannot be
         else:
             self.event("Something went wrong", format_error(error))
 
     def console(self, text: str) -> None:
-        """A line on standard error; the same once in a while only."""
+        """Print a line on standard error; the same once in a while only."""
         if self._is_new(text):
             self._print(text)
 

@@ -1,4 +1,4 @@
-"""What the live viewer tells in numbers: wanted and got, the ledger's terms as they change, and what a frame costs."""
+"""Numbers of the live viewer: target and actual speed, the ledger's terms as they change, and the cost of a frame."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Readouts:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: another character, or the same from its start."""
+        """Restart: another character, or the same from its start."""
         self._rows.clear()
         self._places.clear()
         self._last: FrameChunk | None = None
@@ -38,7 +38,7 @@ class Readouts:
         self.speed = 0.0
 
     def add(self, delivered: FrameChunk, fps: float) -> None:
-        """One more step."""
+        """Add one more step."""
         count = len(delivered.root)
         self.frames += count
         self.late += delivered.late_frames

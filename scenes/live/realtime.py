@@ -1,4 +1,4 @@
-"""Whether a character keeps up with the clock, told within a second."""
+"""Whether a character keeps up with the clock, judged within a second."""
 
 from collections import deque
 
@@ -18,7 +18,7 @@ _MIN_SHARE_FRAMES = 6  # frames of which a share is taken: two steps
 
 
 class RealtimeMonitor:
-    """What the last seconds brought of one character.
+    """Lateness of one character over the last seconds.
 
     It is too slow where half of the last second's frames came late, a fifth of the last five seconds', or none for most
     of a second; and keeps up again after two seconds without a late one.
@@ -29,17 +29,17 @@ class RealtimeMonitor:
         self.slow = False
 
     def forget(self) -> None:
-        """Begin anew: it was paused or reset, so what is missing is not late."""
+        """Restart: it was paused or reset, so what is missing is not late."""
         self._rows.clear()
 
     def add(self, now: float, delivered: FrameChunk) -> None:
-        """One more step, at a value of time.perf_counter."""
+        """Add one more step, at a value of time.perf_counter."""
         self._rows.append((now, delivered.seconds, len(delivered.root), delivered.late_frames, delivered.evaluations))
         while self._rows[-1][0] - self._rows[0][0] > _LONG_SECONDS:
             self._rows.popleft()
 
     def judge(self, now: float) -> bool:
-        """Whether it has begun or ceased to be too slow."""
+        """Judge whether it has begun or ceased to be too slow."""
         if not self._rows:
             return False
         quick, long = self._compute_late_share(now - _SHORT_SECONDS), self._compute_late_share(now - _LONG_SECONDS)
@@ -62,7 +62,7 @@ class RealtimeMonitor:
         return changed
 
     def text(self, now: float) -> str:
-        """How slow, for a person."""
+        """Describe how slow it is, for a person."""
         first, last = self._rows[0], self._rows[-1]
         if (silent := now - last[0]) > _SILENT_SECONDS:
             return f"no frame for {silent:.0f} s"
@@ -74,6 +74,6 @@ class RealtimeMonitor:
         return f"{slowly}{late}, {searched:.0f} evaluations a step"
 
     def _compute_late_share(self, since: float) -> float:
-        """Of late frames among those that came since then; 0 of very few."""
+        """Compute the share of late frames among those since then; 0 of very few."""
         frames = sum(row[2] for row in self._rows if row[0] > since)
         return sum(row[3] for row in self._rows if row[0] > since) / frames if frames >= _MIN_SHARE_FRAMES else 0.0

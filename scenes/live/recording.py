@@ -1,4 +1,4 @@
-"""What was shown, kept as a motion and given out as a file."""
+"""Recordings of the live viewer, kept as a motion and given out as a file."""
 
 import itertools
 import tempfile
@@ -22,17 +22,17 @@ FORMATS = ("bvh", "glb", "mp4")
 
 @dataclass
 class Recording:
-    """Frames of one character, from one moment on."""
+    """Frames of one character, from one time on."""
 
     skeleton: Skeleton
     pieces: list[Motion] = field(default_factory=list)
 
     def add(self, delivered: FrameChunk) -> None:
-        """Keep them."""
+        """Add delivered frames."""
         self.pieces.append(delivered.motion(self.skeleton))
 
     def motion(self) -> Motion:
-        """All of them; RequestError where there are none."""
+        """Join all frames to a motion; RequestError where there are none."""
         if not self.pieces:
             raise RequestError("nothing was recorded")
         root = torch.cat([piece.root_position for piece in self.pieces])
@@ -45,20 +45,20 @@ class RecordedFile:
     """A recording as a file."""
 
     ending: str
-    """Of FORMATS."""
+    """Ending of the file, one of FORMATS."""
     content: bytes
-    """All of it."""
+    """Content of the file."""
     fallback_reason: str = ""
-    """Why it is not of the ending that was asked for, if so."""
+    """Reason why the ending is not the one asked for, if so."""
 
     @property
     def name(self) -> str:
-        """That it is given out under."""
+        """Name under which the file is given out."""
         return f"mapctl.{self.ending}"
 
 
 def encode_with_fallback(motion: Motion, ending: str) -> RecordedFile:
-    """The content of a file of that ending, or of a BVH where none can be made, so that no recording is lost."""
+    """Encode a file of that ending, or a BVH where none can be made, so that no recording is lost."""
     try:
         return RecordedFile(ending, encode_motion(motion, ending))
     except Exception as error:
@@ -68,7 +68,7 @@ def encode_with_fallback(motion: Motion, ending: str) -> RecordedFile:
 
 
 def save_without_replacing(made: RecordedFile, folder: Path) -> Path:
-    """Write it into a folder, under a name that nobody has: mapctl.bvh, mapctl-2.bvh, ..."""
+    """Write the file into a folder, under a name that nobody has: mapctl.bvh, mapctl-2.bvh, ..."""
     for number in itertools.count(1):
         path = folder / (made.name if number == 1 else f"mapctl-{number}.{made.ending}")
         with suppress(FileExistsError), path.open("xb") as file:
@@ -78,7 +78,7 @@ def save_without_replacing(made: RecordedFile, folder: Path) -> Path:
 
 
 def encode_motion(motion: Motion, ending: str) -> bytes:
-    """The content of a file of one of FORMATS. A film is drawn in a process of its own, which takes a while."""
+    """Encode a file of one of FORMATS. A film is drawn in a process of its own, which takes a while."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"motion.{ending}"
         if ending != "mp4":

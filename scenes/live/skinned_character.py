@@ -14,7 +14,7 @@ class SkinnedCharacter:
     """The mannequin of a skeleton below a node of a scene."""
 
     def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton, colour: str):
-        """`colour` is the torso's."""
+        """Add the mannequin with a torso of this `colour`."""
         body, paths = build_skin(at_rest(skeleton), colour), []
         self._joints: list[viser.FrameHandle] = []
         for joint, parent in enumerate(skeleton.parents):
@@ -32,7 +32,7 @@ class SkinnedCharacter:
 
 
 def _extract_part(body: Skin, joint: int) -> trimesh.Trimesh | None:
-    """The triangles that hang on a joint, None if there are none."""
+    """Extract the triangles that hang on a joint, None if there are none."""
     faces = body.faces[body.joint[body.faces[:, 0]] == joint]
     if not len(faces):
         return None

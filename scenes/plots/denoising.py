@@ -1,4 +1,4 @@
-"""Pictures of denoising: angles and feet before and after (rnn paper, figures 10 and 11), and both side by side."""
+"""Pictures of denoising: angles and feet before and after (Wang et al. 2019, figures 10 and 11), and side by side."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +12,7 @@ from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import TOES
 from scenes.film import film
 
 _JOINTS = ("leftUpperArm", "rightLowerArm", "leftUpperLeg", "rightLowerLeg", "chest")
@@ -35,7 +36,7 @@ def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig 
         for motion, colour in ((before, _BEFORE), (after, _AFTER)):
             row.plot(seconds, _compute_joint_angle(motion, name), color=colour, linewidth=1)
         row.set_ylabel(f"{name}\ndegrees")
-    for side, name in enumerate(("leftToes", "rightToes")):
+    for side, name in enumerate(TOES):
         height, speed = rows[len(_JOINTS) + 2 * side], rows[len(_JOINTS) + 2 * side + 1]
         for motion, colour in ((before, _BEFORE), (after, _AFTER)):
             place = motion.joint_positions()[:, motion.skeleton.index(name)].numpy()
@@ -69,6 +70,6 @@ def film_side_by_side(
 
 
 def _compute_joint_angle(motion: Motion, name: str) -> np.ndarray:
-    """From the T-pose, degrees."""
+    """Compute the angle from the T-pose, degrees."""
     quats = motion.local_quat_xyzw[:, motion.skeleton.index(name)]
     return torch.rad2deg(rotations.to_rotation_vector(quats).norm(dim=-1)).numpy()

@@ -1,4 +1,4 @@
-"""A picture of steering: wanted and got speed and direction over time."""
+"""A picture of steering: target and actual speed and direction over time."""
 
 import math
 from os import PathLike

@@ -1,7 +1,7 @@
-"""Light on bodies, worked out at their vertices: the same in every renderer, and cheap where pixels are slow.
+"""Light on bodies, computed at their vertices: the same in every renderer, and cheap where pixels are slow.
 
-A soft key lamp with a wide highlight, light from the sky and a little back from the floor, and a thin
-bright rim that lifts a figure off the ground. All in linear light; sRGB in and out (gamma 2.2).
+A soft key lamp with a wide highlight, light from the sky and a little back from the floor, and a thin bright rim that
+lifts a figure off the ground. All in linear light; sRGB in and out (gamma 2.2).
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ _GAMMA = 2.2
 
 
 def shade(surface: Surface, eye: Array) -> Array:
-    """(n, 4) sRGB of a lit surface as seen from `eye` (3,); a flat one keeps its colours."""
+    """Return (n, 4) sRGB of a lit surface as seen from `eye` (3,); a flat one keeps its colours."""
     if surface.normals is None:
         return surface.rgba
     normals, to_eye = surface.normals, unit(eye - surface.vertices)

@@ -37,7 +37,7 @@ class OffscreenPainter:
         self._sheer = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, alphaMode="BLEND", doubleSided=True)
 
     def paint(self, view: View, content: Content) -> Array:
-        """The picture, (height, width, 3) uint8."""
+        """Paint the picture, (height, width, 3) uint8."""
         eye = view.pose[:3, 3]
         bodies = [figure.surface() for figure in content.figures]
         shadows = [build_shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
@@ -53,7 +53,7 @@ class OffscreenPainter:
         return picture
 
     def _build_mesh(self, surfaces: Sequence[Surface], material: object, eye: Array):
-        """All surfaces as one mesh: a draw call costs more than a body's triangles, and the order stays."""
+        """Build all surfaces as one mesh: a draw call costs more than a body's triangles, and the order stays."""
         surface = merge_surfaces(surfaces)
         primitive = self._gl.Primitive(
             positions=surface.vertices, indices=surface.faces, color_0=shade(surface, eye), material=material
@@ -63,7 +63,7 @@ class OffscreenPainter:
 
 @cache
 def _open_graphics() -> tuple[ModuleType, Any]:
-    """pyrender and its one renderer. Deleting one cuts off all others, so none is deleted and none added."""
+    """Open pyrender and its one renderer. Deleting one cuts off all others, so none is deleted and none added."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     if not hasattr(np, "infty"):
         setattr(np, "infty", np.inf)  # noqa: B010 - pyrender 0.1.45 asks numpy 2 for what it dropped
@@ -77,7 +77,7 @@ def _open_graphics() -> tuple[ModuleType, Any]:
 
 
 def _list_graphics_errors() -> tuple[type[Exception], ...]:
-    """What a missing library, driver or display raises somewhere between Python and EGL."""
+    """List what a missing library, driver or display raises somewhere between Python and EGL."""
     plain = (ImportError, OSError, AttributeError, AssertionError, ValueError, RuntimeError, TypeError)
     try:
         from OpenGL.error import Error

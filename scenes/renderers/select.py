@@ -1,4 +1,4 @@
-"""Which painter there is: shaded bodies where OpenGL works, stick figures where it does not."""
+"""Choice of a painter: shaded bodies where OpenGL works, stick figures where it does not."""
 
 import logging
 import os
@@ -18,10 +18,10 @@ _log = logging.getLogger("mapctl.scenes")
 
 
 def select_painter(name: RendererName | None = None) -> Painter:
-    """The painter of a name; None takes the one in MAPCTL_RENDERER, else `auto`.
+    """Select the painter of a name; None takes the one in MAPCTL_RENDERER, else `auto`.
 
-    `auto` falls back to stick figures and logs one line that says what is missing; `egl` raises
-    NoGraphicsError. RequestError for other names, and where not even matplotlib is installed.
+    `auto` falls back to stick figures and logs one line that says what is missing; `egl` raises NoGraphicsError.
+    RequestError for other names, and where not even matplotlib is installed.
     """
     wanted = name or os.environ.get(RENDERER_VARIABLE) or "auto"
     if wanted not in ("auto", "egl", "stick"):
@@ -38,7 +38,7 @@ def select_painter(name: RendererName | None = None) -> Painter:
 
 
 def back_end() -> str:
-    """One line for people: what films would be made with here, and why not better."""
+    """Describe in one line what films would be made with here, and why not better."""
     try:
         return select_painter("egl").name
     except NoGraphicsError as error:

@@ -14,7 +14,7 @@ _NEAR = 0.1
 """Nothing closer to the camera than this is drawn, metres."""
 _DPI = 100
 _THICKNESS = 1.3
-"""Of a stick, in radii of the body part; 2 would be as thick as the body."""
+"""Width of a stick, in radii of the body part; 2 would be as thick as the body."""
 _SHADOW_STRENGTH = 0.12
 
 
@@ -31,7 +31,7 @@ class StickPainter:
         self._canvas = FigureCanvasAgg(self._sheet)
 
     def paint(self, view: View, content: Content) -> Array:
-        """The picture, (height, width, 3) uint8."""
+        """Paint the picture, (height, width, 3) uint8."""
         self._sheet.clear()
         self._sheet.set_size_inches(view.width / _DPI, view.height / _DPI)
         axes = self._sheet.add_axes((0, 0, 1, 1))
@@ -59,7 +59,7 @@ def _draw_flat(axes, view: View, surface: Surface) -> None:
 
 
 def _draw_shadow(axes, view: View, figure: Figure) -> None:
-    """The sticks laid on the ground along the light."""
+    """Draw the sticks laid on the ground along the light."""
     ends, radii, _ = figure.body.sticks(figure.frame)
     fallen = ends - ends[..., 1:2] * (LIGHT / LIGHT[1])
     shade = np.tile([*colours.rgb(colours.SHADOW), _SHADOW_STRENGTH], (len(ends), 1))
@@ -72,7 +72,7 @@ def _draw_figure(axes, view: View, figure: Figure) -> None:
 
 
 def _draw_lines(axes, view: View, ends: Array, radii: Array, shown: Array) -> None:
-    """Lines (n, 2, 3) in the world as thick as the body there, the furthest first."""
+    """Draw lines (n, 2, 3) in the world as thick as the body there, the furthest first."""
     from matplotlib.collections import LineCollection
 
     flat = view.project(ends)

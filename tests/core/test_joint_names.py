@@ -9,11 +9,10 @@ from rig_maker import Make, make, names_of, person, versions_of
 
 from controllers.inbetweening.keyframes import effector_joint
 from mapctl.errors import MapctlError, RequestError
-from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.joint_names import Side, abbreviate_names, classify_joint, describe_nearest, find_joint, suggest_joints
 from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, resolve_joint_names
 from mapctl.retarget import canonical_joints, identify_rig, rigs
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 VERSIONS = [(rig.name, version) for rig in rigs.known_rigs() for version in range(versions_of(rig.name))]
 ENDS = [side + part for side in ("left", "right") for part in ("Hand", "Foot")]

@@ -76,6 +76,32 @@ def test_wrapped_angles_are_the_same_angle(angle):
     assert math.isclose(math.cos(wrapped - angle), 1, abs_tol=1e-9)
 
 
+@pytest.mark.parametrize("start", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0], [0.6, 0, 0.8], [0.36, 0.48, 0.8]])
+def test_the_shortest_arc_between_vectors_leads_there_even_to_the_opposite(start):
+    start = torch.nn.functional.normalize(torch.tensor(start).double(), dim=0)
+    for stop in (-start, start, start.roll(1), torch.nn.functional.normalize(-start + 1e-7 * start.roll(1), dim=0)):
+        arc = rotations.between_vectors(2 * start, 3 * stop)
+        torch.testing.assert_close(rotations.rotate(arc, start), stop, atol=1e-9, rtol=0)
+        angle = float(rotations.to_rotation_vector(arc).norm())
+        assert angle == pytest.approx(math.acos(max(-1.0, min(1.0, float(start @ stop)))), abs=1e-6)
+    nowhere = rotations.between_vectors(start.new_zeros(2, 3), start.expand(2, 3))
+    torch.testing.assert_close(nowhere, start.new_tensor([[0, 0, 0, 1.0]]).expand(2, 4))
+
+
+def test_rotating_about_y_is_the_quaternions_rotation_and_lifted_ground_has_no_height():
+    angles, vectors = torch.linspace(-4, 4, 5).double()[:, None], torch.arange(30.0).double().reshape(5, 2, 3)
+    expected = rotations.rotate(rotations.about_y(angles).expand(5, 2, 4), vectors)
+    torch.testing.assert_close(rotations.rotate_about_y(vectors, angles), expected)
+    assert rotations.lift_ground(torch.tensor([[1.0, 2.0]])).tolist() == [[1.0, 0.0, 2.0]]
+
+
+def test_numbers_and_arrays_are_wrapped_as_tensors_are():
+    angles = np.array([-7.0, -math.pi, 0.5, math.pi, 9.0])
+    wrapped = rotations.wrap_angle(torch.from_numpy(angles)).tolist()
+    assert rotations.wrap_angle(angles).tolist() == wrapped
+    assert [rotations.wrap_angle(float(angle)) for angle in angles] == wrapped
+
+
 def test_unwrapping_undoes_wrapping_of_slow_angles():
     slow = torch.linspace(-9, 14, 60, dtype=torch.float64).expand(2, -1)
     unwrapped = rotations.unwrap_angle(rotations.wrap_angle(slow))

@@ -8,9 +8,9 @@ from captures import apart_deg
 from helpers import generator, quat_xyzw, walk
 
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets, compute_target_errors, reach_effector_targets
+from mapctl.inbetweening.effector_targets import EffectorTargets, compute_target_errors, reach_effector_targets
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 JOINTS = CANONICAL.num_joints
 HAIR = 1e-4

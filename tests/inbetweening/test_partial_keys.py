@@ -12,11 +12,10 @@ from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.tween import tween
-from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.metrics import worst_frame
 from mapctl.retarget import to_canonical
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 ENDS = [CANONICAL.index(name) for name in LIMBS]
 HANDS = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}

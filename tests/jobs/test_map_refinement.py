@@ -21,13 +21,12 @@ from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.objective import Objective
 from mapctl.problem.pose_offsets import PoseOffsets
 from mapctl.recording import Capture
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, LatentPrior
-from mapctl.terms.foot_contact import TOES
 
-TOE = [CANONICAL.index(name) for name in TOES]
+TOE = CANONICAL.indices(TOES)
 QUICK = RefinementSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
 
 

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import LIMBS
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, LIMBS, Limb, Skeleton
 
 SKELETONS = {"canonical": CANONICAL, "bandai": bandai_skeleton(), "daz": cmu_skeleton()}
 
@@ -51,8 +50,8 @@ def test_twist_and_swing_of_a_walk_come_back_as_places(rig):
     assert torch.allclose(lengths(made), lengths(still), atol=1e-12)
 
 
-ARM = inverse.Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1))
-LEG = inverse.Limb(*(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1))
+ARM = Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1))
+LEG = Limb(*(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1))
 
 
 @settings(max_examples=10)

@@ -46,3 +46,9 @@ def test_beyond_the_ends_the_outermost_frame_goes_on(frames):
     found = gaussian.convolve(level, gaussian.kernel(2.0, 6), "repeated")
     torch.testing.assert_close(found, level)
     assert gaussian.convolve(level, gaussian.kernel(2.0, 6), "nothing").max() < 3
+
+
+def test_white_noise_smoothed_to_unit_variance_keeps_its_variance_in_every_frame():
+    matrix = gaussian.unit_variance_matrix(9, 2.0, torch.float64)
+    torch.testing.assert_close((matrix @ matrix.T).diagonal(), torch.ones(9).double())
+    assert float(matrix.diff(dim=0).abs().max()) < 0.3

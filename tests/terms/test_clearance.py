@@ -7,12 +7,11 @@ import torch
 from helpers import walking_trial
 
 from mapctl.features import LAYOUT
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOES
 from mapctl.terms import Clearance
-from mapctl.terms.foot_contact import TOES
 
 FRAMES = 20
-INDICES = [CANONICAL.index(name) for name in TOES]
+INDICES = CANONICAL.indices(TOES)
 
 
 @pytest.fixture

@@ -8,10 +8,9 @@ from mapctl.kinematics.whole_body import bend_limbs
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets
-from mapctl.skeleton import CANONICAL
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
-_TOES = [CANONICAL.index(name) for name in TOES]
+_TOES = list(TOE_JOINTS)
 _STANCE_FADE_SECONDS = 0.12  # over which a foot that swings leaves the correction of where it stood
 
 

@@ -19,14 +19,14 @@ from controllers.inbetweening.canonical_gap import CanonicalGap
 from controllers.inbetweening.proposers.answers import Proposal, Proposer
 from controllers.inbetweening.proposers.positions import propose_motion
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.kinematics import heading
 from mapctl.kinematics.whole_body import bend_limbs, reach_targets
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.protocols import Inbetweener
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 _MAX_ROOT_KEY_FRAMES = 5  # frames at the prior's rate: hips that are known for longer, a network goes along with
 _MIN_ROOT_UNCERTAINTY = 0.02  # metres by which somebody who stands may stand elsewhere

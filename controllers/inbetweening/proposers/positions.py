@@ -13,15 +13,13 @@ from controllers.inbetweening.geometry.seam_blending import blend_seams_in_posit
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.effector_targets import LIMBS, EffectorTargets
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.kinematics import heading, inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.protocols import Inbetweener
-from mapctl.skeleton import CANONICAL
-from mapctl.terms.foot_contact import TOES
+from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, Limb
 
-_TOES = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 _JITTER_SIGMA, _POWER_SIGMA = 0.8, 10  # frames at the prior's rate
 _MIN_CHANGE = 0.005  # metres
 _SWAY_SIGMA, _DRIFT_PASSES = 10, 4  # frames at the prior's rate: slower than a step
@@ -43,14 +41,14 @@ def propose_motion(
     if targets is not None:
         places = torch.where(targets.wanted[..., None], targets.places / gap.scale, places)
         known = known | targets.wanted
-    stands = contacts.detect_contacts(places[:, list(_TOES)], PRIOR_FPS).float()
+    stands = contacts.detect_contacts(places[:, list(TOE_JOINTS)], PRIOR_FPS).float()
     image = PositionImage.of_world(
         places.float()[None],
         heading(shown.local_quat_xyzw[:, 0]).float()[None],
         stands[None],
         known=known[None],
         present=torch.ones(1, len(places), dtype=torch.bool),
-        toes=_TOES,
+        toes=TOE_JOINTS,
     )
     answer = infiller.propose(image)
     wanted = image.to_world(_remove_jitter(answer.places, image))[0].double()
@@ -67,10 +65,10 @@ def propose_motion(
     bits = torch.where(
         _compute_toe_speeds(made) < _MIN_SWING_SPEED * gap.scale, answer.contacts[0], -_KNOWN_CONTACT_LOGIT
     )
-    return made, torch.where(image.known[0][:, list(_TOES)], _KNOWN_CONTACT_LOGIT * (2 * stands - 1), bits)
+    return made, torch.where(image.known[0][:, list(TOE_JOINTS)], _KNOWN_CONTACT_LOGIT * (2 * stands - 1), bits)
 
 
-def _select_limbs(lost: Bool[Tensor, "frames joints"]) -> list[inverse.Limb]:
+def _select_limbs(lost: Bool[Tensor, "frames joints"]) -> list[Limb]:
     """Arms and legs; how those bend that are known in no frame nothing tells but the proposal."""
     return [
         replace(limb, shown=not bool(lost[:, [limb.upper, limb.lower]].any(dim=1).all())) for limb in LIMBS.values()
@@ -99,5 +97,5 @@ def _estimate_root_drift(off: Float[Tensor, "frames 3"], lost: Bool[Tensor, " fr
 
 def _compute_toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
     """Over the ground, m/s."""
-    toes = motion.joint_positions()[:, list(_TOES)][..., ::2]
+    toes = motion.joint_positions()[:, list(TOE_JOINTS)][..., ::2]
     return torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)

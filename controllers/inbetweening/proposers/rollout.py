@@ -316,8 +316,7 @@ def _sample_smooth_noise(
 ) -> Float[Tensor, "frames continuous"]:
     """Noise that changes slowly."""
     white = torch.randn(frames, LAYOUT.continuous, generator=generator)
-    weight = gaussian.pairwise_weights(frames, settings.slow, white.dtype)
-    return settings.temperature * (weight / weight.square().sum(dim=-1, keepdim=True).sqrt()) @ white
+    return settings.temperature * gaussian.unit_variance_matrix(frames, settings.slow, white.dtype) @ white
 
 
 def _insert_rollout(

@@ -24,15 +24,14 @@ from mapctl.motion import Motion
 from mapctl.problem.warm_start import keep_warm_start
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Density
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms.foot_contact import TOES
 
 INFILLER = "infiller"
 STANDING_STILL = "standing still"
-_TOES = [CANONICAL.index(name) for name in TOES]
-_EFFECTORS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", *TOES)]
+_TOES = CANONICAL.indices(TOES)
+_EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
 _SKATE_HEIGHT = 0.025  # metres
 _STANDING_CONTACT_LOGIT = 4.0  # log odds of contacts of somebody who stands
 

@@ -76,7 +76,7 @@ def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: boo
 
 
 def _find_missing(asf: AsfSkeleton, lost: np.ndarray) -> MissingValues:
-    """By bone. Where all channels are lost, bones are that have none."""
+    """Find the missing values by bone; a bone without channels is missing where all channels are."""
     whole = lost.all(axis=1)
     turns = [lost[:, columns].any(axis=1) | whole for _, columns in _columns(asf, "r")]
     places = np.zeros((len(lost), len(turns)), dtype=bool)
@@ -85,7 +85,7 @@ def _find_missing(asf: AsfSkeleton, lost: np.ndarray) -> MissingValues:
 
 
 def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
-    """The skeleton's and the motion's file. FileFormatError names the candidates where the first is not clear.
+    """Find the skeleton's and the motion's file. FileFormatError names the candidates where the first is not clear.
 
     In `folder/subject.asf+take.amc` the take lies in the same folder unless it names one; `subject.asf+.amc` are two
     files of one stem.
@@ -110,7 +110,7 @@ def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
 
 
 def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, float]:
-    """Joints at the bones' starts, in metres, and how long the file's unit is."""
+    """Build joints at the bones' starts, in metres; also return the file's unit, metres."""
     parents = list(asf.parents)
     offsets = np.concatenate([np.zeros((1, 3)), asf.ends[parents[1:]]])
     leaves = [bone for bone in range(1, len(parents)) if bone not in set(parents)]
@@ -123,7 +123,7 @@ def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, float]:
 
 
 def _columns(asf: AsfSkeleton, kind: str) -> list[tuple[tuple[int, ...], list[int]]]:
-    """Of each bone the axes of its channels of a kind, `t` or `r`, in file order, and their columns."""
+    """Return by bone the axes of its channels of a kind, `t` or `r`, in file order, and their columns."""
     found, start = [], 0
     for channels in asf.channels:
         wanted = [(channel, start + place) for place, channel in enumerate(channels) if channel[0] == kind]
@@ -133,7 +133,7 @@ def _columns(asf: AsfSkeleton, kind: str) -> list[tuple[tuple[int, ...], list[in
 
 
 def _positions(asf: AsfSkeleton, values: np.ndarray) -> np.ndarray:
-    """(frames, 3) of the root, file unit."""
+    """Return root positions (frames, 3), file unit."""
     positions = np.zeros((len(values), 3))
     axes, columns = _columns(asf, "t")[0]
     positions[:, list(axes)] = values[:, columns]
@@ -141,7 +141,7 @@ def _positions(asf: AsfSkeleton, values: np.ndarray) -> np.ndarray:
 
 
 def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Float[Tensor, "frames joints 4"]:
-    """Local rotations C R inverse(C), continuous in sign over time."""
+    """Return the local rotations C R inverse(C), continuous in sign over time."""
     turns = np.empty((len(values), len(asf.names), 4))
     for bone, (axes, columns) in enumerate(_columns(asf, "r")):
         angles = values[:, columns[::-1]]

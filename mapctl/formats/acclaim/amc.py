@@ -65,16 +65,16 @@ class _Reader:
     fps: Fraction | None = None
     full: bool = False
     frames: int = 0
-    """Begun so far."""
+    """Number of frames begun so far."""
     number: int = 0
-    """Of the frame, as the file counts."""
+    """Number of the current frame, as the file counts."""
     line: int = 0
-    """Where the frame began."""
+    """Line at which the current frame began."""
     values: array = field(default_factory=lambda: array("d"))
     seen: set[int] = field(default_factory=set)
-    """Bones of the frame so far."""
+    """Bones of the current frame so far."""
     expected_bones: set[int] = field(default_factory=set)
-    """Bones of the first frame; of a full file those of all."""
+    """Bones of the first frame; in a fully specified file those of all."""
 
     def __post_init__(self):
         counts = [len(channels) for channels in self.skeleton.channels]

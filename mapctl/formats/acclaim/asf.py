@@ -44,7 +44,7 @@ class AsfSkeleton:
     channels: tuple[tuple[str, ...], ...]
     """What an AMC line holds of each bone, as `tx` or `rz`; empty for a bone that never turns."""
     root_position: np.ndarray
-    """(3,) added to the root's place in every frame."""
+    """(3,) added to the root's position in every frame, file unit."""
     length: float
     """`length` of :units: so many units to the inch; 1 says nothing."""
     degrees: bool
@@ -57,7 +57,7 @@ def read(path: str | PathLike[str]) -> AsfSkeleton:
 
 
 def rows(text: str) -> Iterator[Row]:
-    """The lines of ASF or AMC text that hold words, without comments; commas and brackets are blanks."""
+    """Return the lines of ASF or AMC text that hold words, without comments; commas and brackets are blanks."""
     for number, line in enumerate(text.split("\n"), start=1):
         if words := line.partition("#")[0].translate(_BLANKS).split():
             yield number, words
@@ -110,7 +110,7 @@ class _Reader:
         )
 
     def _sections(self, text: str) -> dict[str, list[Row]]:
-        """Rows by section; words behind a section's name, as in `:name body`, are its first row."""
+        """Return rows by section; words behind a section's name, as in `:name body`, are its first row."""
         found: dict[str, list[Row]] = {}
         current: list[Row] | None = None
         for line, words in rows(text):
@@ -143,7 +143,7 @@ class _Reader:
                 self.fail(f"expected mass, length or angle, got {shorten(words[0])}", line)
 
     def _root(self, section: Sequence[Row]) -> tuple[_Bone, np.ndarray]:
-        """The root, and where its pre-set position puts it."""
+        """Read the root and its pre-set position."""
         root = _Bone(section[0][0] if section else 0, "root")
         told: dict[str, tuple[int, list[str]]] = {}
         for line, words in section:
@@ -187,7 +187,7 @@ class _Reader:
             self.fail(f"the bone of line {bone.line} has no end", section[-1][0])
 
     def _take(self, bone: _Bone, key: str, words: list[str], line: int) -> None:
-        """One line of a bone."""
+        """Read one line of a bone."""
         if key == "name":
             if len(words) != 2:
                 self.fail(f"expected one name, got {shorten(' '.join(words[1:]))}", line)
@@ -218,7 +218,7 @@ class _Reader:
         return bone
 
     def _index(self, bones: Sequence[_Bone]) -> dict[str, int]:
-        """By name in lower case, as files are not strict about it."""
+        """Index bones by name in lower case, as files are not strict about it."""
         found: dict[str, int] = {}
         for number, bone in enumerate(bones):
             if bone.name.lower() in found:
@@ -229,7 +229,7 @@ class _Reader:
         return found
 
     def _tree(self, bones: Sequence[_Bone], index: dict[str, int], section: Sequence[Row]):
-        """Bones depth first in file order, and the parent of each; the same numbers as `bones`."""
+        """Sort bones depth first in file order; also return the parent of each. The numbers are those of `bones`."""
         parents, children = {}, {}
         for line, words in section:
             if words[0].lower() in ("begin", "end") and len(words) == 1:
@@ -276,12 +276,13 @@ class _Reader:
         return tuple(_AXES[letter] for letter in word.lower())
 
     def _fixed_axes_quat(self, angles: Sequence[float], axes: tuple[int, ...]) -> np.ndarray:
-        """Quaternion of three turns about fixed axes: `angles` are about x, y and z, `axes` says which comes first."""
+        """Return the quaternion of three rotations about fixed axes: `angles` about x, y and z in the order that `axes`
+        says."""
         radians = np.deg2rad(angles) if self.degrees else np.array(angles)
         return euler.to_quat_xyzw(radians[list(axes[::-1])], axes[::-1])
 
     def _numbers(self, words: list[str], line: int, count: int) -> list[float]:
-        """The words after the first as numbers."""
+        """Parse the words after the first as numbers."""
         values = [finite_number(word) for word in words[1:]]
         if len(values) != count or None in values:
             got = shorten(" ".join(words[1:]) or "nothing")
@@ -290,7 +291,7 @@ class _Reader:
 
 
 def _is_limit(word: str) -> bool:
-    """A further line of limits begins with a number, which may be infinite."""
+    """Return whether a line holds further limits: it begins with a number, which may be infinite."""
     try:
         float(word)
     except ValueError:

@@ -60,7 +60,7 @@ def _read(text: bvh_text.BvhText) -> tuple[Motion, MissingValues]:
 
 
 def _build_motion(layout: BvhLayout, values: np.ndarray) -> Motion:
-    """Of channels (frames, channels) in the layout's order and unit."""
+    """Build the motion of channels (frames, channels) in the layout's order and unit."""
     tree, scale = layout.hierarchy, layout.metres_per_unit
     travels, rest, moving = _classify_translations(tree, values)
     return Motion(
@@ -74,7 +74,7 @@ def _build_motion(layout: BvhLayout, values: np.ndarray) -> Motion:
 
 
 def _fill_missing(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
-    """The channels with numbers in place of NaN."""
+    """Fill in the channels that are NaN with numbers."""
     if not np.isnan(values).any():
         return values
     done = missing.hold_last(values)
@@ -85,7 +85,8 @@ def _fill_missing(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
 
 
 def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> MissingValues:
-    """By joint. Where all channels are lost, joints are that have none. One frame tells the place of a still joint."""
+    """Find the missing values by joint; a joint without channels is missing where all channels are. One known frame
+    tells the position of a joint that stays still."""
     whole = np.all(lost, axis=1)
     rotations = np.tile(whole[:, None], len(tree.names))
     places = np.zeros_like(rotations)
@@ -100,12 +101,12 @@ def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> M
 
 
 def unit_of(motion: Motion) -> float | None:
-    """Metres per unit of the file that a motion was read from; None where it came from none of BVH."""
+    """Return metres per unit of the BVH file that a motion was read from; None for other motions."""
     return motion.source.metres_per_unit if isinstance(motion.source, BvhLayout) else None
 
 
 def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
-    """The motion as its BVH file says it if a unit of it is so many metres; other motions as they are."""
+    """Return the motion as its BVH file has it if a unit is so many metres; other motions unchanged."""
     if not isinstance(motion.source, BvhLayout) or motion.source.metres_per_unit == metres_per_unit:
         return motion
     scale, old = metres_per_unit / motion.source.metres_per_unit, motion.skeleton
@@ -138,7 +139,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 def _translations(tree: Hierarchy, values: np.ndarray) -> dict[int, np.ndarray]:
-    """(frames, 3) in the file's unit of the root and of every joint with position channels."""
+    """Return translations (frames, 3), file unit, of the root and of every joint with position channels."""
     travels = {}
     for joint, columns in enumerate(tree.position_columns()):
         if columns or joint == 0:
@@ -148,8 +149,8 @@ def _translations(tree: Hierarchy, values: np.ndarray) -> dict[int, np.ndarray]:
 
 
 def _classify_translations(tree: Hierarchy, values: np.ndarray) -> tuple[dict[int, np.ndarray], np.ndarray, list[int]]:
-    """Translations as of `_translations`, rest offsets (joints, 3) in the file's unit, and which joints travel within
-    their parent.
+    """Return translations as `_translations` does, rest offsets (joints, 3) in the file's unit, and which joints travel
+    within their parent.
 
     A channel that repeats OFFSET up to rounding is taken as OFFSET, so that clips of one rig agree.
     """
@@ -177,7 +178,7 @@ def _build_skeleton(tree: Hierarchy, offsets: np.ndarray, scale: float) -> Skele
 
 
 def _quaternions(tree: Hierarchy, values: np.ndarray) -> Float[Tensor, "frames joints 4"]:
-    """Local rotations, continuous in sign over time; joints of one Euler order at once."""
+    """Return the local rotations, continuous in sign over time; joints of one Euler order at once."""
     quat_xyzw = np.empty((len(values), len(tree.names), 4))
     for axes, joints, columns in tree.rotation_groups():
         quat_xyzw[:, joints] = euler.to_quat_xyzw(np.deg2rad(values[:, columns]), axes)
@@ -185,7 +186,7 @@ def _quaternions(tree: Hierarchy, values: np.ndarray) -> Float[Tensor, "frames j
 
 
 def channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
-    """The motion block (frames, channels), file unit and degrees."""
+    """Return the motion block (frames, channels), file unit and degrees."""
     values = np.zeros((len(quat_xyzw), len(tree.labels())))
     for joint, columns in enumerate(tree.position_columns()):
         values[:, list(columns.values())] = translations[:, joint, list(columns)]
@@ -197,7 +198,7 @@ def channel_values(tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndar
 def _keep_source_values(
     layout: BvhLayout, tree: Hierarchy, translations: np.ndarray, quat_xyzw: np.ndarray
 ) -> np.ndarray:
-    """The motion block, with the numbers that were read where a joint still is as they say.
+    """Return the motion block, with the numbers that were read where a joint is unchanged.
 
     They are read again to compare: a motion's tensors may have been written into.
     """
@@ -229,7 +230,7 @@ def _keep_source_values(
 
 
 def all_translations(motion: Motion) -> np.ndarray:
-    """(frames, joints, 3) metres: each joint in its parent's frame, the root in the world."""
+    """Return translations (frames, joints, 3), metres: each joint in its parent's frame, the root in the world."""
     translations = np.tile(as_array(motion.skeleton.offsets), (motion.num_frames, 1, 1))
     translations[:, 0] = as_array(motion.root_position)
     for joint, track in motion.moving_offsets.items():
@@ -238,7 +239,7 @@ def all_translations(motion: Motion) -> np.ndarray:
 
 
 def check_finite(motion: Motion, path: str | PathLike[str]) -> None:
-    """RequestError, naming joint and frame, unless all positions and rotations can be written."""
+    """Raise RequestError, naming joint and frame, unless all positions and rotations can be written."""
     length = np.linalg.norm(as_array(motion.local_quat_xyzw), axis=-1)
     bad = ~np.isfinite(all_translations(motion)).all(-1) | ~(abs(length - 1) < 0.01)
     if bad.any():
@@ -248,5 +249,5 @@ def check_finite(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 def as_array(values: Tensor) -> np.ndarray:
-    """Of float64, wherever the tensor is."""
+    """Return a float64 array, wherever the tensor is."""
     return values.detach().cpu().double().numpy()

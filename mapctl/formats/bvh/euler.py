@@ -9,14 +9,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mapctl import rotations
+
 W = 3
-"""Place of the scalar in xyzw."""
+"""Index of the scalar in xyzw."""
 _GIMBAL = 1e-7
 """Below this length of a pair of quaternion parts its angle is noise; holding it costs at most 2e-7 rad."""
 
 
 def to_quat_xyzw(radians: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Angles (..., channels) about `axes` (0, 1, 2 for X, Y, Z), one each, as unit quaternions (..., 4)."""
+    """Convert angles (..., channels) about `axes` (0, 1, 2 for X, Y, Z), one each, to unit quaternions (..., 4)."""
     quat = np.zeros((*radians.shape[:-1], 4))
     quat[..., W] = 1.0
     for channel, i in enumerate(axes):
@@ -33,7 +35,7 @@ def to_quat_xyzw(radians: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
 
 def from_quat_xyzw(quat_xyzw: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Radians (frames, joints, channels), continuous over frames, of quaternions (frames, joints, 4).
+    """Convert quaternions (frames, joints, 4) to radians (frames, joints, channels) that are continuous over frames.
 
     With fewer than three axes the angles are those of the nearest rotation the axes can make.
     """
@@ -45,7 +47,7 @@ def from_quat_xyzw(quat_xyzw: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
 
 def can_represent(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: float = 2e-6) -> bool:
-    """Whether turns about `axes` can make these rotations (frames, joints, 4), to `tolerance` radians."""
+    """Return whether rotations about `axes` can represent these (frames, joints, 4), to `tolerance` radians."""
     if len(axes) == 3:
         return True
     made = to_quat_xyzw(from_quat_xyzw(quat_xyzw, axes), axes)
@@ -54,7 +56,7 @@ def can_represent(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: floa
 
 
 def keep_source_angles(path: np.ndarray, source: np.ndarray, same: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Degrees (frames, channels): the source's own in the frames that are the `same`, the path's in others.
+    """Return degrees (frames, channels): the source's own in the frames that are the `same`, the path's in others.
 
     These go on from the source's angles before them, at the beginning to those after them, without a jump. Where they
     do not lead to the source's angles after them but a whole turn away, or to the other of two equal solutions, the
@@ -69,9 +71,8 @@ def keep_source_angles(path: np.ndarray, source: np.ndarray, same: np.ndarray, a
 
 
 def nearest_equivalent(path: np.ndarray, wanted: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """A path of angles (frames, channels), or its equal of the other solution, by whole turns from where its first
-    frame is nearest to the wanted angles (channels,); degrees.
-    """
+    """Shift a path of angles (frames, channels), or its equivalent solution, by whole turns to where its first frame is
+    nearest to the target angles (channels,); degrees."""
     forms = [path, _equivalent_angles(path, axes, half=180.0)] if len(axes) == 3 else [path]
     forms = [form + 360 * np.round((wanted - form[0]) / 360) for form in forms]
     away = [abs(form[0] - wanted).sum() for form in forms]
@@ -84,7 +85,7 @@ def _one_angle(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
 
 def _two_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """(w, i) and (j, ek) are cos b/2 and sin b/2 times (cos a/2, sin a/2); e is the handedness."""
+    """Solve two angles: (w, i) and (j, ek) are cos b/2 and sin b/2 times (cos a/2, sin a/2); e is the handedness."""
     (i, j), k = axes, 3 - sum(axes)
     q_w, q_i, q_j, q_k = quat[..., W], quat[..., i], quat[..., j], _handedness(i, j) * quat[..., k]
     first = np.arctan2(2 * (q_w * q_i + q_j * q_k), q_w**2 + q_j**2 - q_i**2 - q_k**2)
@@ -93,12 +94,12 @@ def _two_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
 
 def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Half sum and half difference of the outer angles are the arguments of two pairs of quaternion parts.
+    """Solve three angles: half sum and half difference of the outer ones are arguments of two pairs of quaternion
+    parts.
 
-    For distinct axes i, j, k these are (w + j, i + ek) and (w - j, i - ek), of lengths |cos b/2 +- sin
-    b/2|; for ZXZ and its like (w, i) and (j, ek), of lengths cos b/2 and sin b/2; e is the axes'
-    handedness. Where a length is zero (gimbal lock) only the other pair counts, and the lost angle keeps
-    its last value.
+    For distinct axes i, j, k these are (w + j, i + ek) and (w - j, i - ek), of lengths |cos b/2 +- sin b/2|; for ZXZ
+    and its like (w, i) and (j, ek), of lengths cos b/2 and sin b/2; e is the axes' handedness. Where a length is zero
+    (gimbal lock) only the other pair counts, and the lost angle keeps its last value.
     """
     i, j, last = axes
     proper, k, sign = i == last, 3 - i - j, _handedness(i, j)
@@ -117,13 +118,13 @@ def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
 
 def _equivalent_angles(angles: np.ndarray, axes: Sequence[int], *, half: float) -> np.ndarray:
-    """The other three angles (..., 3) of the same rotations, in the unit in which a half turn is `half`."""
+    """Return the other three angles (..., 3) of the same rotations, in the unit in which a half turn is `half`."""
     first, middle, last = np.moveaxis(angles, -1, 0)
     return np.stack([first + half, (0 if axes[0] == axes[2] else half) - middle, last + half], axis=-1)
 
 
 def _hold_argument(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Argument and length of a number over frames; where it vanishes the argument keeps its last value."""
+    """Return argument and length of complex numbers over frames; where one vanishes its last argument holds."""
     length = np.hypot(imaginary, real)
     known = length > _GIMBAL
     frame = np.arange(len(length)).reshape(-1, *[1] * (length.ndim - 1))
@@ -133,17 +134,16 @@ def _hold_argument(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray,
 
 
 def _closest_path(angles: np.ndarray, twin: np.ndarray) -> np.ndarray:
-    """Of two equivalent solutions per frame, the path of least change.
+    """Choose between two equivalent solutions per frame the path of least change.
 
-    Twinning twice is no change and keeps distances, so whether to switch does not depend on which is
-    followed.
+    Twinning twice is no change and keeps distances, so whether to switch does not depend on which is followed.
     """
-    stay = abs(_wrap(angles[1:] - angles[:-1])).sum(-1)
-    switch = abs(_wrap(twin[1:] - angles[:-1])).sum(-1) < stay - 1e-9
-    first = abs(_wrap(twin[:1])).sum(-1) < abs(_wrap(angles[:1])).sum(-1) - 1e-9
+    stay = abs(rotations.wrap_angle(angles[1:] - angles[:-1])).sum(-1)
+    switch = abs(rotations.wrap_angle(twin[1:] - angles[:-1])).sum(-1) < stay - 1e-9
+    first = abs(rotations.wrap_angle(twin[:1])).sum(-1) < abs(rotations.wrap_angle(angles[:1])).sum(-1) - 1e-9
     on_twin = np.cumsum(np.concatenate([first, switch]), axis=0) % 2 == 1
     path = np.where(on_twin[..., None], twin, angles)
-    path[0] = _wrap(path[0])
+    path[0] = rotations.wrap_angle(path[0])
     return np.unwrap(path, axis=0)
 
 
@@ -152,11 +152,6 @@ def _sign_continuous(quat: np.ndarray) -> np.ndarray:
     return np.concatenate([quat[:1], quat[1:] * (1 - 2 * flips)[..., None]])
 
 
-def _wrap(angle: np.ndarray) -> np.ndarray:
-    """The same angle in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
 def _handedness(i: int, j: int) -> int:
-    """1 if the third axis is i x j, else -1."""
+    """Return 1 if the third axis is i x j, else -1."""
     return 1 if (j - i) % 3 == 1 else -1

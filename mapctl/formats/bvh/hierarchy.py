@@ -18,7 +18,7 @@ MAX_CHANNELS = 6
 """Most channels of one joint: three positions and three rotations."""
 
 AXES = {"X": 0, "Y": 1, "Z": 2}
-"""Place of an axis in a vector."""
+"""Index of an axis in a vector."""
 
 _WORD = re.compile(r"\s*+([{}]|[^\s{}]++)")
 _NAME = re.compile(r"\s*+([^\n{}]*+)")
@@ -36,22 +36,22 @@ class Scanner:
         self.path, self.text, self.start, self.stop = path, text, 0, 0
 
     def word(self) -> str:
-        """The next word or brace; empty at the end of the text."""
+        """Read the next word or brace; empty at the end of the text."""
         return self._take(_WORD)
 
     def name(self) -> str:
-        """A joint's name: the rest of the line up to a brace, so that it may hold spaces."""
+        """Read a joint's name: the rest of the line up to a brace, so that it may hold spaces."""
         name = self._take(_NAME).rstrip()
         return name or self.fail(f"expected a joint's name, got {self.shown(self.word())}")
 
     def number(self, meaning: str) -> float:
-        """The next word as a finite number."""
+        """Read the next word as a finite number."""
         word = self.word()
         value = finite_number(word)
         return self.fail(f"expected {meaning} as {NUMBER}, got {self.shown(word)}") if value is None else value
 
     def match(self, pattern: re.Pattern[str], meaning: str) -> str:
-        """The first group of `pattern`, which must come next."""
+        """Take the first group of `pattern`, which must come next."""
         return self._take(pattern) or self.fail(f"expected {meaning}, got {self.shown(self.word())}")
 
     def expect(self, wanted: str) -> None:
@@ -70,12 +70,12 @@ class Scanner:
         return self.line_of(self.start)
 
     def line_of(self, position: int) -> int:
-        """Line of a position in the text, from 1."""
+        """Return the line of a position in the text, from 1."""
         return self.text.count("\n", 0, position) + 1
 
     @staticmethod
     def shown(word: str) -> str:
-        """A word for a message."""
+        """Quote a word for a message."""
         return shorten(word) if word else "the end of the file"
 
     def _take(self, pattern: re.Pattern[str]) -> str:
@@ -103,17 +103,17 @@ class Hierarchy:
     """End Sites: joint to the site's OFFSET."""
 
     def labels(self) -> list[str]:
-        """What each column of the motion block is: `Hips Zrotation`."""
+        """Return the meaning of each column of the motion block: `Hips Zrotation`."""
         joints = zip(self.names, self.channels, strict=True)
         return [f"{name} {channel}" for name, channels in joints for channel in channels]
 
     def position_columns(self) -> list[dict[int, int]]:
-        """Of each joint, axis (0, 1, 2 for X, Y, Z) to column of the motion block."""
+        """Return by joint the map from axis (0, 1, 2 for X, Y, Z) to column of the motion block."""
         joints = self._columns()
         return [{AXES[c[0]]: column for c, column in joint if c.endswith("position")} for joint in joints]
 
     def rotation_groups(self) -> list[tuple[tuple[int, ...], list[int], np.ndarray]]:
-        """Joints by Euler order, to be converted together: axes, joints, and columns (joints, axes)."""
+        """Group joints by Euler order, to be converted together: axes, joints, and columns (joints, axes)."""
         groups: dict[tuple[int, ...], dict[int, list[int]]] = {}
         for joint, channels in enumerate(self._columns()):
             turns = [(AXES[c[0]], column) for c, column in channels if c.endswith("rotation")]
@@ -212,7 +212,8 @@ class _Reader:
         self._open_brace(self.nodes[-1])
 
     def _unique_name(self, name: str) -> str:
-        """A name for a joint whose own is taken: `Bip01_2` for the second Bip01, one that no joint of the file has."""
+        """Make a name for a joint whose own is taken: `Bip01_2` for the second Bip01, one that no joint of the file
+        has."""
         taken = {line.strip() for line in _JOINT_LINE.findall(self.scanner.text)} | set(self.joints)
         own = next(own for number in count(2) if (own := f"{name}_{number}") not in taken)
         self.renamed.append(f"the joint {shorten(name)} of line {self.scanner.line} as {own!r}")
@@ -262,7 +263,7 @@ class _Reader:
         return found.group(1).upper() + found.group(2).lower()
 
     def _check(self, channels: tuple[str, ...]) -> None:
-        """ZXZ is an Euler order, ZZX is none; a position is given once."""
+        """Check a joint's channels: ZXZ is an Euler order, ZZX is none; a position is given once."""
         positions = [c for c in channels if c.endswith("position")]
         rotations = [c for c in channels if c.endswith("rotation")]
         twice = any(a == b for a, b in pairwise(rotations))
@@ -270,7 +271,7 @@ class _Reader:
             self.scanner.fail(f"expected up to three positions and an Euler order, got {' '.join(channels)}")
 
     def _current(self, word: str) -> _Node:
-        """The open node that `word` belongs to."""
+        """Return the open node that `word` belongs to."""
         if not self.open:
             self.scanner.fail(f"{word} outside of a joint, expected ROOT or MOTION")
         return self.open[-1]

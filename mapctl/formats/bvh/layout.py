@@ -46,7 +46,7 @@ class BvhLayout:
 
 
 def choose_layout(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
-    """The layout to write a motion in; RequestError where BVH has no form for its names or frame rate."""
+    """Choose the layout to write a motion in; RequestError where BVH has no form for its names or frame rate."""
     layout = _source_layout(motion) or BvhLayout(_default_hierarchy(motion), 0.01, motion.fps, "")
     if layout.fps != motion.fps or not layout.frame_time:
         layout = replace(layout, fps=motion.fps, frame_time=_format_frame_time(motion.fps, path))
@@ -60,7 +60,7 @@ def choose_layout(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
 
 
 def _source_layout(motion: Motion) -> BvhLayout | None:
-    """The layout the motion came in, if its skeleton still has the same joints."""
+    """Return the layout that the motion was read in, if its skeleton still has the same joints."""
     if not isinstance(motion.source, BvhLayout):
         return None
     tree, skeleton = motion.source.hierarchy, motion.skeleton
@@ -68,11 +68,10 @@ def _source_layout(motion: Motion) -> BvhLayout | None:
 
 
 def fit_hierarchy(layout: BvhLayout, translations: np.ndarray, quat_xyzw: np.ndarray) -> Hierarchy:
-    """The layout's hierarchy for this motion, with channels added where a joint's own cannot hold it.
+    """Fit the layout's hierarchy to this motion, with channels added where a joint's own cannot hold it.
 
-    `translations` (frames, joints, 3) in the file's unit, `quat_xyzw` (frames, joints, 4), joints in file
-    order. OFFSET is the source's along axes with a channel, which replaces it, and the motion's along the
-    others.
+    `translations` (frames, joints, 3) in the file's unit, `quat_xyzw` (frames, joints, 4), joints in file order. OFFSET
+    is the source's along axes with a channel, which replaces it, and the motion's along the others.
     """
     tree, still = layout.hierarchy, STILL_METRES / layout.metres_per_unit
     channels, offsets = [], []
@@ -95,7 +94,8 @@ def _widen_channels(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_pos
 
 
 def _default_hierarchy(motion: Motion) -> Hierarchy:
-    """Centimetres, root OFFSET 0, joints depth first as BVH nests them (the canonical order is not)."""
+    """Return a hierarchy in centimetres, root OFFSET 0, joints depth first as BVH nests them (the canonical order is
+    not)."""
     skeleton = motion.skeleton
     order = _depth_first(skeleton)
     channels = [(POSITIONS if j == 0 or j in motion.moving_offsets else ()) + ROTATIONS for j in order]
@@ -126,7 +126,7 @@ def _format_frame_time(fps: Fraction, path: str | PathLike[str]) -> str:
 
 
 def _check_names(layout: BvhLayout, path: str | PathLike[str]) -> None:
-    """A name must come back as it is: it ends at a brace or a line's end and loses outer blanks."""
+    """Refuse names that would not be read back: a name ends at a brace or a line's end and loses outer blanks."""
     for name in layout.hierarchy.names:
         broken = not name or name != name.strip() or any(mark in name for mark in "{}\r\n\0")
         if broken or name.encode(layout.encoding, "replace").decode(layout.encoding) != name:

@@ -37,13 +37,13 @@ class BvhStream:
     """Takes pieces in turn. The first decides the layout, that of `bvh.save`; rows are the same as there."""
 
     path: str | PathLike[str]
-    """For messages."""
+    """Path of the file, for messages."""
     frames: int
-    """Of the whole motion."""
+    """Number of frames of the whole motion."""
     file: TextIO
-    """Open for writing."""
+    """The file, open for writing."""
     written: int = 0
-    """Frames so far."""
+    """Number of frames written so far."""
     _tree: Hierarchy | None = field(default=None, repr=False)
     _last: np.ndarray | None = field(default=None, repr=False)
 
@@ -68,7 +68,7 @@ class BvhStream:
         self._tree, self._last, self.written = tree, values[-1], self.written + len(values)
 
     def _continue_angles(self, tree: Hierarchy, values: np.ndarray) -> np.ndarray:
-        """The channels, with angles that go on from the last piece's as if converted with it."""
+        """Return the channels with angles that continue the last piece's as if converted with it."""
         if self._last is None:
             return values
         for axes, _, columns in tree.rotation_groups():

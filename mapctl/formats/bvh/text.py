@@ -71,7 +71,7 @@ def _parse_frame_time(scanner: Scanner) -> str:
 
 
 def _parse_values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
-    """The motion block as (frames, channels). Parsed in one go; only a fault is looked for by row."""
+    """Parse the motion block as (frames, channels), in one go; only a fault is looked for by row."""
     expected = frames * len(labels)
     if expected == 0:
         scanner.fail("no joint has any CHANNELS, expected at least one")
@@ -90,7 +90,7 @@ def _parse_values(scanner: Scanner, labels: Sequence[str], *, frames: int, frame
 
 
 def _iterate_rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
-    """Line number and text of every row that is not blank."""
+    """Yield line number and text of every row that is not blank."""
     text, start, line = scanner.text, scanner.stop, scanner.line_of(scanner.stop)
     while start < len(text):
         stop = text.find("\n", start)
@@ -102,7 +102,7 @@ def _iterate_rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
 
 
 def _find_fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, lossy: bool) -> FileFormatError | None:
-    """The first value that is none, or the first row of a wrong length (where rows may not be wrapped)."""
+    """Find the first value that is no number, or the first row of a wrong length (where rows may not be wrapped)."""
     read = 0
     for line, row in _iterate_rows(scanner):
         words = _DATUM.findall(row)
@@ -120,7 +120,7 @@ def _find_fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, loss
 
 
 def compose(hierarchy: Hierarchy, frame_time: str, values: np.ndarray, *, decimals: int) -> str:
-    """The text of a BVH file; `values` (frames, channels) get `decimals` digits after the point."""
+    """Compose the text of a BVH file; `values` (frames, channels) get `decimals` digits after the point."""
     row = " ".join([f"%.{decimals}f"] * values.shape[1])
     # Adding zero turns -0.0 into 0.0.
     rows = [row % tuple(frame) for frame in (np.round(values, decimals) + 0.0).tolist()]

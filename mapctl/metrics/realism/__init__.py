@@ -1,4 +1,4 @@
-"""Realism without users (design, section 6): can a network tell made motion from mocap, and how far apart are they?
+"""Realism without users: can a network tell made motion from mocap, and how far apart are they?
 
 Every number comes with its floor: what mocap shows against mocap.
 """
@@ -38,12 +38,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class RealismSettings:
-    """How realism is measured."""
+    """Settings of a realism measurement."""
 
     windows: WindowSettings = field(default_factory=WindowSettings)
-    """How clips are cut."""
+    """Settings of the windows that clips are cut into."""
     classifier: ClassifierSettings = field(default_factory=ClassifierSettings)
-    """The network that tells them apart."""
+    """Settings of the network that tells the sets apart."""
     dims: int = 32
     """Principal components of mocap's windows in which the Frechet distance is taken."""
 
@@ -53,7 +53,7 @@ class RealismSettings:
 
     @property
     def min_clips(self) -> int:
-        """Clips that each set must have, so that half of the mocap still has one for every fold."""
+        """Number of clips that each set needs, so that half of the mocap still has one for every fold."""
         return 2 * self.classifier.folds
 
 
@@ -64,15 +64,15 @@ class Realism:
     accuracy: float
     """Balanced held-out accuracy of the network, made against mocap; 0.5 is perfect, 1 is told apart every time."""
     floor_accuracy: float
-    """The same for one half of the mocap's clips against the other."""
+    """Balanced held-out accuracy of the network, one half of the mocap's clips against the other."""
     frechet: float
     """Frechet distance of made windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
     floor_frechet: float
-    """The same between the halves, in the same coordinates; halves are smaller sets, which adds to it."""
+    """Frechet distance between the halves, in the same coordinates; halves are smaller sets, which adds to it."""
     made_windows: int
-    """How many windows the made clips gave."""
+    """Number of windows of the made clips."""
     mocap_windows: int
-    """How many windows the mocap clips gave."""
+    """Number of windows of the mocap clips."""
 
 
 def measure_realism(
@@ -103,7 +103,7 @@ def measure_window_realism(
     settings: RealismSettings = RealismSettings(),
     progress: Progress | None = None,
 ) -> Realism:
-    """The same from the `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
     _check_counts(len(made), len(mocap), settings)
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)

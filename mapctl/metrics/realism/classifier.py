@@ -1,4 +1,4 @@
-"""How well a small network learns to tell two sets of windows apart: 50 % where it cannot (design, section 6)."""
+"""Accuracy with which a small network learns to tell two sets of windows apart: 50 % where it cannot."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,10 +16,10 @@ _LEAST_STD = 1e-3
 
 @dataclass(frozen=True)
 class ClassifierSettings:
-    """The network and its training: about 10 s an accuracy on one core at 90 clips."""
+    """Settings of the network and its training: about 10 s an accuracy on one core at 90 clips."""
 
     folds: int = 4
-    """Parts of the clips; each is held out once while a network learns on the others."""
+    """Number of parts of the clips; each is held out once while a network learns on the others."""
     steps: int = 400
     """Optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter judge."""
     batch: int = 64
@@ -27,11 +27,11 @@ class ClassifierSettings:
     width: int = 48
     """Channels of each convolution."""
     dropout: float = 0.3
-    """Share of activations that are dropped while it learns."""
+    """Share of activations that are dropped in training."""
     learning_rate: float = 1e-3
-    """Of AdamW."""
+    """Learning rate of AdamW."""
     weight_decay: float = 1e-2
-    """Of AdamW."""
+    """Weight decay of AdamW."""
 
     def __post_init__(self):
         for name, least in (("folds", 2), ("steps", 1), ("batch", 2), ("width", 1)):
@@ -47,7 +47,7 @@ def compute_held_out_accuracy(
     settings: ClassifierSettings = ClassifierSettings(),
     tick: Callable[[], None] = lambda: None,
 ) -> float:
-    """Balanced accuracy on clips that training did not see, 0 to 1: the mean over both sets and all folds.
+    """Compute the balanced accuracy on clips that training did not see, 0 to 1: the mean over both sets and all folds.
 
     Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap. The same generator state
     gives the same bits; torch's global generator and thread count are left as they were. `tick` is called after each
@@ -67,14 +67,14 @@ def compute_held_out_accuracy(
 
 
 def _split_folds(clips: Sequence[Tensor], folds: int, generator: torch.Generator) -> list[Tensor]:
-    """The windows of each fold's clips, dealt out in a drawn order."""
+    """Deal the windows of clips out to folds in a random order."""
     order = torch.randperm(len(clips), generator=generator).tolist()
     return [torch.cat([clips[i] for i in order[fold::folds]]) for fold in range(folds)]
 
 
 @contextmanager
 def _isolate_torch(generator: torch.Generator) -> Iterator[None]:
-    """A global generator seeded from ours (weights and dropout draw from it) and one thread, both for the while."""
+    """Seed torch's global generator from ours (weights and dropout draw from it) and use one thread, within."""
     threads = torch.get_num_threads()
     seed = int(torch.randint(2**62, (1,), generator=generator))
     with torch.random.fork_rng(devices=[]):
@@ -98,7 +98,8 @@ class _Standardise(nn.Module):
 
 
 def _build_network(windows: Float[Tensor, "windows frames channels"], settings: ClassifierSettings) -> nn.Module:
-    """Three convolutions over time, the mean over what is left of it, and one logit: positive for the first set."""
+    """Build three convolutions over time, the mean over the remaining frames, and one logit: positive for the first
+    set."""
     layers: list[nn.Module] = [_Standardise(windows)]
     channels = windows.shape[-1]
     for stride in (1, 2, 2):

@@ -1,4 +1,4 @@
-"""How different samples are from one another: average pairwise distance (stitching paper, section 5.1)."""
+"""Diversity of samples: their average pairwise distance (Ren et al. 2024, section 5.1)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,13 +18,15 @@ class Diversity(NamedTuple):
     """Average pairwise distance of samples."""
 
     world_cm: float
-    """Of the joints in the world: where they go and how."""
+    """Distance between the joints in the world, metres: where they go and how."""
     root_aligned_cm: float
-    """Of the joints seen from each frame's own hips and facing: poses and their timing alone."""
+    """Distance between the joints relative to each frame's own hips and facing, metres: poses and their timing alone.
+    """
 
 
 def measure_diversity(samples: Sequence[Motion]) -> Diversity:
-    """Of several samples from one start (any known rig); RequestError for fewer than two, or other lengths."""
+    """Measure diversity of several samples from one start (any known rig); RequestError for fewer than two, or other
+    lengths."""
     lengths = sorted({sample.num_frames / sample.fps for sample in samples})
     if len(samples) < 2 or len(lengths) > 1:
         told = " and ".join(f"{float(length):.4g}" for length in lengths)
@@ -33,18 +35,19 @@ def measure_diversity(samples: Sequence[Motion]) -> Diversity:
 
 
 def measure_position_diversity(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
-    """The same from world positions of the canonical joints, metres."""
+    """Measure diversity from world positions of the canonical joints, metres."""
     aligned = torch.stack([_align_to_root(sample) for sample in positions])
     return Diversity(average_pairwise_distance(positions) * _CM, average_pairwise_distance(aligned) * _CM)
 
 
 def align_to_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
-    """A clip as if it began at the origin and faced +Z: to compare clips that did not begin in one place."""
+    """Move a clip to begin at the origin facing +Z, to compare clips that did not begin at one position."""
     return transform_to_ground_frame(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
 
 
 def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
-    """Mean over pairs of samples, frames and joints of the distance between joints, in the unit of `positions`."""
+    """Return the mean over pairs of samples, frames and joints of the distance between joints, in the unit of
+    `positions`."""
     samples, frames, joints, _ = positions.shape
     # frame by frame, for the distances of a thousand samples at once would need gigabytes
     total = sum(float(torch.cdist(at, at).sum()) for at in positions.permute(1, 2, 0, 3))

@@ -20,26 +20,26 @@ class Basis:
     """Principal components of a reference set of windows; both sets of a distance are seen in one basis."""
 
     mean: Float[Tensor, "features"]
-    """Of each feature, m or m/s."""
+    """Mean of each feature, m or m/s."""
     std: Float[Tensor, "features"]
-    """Of each feature, m or m/s."""
+    """Standard deviation of each feature, m or m/s."""
     axes: Float[Tensor, "features dims"]
-    """Orthonormal, in units of the standard deviations."""
+    """Orthonormal axes, in units of the standard deviations."""
 
     @staticmethod
     def of(windows: Float[Tensor, "windows frames channels"], dims: int) -> "Basis":
-        """The first `dims` components; fewer where there are fewer windows."""
+        """Fit the first `dims` components; fewer where there are fewer windows."""
         flat = windows.flatten(1)
         mean, std = flat.mean(0), flat.std(0, correction=0).clamp_min(_LEAST_STD)
         return Basis(mean, std, _principal_axes((flat - mean) / std, min(dims, *flat.shape)))
 
     def project(self, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, "windows dims"]:
-        """Coordinates of windows, float64."""
+        """Project windows to coordinates, float64."""
         return (((windows.flatten(1) - self.mean) / self.std) @ self.axes).double()
 
 
 def _principal_axes(centred: Float[Tensor, "windows features"], dims: int) -> Float[Tensor, "features dims"]:
-    """By the eigenvectors of the smaller of the two Gram matrices: a clip's worth or a thousand, seconds at most."""
+    """Return principal axes by the smaller of the two Gram matrices: seconds for a clip's worth or a thousand."""
     few = len(centred) < centred.shape[1]
     gram = (centred @ centred.T if few else centred.T @ centred).double().numpy()
     largest = [len(gram) - dims, len(gram) - 1]
@@ -48,7 +48,8 @@ def _principal_axes(centred: Float[Tensor, "windows features"], dims: int) -> Fl
 
 
 def frechet_distance(points: Float[Tensor, "points dims"], reference: Float[Tensor, "others dims"]) -> float:
-    """|m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the points' means and covariances; each set needs two points.
+    """Return |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the points' means and covariances; each set needs two
+    points.
 
     With triangles C = R^T R the root's trace is the sum of the singular values of R1 R2^T, so no matrix root is taken
     and singular covariances (fewer points than dimensions) do no harm.
@@ -61,5 +62,5 @@ def frechet_distance(points: Float[Tensor, "points dims"], reference: Float[Tens
 
 
 def _covariance_triangle(points: Float[Tensor, "points dims"]) -> Float[Tensor, "rows dims"]:
-    """R with R^T R the covariance."""
+    """Return R with R^T R the covariance."""
     return torch.linalg.qr(points - points.mean(0), mode="r").R / (len(points) - 1) ** 0.5

@@ -1,4 +1,4 @@
-"""How widely a set of clips spreads in gait: step length, speed and turning of pieces of one length."""
+"""Range of gait in a set of clips: step length, speed and turning of pieces of one length."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -19,29 +19,29 @@ from mapctl.rotations import unwrap_angle
 PIECE_SECONDS = 3.0
 """Length of the pieces: long averages vary less than short ones, so sets are compared in pieces of one length."""
 LONGEST_STEP = 1.0
-"""A step takes less, seconds; touch-downs further apart have a contact between them that was not seen."""
+"""Longest step, seconds; touch-downs further apart have a contact between them that was not detected."""
 _MOVING = 0.2
 """Slower than this over the ground, m/s, travel has no direction to speak of."""
 
 
 class GaitSpread(NamedTuple):
-    """What the pieces of a set of clips show of one measure; NaN where too few of them can tell it."""
+    """Statistics of one measure over the pieces of a set of clips; NaN where too few of them have it."""
 
     mean: float
-    """Over pieces."""
+    """Mean over pieces."""
     std: float
     """Standard deviation over pieces."""
     pieces: int
-    """How many pieces can tell it."""
+    """Number of pieces that have the measure."""
 
 
 def measure_gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SECONDS) -> dict[str, GaitSpread]:
-    """Spread of step_length_cm, speed_m_s and turning_deg_s over consecutive pieces of the clips (any rig).
+    """Measure the spread of step_length_cm, speed_m_s and turning_deg_s over consecutive pieces of the clips (any rig).
 
     Step length is the mean of a piece's distances over the ground from one foot's touch-down to the next of the other
-    foot; speed the hips' mean over the ground; turning the mean size of the turn rate of their travel, strides
-    smoothed away. What is left of a clip after its last whole piece is not used, so clips shorter than `seconds` add
-    nothing. RequestError for no clips, a length that is none, and rigs whose hips or feet cannot be told.
+    foot; speed the hips' mean over the ground; turning the mean size of the turn rate of their travel, strides smoothed
+    away. What is left of a clip after its last whole piece is not used, so clips shorter than `seconds` add nothing.
+    RequestError for no clips, a length that is none, and rigs whose hips or feet cannot be told.
     """
     if not motions or not 0 < seconds < float("inf"):
         raise RequestError(f"a gait needs clips and a length in seconds, got {len(motions)} and {seconds:g} s")
@@ -50,7 +50,7 @@ def measure_gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SEC
 
 
 def spread_ratios(made: Mapping[str, GaitSpread], data: Mapping[str, GaitSpread]) -> dict[str, float]:
-    """How widely one set spreads for each unit of the other's spread; NaN where either cannot be told or is 0."""
+    """Return how widely one set spreads for each unit of the other's spread; NaN where either is unknown or 0."""
     return {name: spread.std / data[name].std if data[name].std else float("nan") for name, spread in made.items()}
 
 
@@ -62,7 +62,7 @@ def _summarise_pieces(values: Float[Tensor, "pieces"]) -> GaitSpread:
 
 
 def _measure_clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor, "pieces"]]:
-    """By measure a value for each whole piece of a clip. Contacts and smoothing know the whole clip."""
+    """Measure a value for each whole piece of a clip, by measure. Contacts and smoothing know the whole clip."""
     positions, fps = motion.joint_positions(), float(motion.fps)
     hips = positions[:, find_hips(motion.skeleton)]
     toes = positions[:, list(find_feet(motion.skeleton))]
@@ -84,10 +84,10 @@ def _measure_clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor
 def step_lengths(
     toes_xz: Float[Tensor, "frames feet 2"], planted: Bool[Tensor, "frames feet"], fps: float
 ) -> Float[Tensor, "frames"]:
-    """Length of the step that a touch-down ends in its frame, metres; NaN where none does.
+    """Return the length of the step that a touch-down ends in its frame, metres; NaN where none does.
 
-    A touch-down is the first frame of a contact. Two of one foot on end make no step: it was set down again. Nor do
-    two that are `LONGEST_STEP` apart.
+    A touch-down is the first frame of a contact. Two of one foot on end make no step: it was set down again. Nor do two
+    that are `LONGEST_STEP` apart.
     """
     lengths = torch.full((len(planted),), float("nan"), dtype=toes_xz.dtype)
     downs = ((planted[1:] & ~planted[:-1]).nonzero() + planted.new_tensor([1, 0], dtype=torch.long)).tolist()
@@ -98,9 +98,9 @@ def step_lengths(
 
 
 def travel_turn_rate(hips_xz: Float[Tensor, "frames 2"], fps: float) -> Float[Tensor, "frames"]:
-    """Size of the turn rate of the direction of travel on the way to each frame, rad/s; NaN where it hardly moves.
+    """Return the size of the turn rate of the direction of travel, rad/s; NaN where the hips hardly move.
 
-    Smoothed as the design's turn rate, so that the hips' swing with each stride does not count.
+    Smoothed as `body.turn_rate`, so that the hips' swing with each stride does not count.
     """
     rate = torch.full((len(hips_xz),), float("nan"), dtype=hips_xz.dtype)
     if len(hips_xz) < 3:

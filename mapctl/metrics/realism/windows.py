@@ -1,4 +1,4 @@
-"""One-second windows of motion as the realism measures see them: joint positions and velocities, place taken away."""
+"""One-second windows of motion for the realism measures: joint positions and velocities relative to their start."""
 
 from dataclasses import dataclass
 
@@ -19,12 +19,12 @@ _UPPER_LEGS = CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """How clips are cut."""
+    """Settings of the windows that clips are cut into."""
 
     frames: int = 30
     """Frames a window, at 30 a second; one more is needed before it for the velocities."""
     step: int = 10
-    """Frames from the beginning of one window to that of the next."""
+    """Stride from one window to the next, frames."""
 
     def __post_init__(self):
         for name in ("frames", "step"):
@@ -33,12 +33,13 @@ class WindowSettings:
 
 
 def canonical_positions(motion: Motion) -> Float[Tensor, "frames joints 3"]:
-    """World positions (metres) of the canonical joints at 30 frames a second; RequestError for rigs not known."""
+    """Return the world positions (metres) of the canonical joints at 30 frames a second; RequestError for rigs not
+    known."""
     return retarget.to_canonical(motion)[0].resample(PRIOR_FPS).joint_positions()
 
 
 def facing_angle(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames"]:
-    """Facing of canonical joints, radians; positions alone tell it, so that every rig has the same."""
+    """Return the facing of canonical joints, radians, from positions alone, so that every rig has the same."""
     left, right = _UPPER_LEGS
     return body.facing(positions[:, left], positions[:, right])
 
@@ -48,19 +49,17 @@ def transform_to_ground_frame(
     ground_xz: Float[Tensor, "*batch #frames 2"],
     angle: Float[Tensor, "*batch #frames"],
 ) -> Float[Tensor, "*batch frames joints 3"]:
-    """World positions as seen from places on the ground that face by `angle` radians; height stays."""
-    apart = positions[..., ::2] - ground_xz.unsqueeze(-2)
-    turned = rotations.rotate_ground(apart, -angle.unsqueeze(-1).expand(apart.shape[:-1]))
-    return torch.stack([turned[..., 0], positions[..., 1], turned[..., 1]], dim=-1)
+    """Transform world positions to ground positions that face by `angle` radians; height stays."""
+    return rotations.rotate_about_y(positions - rotations.lift_ground(ground_xz).unsqueeze(-2), -angle.unsqueeze(-1))
 
 
 def cut_windows(
     positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings = WindowSettings()
 ) -> Float[Tensor, "windows frames channels"]:
-    """Windows of one clip, float32: joint positions (m), then velocities (m/s) on the way to each frame.
+    """Cut one clip into windows, float32: joint positions (m), then velocities (m/s) from the frame before each.
 
-    `positions` are those of `canonical_positions`. A window is seen from the hips' ground projection and the facing
-    of the frame before its first, which place the velocities. RequestError for a clip shorter than one window.
+    `positions` are those of `canonical_positions`. A window is seen from the hips' ground projection and the facing of
+    the frame before its first, which place the velocities. RequestError for a clip shorter than one window.
     """
     needed = settings.frames + 1
     if len(positions) < needed:

@@ -13,14 +13,14 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
 from mapctl.pose import BodyPose
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
 from priors.training.trainer import Trainer
 
-_TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+_TOES = list(TOE_JOINTS)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.errors import RequestError
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
@@ -17,7 +17,6 @@ from priors.training.corpus import Corpus
 from priors.training.trainer import Trainer
 from priors.training.windows import PositionWindows, Window
 
-TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
 _ERROR_OFFSET_CM = 0.5  # cm that the guess may be off by before a window's weight falls
 _MAX_ERROR_CM = 4.0  # cm beyond which it falls no more
 _MIN_STD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
@@ -101,8 +100,8 @@ def compute_infiller_losses(
     slip = torch.diff(wrong, dim=1) * pairs[..., None, None]
     pace = (weight * slip.abs().sum(dim=(1, 2, 3))).mean()
     planted = window.contacts[:, 1:] * window.contacts[:, :-1]
-    feet = (slip[..., list(TOES), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
-    unsure = made[..., list(TOES)]
+    feet = (slip[..., list(TOE_JOINTS), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
+    unsure = made[..., list(TOE_JOINTS)]
     guessed = cross_entropy(proposed.contacts, window.contacts, reduction="none")
     contacts = (guessed * unsure).sum() / unsure.sum().clamp_min(1)
     loss = place + settings.pace * pace + settings.feet * feet + settings.contacts * contacts
