@@ -5,6 +5,8 @@ from priors.denoiser import network as denoiser_network
 from priors.denoiser.network import ConvDenoiser
 from priors.infiller import network as infiller_network
 from priors.infiller.network import ConvInfiller
+from priors.keyframe_timing import model as keyframe_timing
+from priors.keyframe_timing.model import KeyframeTiming
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner import network as refiner_network
@@ -39,6 +41,11 @@ def load_denoiser(name: str = "denoiser") -> ConvDenoiser:
 def load_infiller(name: str = "infiller") -> ConvInfiller:
     """The bundled infiller, or a trained one by its file or run folder."""
     return infiller_network.load(name)
+
+
+def load_keyframe_timing(name: str = "keyframe-timing") -> KeyframeTiming:
+    """The bundled timing of keyframes, or a trained one by its file or run folder."""
+    return keyframe_timing.load(name)
 
 
 def refiner_of(prior: str, name: str = "auto") -> LstmRefiner | None:

@@ -236,16 +236,16 @@ class Killed(Exception):
 
 
 @contextmanager
-def killing(trainer: type, step: str, number: int, *, counter: str) -> Iterator[None]:
-    """Kills the training within when a trainer's method `step` is begun with its `counter` at this number."""
-    whole = getattr(trainer, step)
+def killing(trainer: type, number: int) -> Iterator[None]:
+    """Kills the training within when a trainer's step of this number is begun."""
+    whole = trainer.train_step
 
     def stopping(self):
-        if getattr(self, counter) == number:
+        if self.step == number:
             raise Killed
         return whole(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, step, stopping)
+        patch.setattr(trainer, "train_step", stopping)
         with pytest.raises(Killed):
             yield

@@ -23,7 +23,7 @@ from mapctl.commands.measure import Measure
 from mapctl.commands.render import Render
 from mapctl.commands.run import RunScene
 from mapctl.commands.steer import Steer
-from mapctl.commands.train import Train
+from mapctl.commands.train import MODELS, Train
 from mapctl.commands.tween import Tween
 
 
@@ -56,5 +56,7 @@ COMMANDS: dict[str, type[Runnable]] = {
     "bench": Bench,
 }
 """By the name the user types, in the order of the help."""
-SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES}
-"""Of the commands that have sub-commands of their own; the first is meant where none is named."""
+SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES, "train": {kind.model: kind for kind in MODELS}}
+"""The sub-commands of commands that have some."""
+IMPLIED = {"bench": next(iter(TABLES))}
+"""The sub-command that is meant where none is named."""

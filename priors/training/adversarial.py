@@ -1,4 +1,4 @@
-"""The refiner's critic and its memory: a bidirectional LSTM on end effectors (rnn paper, Eq. 12, figure 5; 4.2.2)."""
+"""The refiner's critic, a bidirectional LSTM on end effectors, and its memory (Wang et al. 2019, Eq. 12 and 4.2.2)."""
 
 from collections.abc import Sequence
 

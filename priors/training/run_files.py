@@ -60,13 +60,13 @@ def write_checkpoint(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor
 
 
 def read_checkpoint(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Index and tensors; one of BROKEN where they cannot be read."""
+    """Index and tensors; one of UNREADABLE_ERRORS where they cannot be read."""
     index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
     return index, load_file(run / index["tensors"])
 
 
 def parse_curve(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:
-    """The curve that an index holds; one of BROKEN unless every row says at what `count` it was measured."""
+    """The curve that an index holds; one of UNREADABLE_ERRORS unless every row says at what `count` it was measured."""
     return [{**row, count: int(row[count])} for row in index["curve"]]
 
 
@@ -92,15 +92,19 @@ def unflatten_optimiser(
 ) -> dict[str, Any]:
     """For `load_state_dict`, from what `flatten_optimiser` gave; KeyError unless it is whole."""
     state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in tensors.items():
-        if name.startswith(f"{prefix}."):
-            number, key = name.removeprefix(f"{prefix}.").split(".", 1)
-            state.setdefault(int(number), {})[key] = tensor
+    for name, tensor in select_prefixed(f"{prefix}.", tensors).items():
+        number, key = name.split(".", 1)
+        state.setdefault(int(number), {})[key] = tensor
     groups = optimiser.state_dict()["param_groups"]
     # Torch takes a partial state, and fails at the next step.
     if len(state) != sum(len(group["params"]) for group in groups) or len(set(map(frozenset, state.values()))) > 1:
         raise KeyError("the optimiser's state is not whole")
     return {"state": state, "param_groups": groups}
+
+
+def select_prefixed(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Those whose names begin so, without it."""
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 def check_unchanged(run: Path, part: str, *, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -111,5 +115,5 @@ def check_unchanged(run: Path, part: str, *, then: Mapping[str, Any], now: Mappi
 
 
 def make_unreadable_error(run: Path, error: Exception) -> CheckpointError:
-    """For a checkpoint that raised one of BROKEN."""
+    """For a checkpoint that raised one of UNREADABLE_ERRORS."""
     return CheckpointError(f"{run}: no readable checkpoint ({' '.join(f'{type(error).__name__}: {error}'.split())})")

@@ -1,14 +1,16 @@
-"""What training a network on drawn windows is, whatever it learns: one update at a time, resumed to the bit."""
+"""What is trained, whatever it learns: a step at a time, resumed to the bit."""
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Generic, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from mapctl.errors import MapctlError
 from priors.training import run_files
+from priors.training.corpus import Corpus
 
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
@@ -17,46 +19,113 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class Trainer(ABC, Generic[Network]):
-    """Network, optimiser and generator. AdamW; the learning rate rises, then falls to nothing along a cosine."""
+    """A network and what teaches it. Everything random comes from one generator."""
+
+    network: Network
+    """What is validated, and exported at the end."""
+
+    def __init__(self, *, steps: int, seed: int):
+        self.step, self.steps = 0, steps
+        self.generator = torch.Generator().manual_seed(seed)
+
+    @abstractmethod
+    def train_step(self) -> dict[str, float]:
+        """Take one step; the parts of its loss."""
+
+    @abstractmethod
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Measure the network on clips that it has not seen."""
+
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        return {"network": self.network}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """All optimisers, by their names in checkpoints."""
+        return {}
+
+    def check_finite(self) -> None:
+        """MapctlError unless every weight is a number."""
+        if not all(bool(torch.isfinite(values).all()) for values in self.network.parameters()):
+            raise make_divergence_error(self.step, "its weights are not finite")
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a bit-exact continuation needs, but the step."""
+        tensors = {"generator": self.generator.get_state()}
+        for kind, network in self.networks().items():
+            tensors |= {f"{kind}.{name}": value for name, value in network.state_dict().items()}
+        for kind, optimiser in self.optimisers().items():
+            tensors |= run_files.flatten_optimiser(optimiser, kind)
+        return tensors
+
+    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Go on from what `state` gave; KeyError or RuntimeError where it is not whole."""
+        self.generator.set_state(tensors["generator"])
+        for kind, network in self.networks().items():
+            network.load_state_dict(run_files.select_prefixed(f"{kind}.", tensors))
+        for kind, optimiser in self.optimisers().items():
+            optimiser.load_state_dict(run_files.unflatten_optimiser(optimiser, kind, tensors))
+        self.step = step
+
+
+class GradientTrainer(Trainer[Network]):
+    """One network, one loss: AdamW, unless another is made; the learning rate rises, then falls along a cosine."""
 
     def __init__(self, make: Callable[[], Network], *, steps: int, learning_rate: float, seed: int):
-        """`make` builds the network; its weights are drawn with the seed, and the global generator is left alone."""
-        self.step, self.steps, self.learning_rate = 0, steps, learning_rate
-        self.generator = torch.Generator().manual_seed(seed)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
-            self.network = make()
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=learning_rate, weight_decay=1e-4)
+        """`make` builds the network (see `draw_weights`)."""
+        super().__init__(steps=steps, seed=seed)
+        self.learning_rate = learning_rate
+        self.network = draw_weights(make, seed)
+        self.optimiser = self.make_optimiser()
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
         """Of a batch drawn anew: `loss`, and in plain units what it is made of."""
 
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """For the network's weights."""
+        return torch.optim.AdamW(self.network.parameters(), lr=self.learning_rate, weight_decay=1e-4)
+
+    def compute_learning_rate(self) -> float:
+        """At the current step."""
+        return self.learning_rate * warmup_cosine(self.step, self.steps)
+
+    def limit_gradients(self) -> None:
+        """Clip what the loss has left in the weights, before the optimiser's step."""
+        nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+
     def train_step(self) -> dict[str, float]:
-        """One update; the parts of its loss."""
+        """One update; the parts of its loss. MapctlError, and no update, where that is no number."""
         for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate * warmup_cosine(self.step, self.steps)
+            group["lr"] = self.compute_learning_rate()
         parts = self.losses()
-        self.optimiser.zero_grad()
+        if not torch.isfinite(parts["loss"]):
+            raise make_divergence_error(self.step + 1, f"the loss is {parts['loss'].item()}")
+        self.optimiser.zero_grad(set_to_none=True)
         parts["loss"].backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+        self.limit_gradients()
         self.optimiser.step()
         self.step += 1
         return {name: float(value.detach()) for name, value in parts.items()}
 
-    def state(self) -> dict[str, Tensor]:
-        """Everything that a bit-exact continuation needs, but the step."""
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= run_files.flatten_optimiser(self.optimiser, "optimiser")
-        return tensors | {"generator": self.generator.get_state()}
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """The one."""
+        return {"optimiser": self.optimiser}
 
-    def load_state(self, tensors: dict[str, Tensor], step: int) -> None:
-        """Inverse of `state`; KeyError or RuntimeError for tensors that are not its."""
-        own = {n.removeprefix("network."): t for n, t in tensors.items() if n.startswith("network.")}
-        self.network.load_state_dict(own)
-        self.optimiser.load_state_dict(run_files.unflatten_optimiser(self.optimiser, "optimiser", tensors))
-        self.generator.set_state(tensors["generator"])
-        self.step = step
+
+Drawn = TypeVar("Drawn")
+
+
+def draw_weights(make: Callable[[], Drawn], seed: int) -> Drawn:
+    """What `make` builds of torch's global generator, seeded; the caller's own numbers are left alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        return make()
+
+
+def make_divergence_error(step: int, how: str) -> MapctlError:
+    """For a run whose numbers are none any more."""
+    return MapctlError(f"training diverged at step {step}: {how}; the last checkpoint, if there is one, is kept")
 
 
 def warmup_cosine(step: int, steps: int) -> float:

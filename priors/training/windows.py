@@ -1,4 +1,4 @@
-"""Windows of joint positions, as the infiller is trained on them."""
+"""Windows of a corpus, as training draws them: of its features, and of joint positions."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,67 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, GroundPose, integrate_root
+from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.training.corpus import Corpus, number_clip_folders
+from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
 
 _CHUNK_FRAMES = 50_000  # frames
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureBatch:
+    """Windows of features."""
+
+    features: Float[Tensor, "batch window size"]
+    """As in the corpus, or mirrored."""
+    first: Int[Tensor, " batch"]
+    """Frame of the joined corpus that each begins with."""
+    mirrored: Bool[Tensor, " batch"]
+    """Whether left and right are exchanged."""
+
+
+class FeatureWindows:
+    """Draws windows from a corpus."""
+
+    def __init__(self, corpus: Corpus, frames: int, *, evenness: float | None = None):
+        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each; None draws
+        by frames without a look at folders. RequestError where no clip is as long as a window.
+        """
+        self.features, self.frames = corpus.features, frames
+        self.starts = find_window_starts(corpus.lengths, frames)
+        if evenness is not None:
+            folder = number_clip_folders(corpus).repeat_interleave(torch.tensor(corpus.lengths))
+            # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
+            self.groups = [self.starts[folder[self.starts] == number] for number in folder.unique()]
+            self.groups = [group for group in self.groups if len(group)]
+            self.probabilities = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - evenness)
+        self._pick = self._pick_any if evenness is None else self._pick_evened
+
+    def draw(self, batch: int, generator: torch.Generator, *, mirror: bool = True) -> FeatureBatch:
+        """So many, half of them mirrored if that is allowed."""
+        first = self._pick(batch, generator)
+        windows = self.features[first[:, None] + torch.arange(self.frames)]
+        if not mirror:
+            return FeatureBatch(windows, first, torch.zeros(batch, dtype=torch.bool))
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows)
+        return FeatureBatch(windows, first, mirrored)
+
+    def _pick_any(self, batch: int, generator: torch.Generator) -> Int[Tensor, " batch"]:
+        return self.starts[torch.randint(len(self.starts), (batch,), generator=generator)]
+
+    def _pick_evened(self, batch: int, generator: torch.Generator) -> Int[Tensor, " batch"]:
+        groups = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
+        shares = torch.rand(batch, generator=generator)
+        return torch.stack(
+            [
+                self.groups[group][int(share * len(self.groups[group]))]
+                for group, share in zip(groups.tolist(), shares.tolist(), strict=True)
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False)

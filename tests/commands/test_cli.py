@@ -227,13 +227,13 @@ def test_train_takes_its_options(tmp_path):
     words = ["train", "lstm-gmm", "--data", str(tmp_path), "-o", "run", "--width", "64", "--steps", "7", "--seed", "3"]
     command = cli.parse([*words, "--match", "walk", "--device", "cpu", "--minutes-between-checkpoints", "0.5"])
     assert isinstance(command, Train)
-    request = command.request()
+    request = command.model.recipe()
     assert (request.config.width, request.settings.steps, request.settings.seed) == (64, 7, 3)
     assert (request.match, request.device, request.checkpoint_minutes) == ("walk", "cpu", 0.5)
     paper = cli.parse([*words, "--paper"])
     assert isinstance(paper, Train)
-    assert (paper.request().config.retain, paper.request().config.width) == (0.0, 64)
-    assert paper.request().settings.optimiser == "rmsprop"
+    assert (paper.model.recipe().config.retain, paper.model.recipe().config.width) == (0.0, 64)
+    assert paper.model.recipe().settings.optimiser == "rmsprop"
 
 
 def _started(words) -> subprocess.Popen[str]:

@@ -9,20 +9,21 @@ from captures import on_rig
 from helpers import generator, moved, random_motion, run, walk, walks
 from tiny_infiller import card, network
 
-from controllers.benchmarks import keyframe_timing
-from controllers.benchmarks.keyframe_timing import (
-    PosePairs,
-    benchmark_keyframe_timing,
-    fit_timing_weights,
-    sample_pose_pairs,
-)
-from controllers.inbetweening.keyframe_timing import FEATURES, WEIGHTS, compute_pair_features, suggest_intervals
+import priors
+from controllers.benchmarks.keyframe_timing import benchmark_keyframe_timing
+from controllers.inbetweening import keyframe_timing
 from mapctl import retarget
+from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed
+from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, compute_pair_features, sample_pose_pairs
 from mapctl.intent.keyframes import Key, Keys
 from priors import checkpoints
 
 KEYS = Keys((0, 20, 50, 89))
+
+
+def suggest_intervals(motion, keys):
+    return keyframe_timing.suggest_intervals(motion, keys, priors.load_keyframe_timing())
 
 
 def frames(intervals):
@@ -104,40 +105,38 @@ def test_keys_that_tell_less_than_a_pose_lie_within():
     assert frames(suggest_intervals(walk(90), keys)) == frames(suggest_intervals(walk(90), Keys((0, 50, 89))))
 
 
-def test_features_have_names_and_weights():
+def test_features_have_names():
     features = compute_pair_features(walk(20), torch.tensor([0, 3]), torch.tensor([9, 19]))
-    assert features.shape == (2, len(FEATURES))
-    assert len(WEIGHTS) == len(FEATURES)
+    assert features.shape == (2, len(PAIR_FEATURES))
     assert features.isfinite().all()
 
 
-def test_the_fit_finds_the_weights_that_pairs_were_made_by_but_for_a_few_wild_ones():
-    features = torch.randn(2000, 4, generator=generator(), dtype=torch.float64)
-    features[:, 0] = 1
-    features[:, 2] = 5 + 0.1 * features[:, 2]
-    wanted = torch.tensor([0.3, -0.2, 0.5, 0.1]).double()
-    seconds = torch.exp(features @ wanted)
-    seconds[::50] *= 20
-    found = fit_timing_weights(PosePairs(features, torch.ones(2000), seconds))
-    assert torch.allclose(features @ found, features @ wanted, atol=0.02)
-
-
 def test_pairs_are_as_long_as_asked_for_and_clips_that_are_too_short_give_none():
-    pairs = sample_pose_pairs([walk(80), walk(10), walk(40)], generator(), shortest=0.5, longest=1.0)
+    pairs = sample_pose_pairs([walk(80), walk(10), walk(40)], generator(), count=5, shortest=0.5, longest=1.0)
     assert len(pairs.seconds) == 2 * 5
     assert pairs.seconds.min() >= 0.5
     assert pairs.seconds.max() <= 1.0
-    assert pairs.features.shape == (10, len(FEATURES))
+    assert pairs.features.shape == (10, len(PAIR_FEATURES))
+    with pytest.raises(RequestError, match=r"no clip is longer than 0\.5 s"):
+        sample_pose_pairs([walk(10)], generator(), count=5, shortest=0.5, longest=1.0)
 
 
-def test_the_bench_compares_with_what_poses_do_not_tell(monkeypatch):
+class KnowsTheTruth:
+    """Of the pairs that the bench draws."""
+
+    def __init__(self, clips):
+        self.pairs = sample_pose_pairs(clips, torch.Generator().manual_seed(0), count=5, shortest=0.5, longest=3.0)
+
+    def estimate_seconds(self, features, metres):
+        return self.pairs.seconds[:, None].expand(-1, 3)
+
+
+def test_the_bench_compares_with_what_poses_do_not_tell():
     """Who knows the truth is right everywhere."""
-    rows = benchmark_keyframe_timing(walks(3, 90))
+    rows = benchmark_keyframe_timing(walks(3, 90), priors.load_keyframe_timing())
     methods = ["suggested", "one speed for all", "one duration for all"]
     assert [(row["pairs"], row["method"]) for row in rows] == [(p, m) for p in ("on the way", "all") for m in methods]
-    pairs = sample_pose_pairs(walks(3, 90), torch.Generator().manual_seed(0))
-    monkeypatch.setattr(keyframe_timing, "predict_seconds", lambda features, metres: pairs.seconds)
-    for row in benchmark_keyframe_timing(walks(3, 90)):
+    for row in benchmark_keyframe_timing(walks(3, 90), KnowsTheTruth(walks(3, 90))):
         assert row["count"] == 15
         if row["method"] == "suggested":
             assert (row["lower_quartile"], row["median"], row["upper_quartile"], row["half_off_by"]) == (1, 1, 1, 1)

@@ -87,7 +87,7 @@ def test_half_of_the_windows_are_told_nothing_and_none_more_than_is_known():
     known = Labels(("gait=walk", "style=old"), torch.tensor([[1.0, 1.0]] * 5))
     settings = TrainingSettings(steps=1, batch=2000, window=6, matching=MatchingSettings(begin=1.0))
     trainer = DensityTrainer(LstmGmmConfig(width=8, components=1, labels=known.names), settings, data, labels=known)
-    _, told = trainer._sample_windows()
+    _, told = trainer._draw_windows()
     silent = float((told.sum(-1) == 0).double().mean())
     assert pytest.approx(silent, abs=0.04) == 0.5 + 0.5 * 0.09
     assert {tuple(row) for row in told.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}

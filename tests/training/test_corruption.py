@@ -9,7 +9,8 @@ from helpers import corpus, generator
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, corrupt, make_clean_capture
+from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
+from priors.training.augmentation.draws import LIMBS
 
 JOINTS = CANONICAL.num_joints
 NOTHING = CorruptionSettings(

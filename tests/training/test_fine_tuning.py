@@ -9,16 +9,17 @@ from helpers import corpus, write_corpus
 
 import priors
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training import free_run, run
-from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
+from priors.training import density_quality, run
+from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
 
 TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 
 def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
-    request = run.DensityRequest(
+    whole = density_quality.measure_free_runs
+    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+    request = DensityRecipe(
         write_corpus(tmp_path / "data"),
         tmp_path / "first",
         config=TINY,
@@ -42,6 +43,6 @@ def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_pa
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_both_precisions_learn_and_keep_their_weights_in_float32(bfloat16):
     trainer = DensityTrainer(TINY, replace(SETTINGS, steps=400, learning_rate=5e-3, bfloat16=bfloat16), corpus())
-    losses = [trainer.train_step() for _ in range(60)]
+    losses = [trainer.train_step()["loss"] for _ in range(60)]
     assert sum(losses[-5:]) < sum(losses[:5]) - 10
-    assert {weight.dtype for weight in trainer.model.parameters()} == {torch.float32}
+    assert {weight.dtype for weight in trainer.network.parameters()} == {torch.float32}

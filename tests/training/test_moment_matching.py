@@ -86,8 +86,8 @@ def test_training_runs_free_once_it_has_begun(monkeypatch):
         steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, every=1, wander=0, batch=4)
     )
     trainer, runs = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
-    draw = trainer.model.draw
-    monkeypatch.setattr(trainer.model, "draw", lambda *run: (runs.append(trainer.step), draw(*run))[1])
+    draw = trainer.network.draw
+    monkeypatch.setattr(trainer.network, "draw", lambda *run: (runs.append(trainer.step), draw(*run))[1])
     for _ in range(4):
         trainer.train_step()
     assert runs == [2, 3]
@@ -98,7 +98,7 @@ def test_windows_too_short_for_a_run_are_refused():
         LstmGmmConfig(width=8, components=1), TrainingSettings(steps=1, batch=2, window=4), corpus()
     )
     with pytest.raises(RequestError, match="at least 6 frames, got 5"):
-        free_run_moment_loss(trainer.model, windows(5), SETTINGS, generator())
+        free_run_moment_loss(trainer.network, windows(5), SETTINGS, generator())
 
 
 def test_runs_that_wander_first_are_compared_all_the_same():

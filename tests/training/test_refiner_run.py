@@ -14,15 +14,14 @@ from tiny_prior import save_tiny_prior
 import priors
 from mapctl import cli
 from mapctl.commands.train import Train
-from mapctl.commands.train import refiner as train_refiner
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from priors import checkpoints
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus as corpora
-from priors.training import refiner_run
-from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, RoundLosses
-from priors.training.refiner_run import RefinerRequest, compute_realism_gap, format_refiner_command, train
+from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, RefinerRecipe
+from priors.training.refiner_quality import RefinerEvaluator, compute_realism_gap, sample_corpus
+from priors.training.run import train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
 SETTINGS = AdversarialSettings(
@@ -54,22 +53,22 @@ def request_in(data, density):
         settings = replace(SETTINGS, **changes.pop("settings", {}))
         given = {
             "checkpoint_minutes": 0.0,
-            "report_rounds": 2,
-            "judge_rounds": 4,
+            "report_steps": 2,
+            "validate_steps": 4,
             "samples": 6,
             "judged": 2,
             "seconds": 1.2,
             "density": density,
             "config": TINY,
         } | changes
-        return RefinerRequest(data, out, settings=settings, **given)
+        return RefinerRecipe(data, out, settings=settings, **given)
 
     return made
 
 
 def killed_in(request, number):
     """Runs until a round is begun."""
-    with killing(AdversarialTrainer, "train_round", number, counter="round"):
+    with killing(AdversarialTrainer, number):
         train(request)
 
 
@@ -98,7 +97,7 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert [row["round"] for row in card.training["curve"]] == [0, 4, 6]
     for row in card.training["curve"]:
         assert {"jitter_m_s3_ratio", "score"} <= set(row)
-        assert row["round"] == 0 or row["critic_loss"] > 0
+        assert row["round"] == 0 or row["training_critic"] > 0
     assert card.quality == min(card.training["curve"], key=compute_realism_gap)
     assert f"--density {density}" in card.training["command"]
     assert [line.split(":")[0] for line in news if line.startswith("round")] == ["round 2", "round 4", "round 6"]
@@ -117,25 +116,23 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
 def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, variant, changes):
     """What is typed from the card, the command line reads as the request that wrote it."""
     config, recipe = variant
-    wanted = RefinerRequest(data, tmp_path, match="walk-[01]", config=config, settings=replace(recipe, **changes))
-    words = (
-        format_refiner_command(wanted).replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path)).split()
-    )
+    wanted = RefinerRecipe(data, tmp_path, match="walk-[01]", config=config, settings=replace(recipe, **changes))
+    words = wanted.format_command().replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path)).split()
     given = cli.parse(words[1:])
     assert isinstance(given, Train)
-    assert train_refiner.build_refiner_request(given) == wanted
+    assert given.model.recipe() == wanted
 
 
 def test_samples_go_on_from_the_clips_they_are_drawn_with(data, density, tmp_path):
     prior = priors.load(density)
     clips = corpora.read_corpus(data, match="", cache=tmp_path)
-    drawn = [refiner_run.sample_corpus(prior, clips, 4, 20, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    drawn = [sample_corpus(prior, clips, 4, 20, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     assert drawn[0].lengths == (20,) * 4
     assert drawn[0].features.shape == (80, clips.features.shape[1])
     assert torch.equal(drawn[0].features, drawn[1].features)
     assert not torch.equal(drawn[0].features, drawn[2].features)
     short = corpora.Corpus(("a", "b"), (59, 60), clips.features[:119])
-    assert refiner_run.sample_corpus(prior, short, 3, 5, torch.Generator()).lengths == (5,) * 3  # all after the longer
+    assert sample_corpus(prior, short, 3, 5, torch.Generator()).lengths == (5,) * 3  # all after the longer
 
 
 @pytest.fixture
@@ -143,25 +140,25 @@ def scripted(monkeypatch):
     """Rounds that mark a bias with their number and tell the losses given; the measures are given round by round."""
 
     def play(losses, scores):
-        step = AdversarialTrainer.train_round
+        step = AdversarialTrainer.train_step
 
-        def train_round(trainer):
+        def train_step(trainer):
             step(trainer)
             with torch.no_grad():
-                trainer.averaged_refiner.last.bias.fill_(trainer.round)
-            return losses(trainer.round)
+                trainer.network.last.bias.fill_(trainer.step)
+            return losses(trainer.step)
 
         def judged(judge, network):
             return {"jitter_m_s3_ratio": scores.get(round(network.last.bias[0].item()), 9.0)}
 
-        monkeypatch.setattr(AdversarialTrainer, "train_round", train_round)
-        monkeypatch.setattr(refiner_run.RefinerEvaluator, "__call__", judged)
+        monkeypatch.setattr(AdversarialTrainer, "train_step", train_step)
+        monkeypatch.setattr(RefinerEvaluator, "__call__", judged)
 
     return play
 
 
 def even(number):
-    return RoundLosses(refiner=0.7, critic=0.69, told=0.5, updates=1)
+    return {"refiner": 0.7, "critic": 0.69, "told": 0.5, "updates": 1}
 
 
 def kept(path):
@@ -171,7 +168,7 @@ def kept(path):
 
 def test_the_best_refiner_seen_is_exported(tmp_path, request_in, scripted):
     scripted(even, {0: 2.0, 2: 1.5, 4: 1.1, 6: 0.5})
-    path = train(request_in(tmp_path / "run", judge_rounds=2))
+    path = train(request_in(tmp_path / "run", validate_steps=2))
     assert kept(path) == 4
     card = priors.load_refiner(str(path)).card
     assert (card.quality["round"], card.quality["score"]) == (4, pytest.approx(math.log(1.1)))
@@ -180,7 +177,7 @@ def test_the_best_refiner_seen_is_exported(tmp_path, request_in, scripted):
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
 def test_a_measure_that_cannot_be_had_is_never_the_best_and_null_in_the_card(tmp_path, request_in, scripted, bad):
     scripted(even, {0: 2.0, 2: bad, 4: bad, 6: bad})
-    path = train(request_in(tmp_path / "run", judge_rounds=2))
+    path = train(request_in(tmp_path / "run", validate_steps=2))
     assert kept(path) == 0
     curve = priors.load_refiner(str(path)).card.training["curve"]
     assert [row["score"] for row in curve] == [pytest.approx(math.log(2)), None, None, None]
@@ -191,7 +188,7 @@ def test_a_measure_that_cannot_be_had_is_never_the_best_and_null_in_the_card(tmp
 def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, scripted):
     """And a resumed run stops there too, though it was killed within the report that decides."""
     news = []
-    scripted(lambda number: replace(even(number), told=1.0 if number > 4 else 0.5), {0: 2.0, 4: 1.2, 8: 1.0})
+    scripted(lambda number: even(number) | {"told": 1.0 if number > 4 else 0.5}, {0: 2.0, 4: 1.2, 8: 1.0})
     request = request_in(tmp_path / "run", settings={"rounds": 20})
     assert kept(train(request, news.append)) == 4
     assert news[-1] == "the critic has won: training ends with the best refiner seen"
@@ -204,28 +201,28 @@ def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, sc
 
 
 def test_one_report_that_is_nearly_won_does_not_stop_it(tmp_path, request_in, scripted):
-    scripted(lambda number: replace(even(number), told=0.97), {6: 1.0})
+    scripted(lambda number: even(number) | {"told": 0.97}, {6: 1.0})
     assert kept(train(request_in(tmp_path / "run"))) == 6
 
 
 @pytest.mark.parametrize("side", ["refiner", "critic"])
 def test_it_stops_with_the_best_when_it_diverges(tmp_path, request_in, scripted, side):
     news, marked = [], {0: 2.0, 4: 1.2, 6: 1.0}
-    scripted(lambda number: replace(even(number), **({side: math.nan} if number == 5 else {})), marked)
+    scripted(lambda number: even(number) | ({side: math.nan} if number == 5 else {}), marked)
     assert kept(train(request_in(tmp_path / "run"), news.append)) == 4
     assert news[-1] == "training diverged at round 5: training ends with the best refiner seen"
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 4
 
 
 def test_weights_that_are_not_finite_are_seen(tmp_path, request_in, monkeypatch):
-    step = AdversarialTrainer.train_round
+    step = AdversarialTrainer.train_step
 
     def spoiled(trainer):
-        if trainer.round == 2:
+        if trainer.step == 2:
             trainer.refiner.last.bias.data[0] = torch.nan
         return step(trainer)
 
-    monkeypatch.setattr(AdversarialTrainer, "train_round", spoiled)
+    monkeypatch.setattr(AdversarialTrainer, "train_step", spoiled)
     news = []
     path = train(request_in(tmp_path / "run"), news.append)
     assert news[-1].startswith("training diverged at round 3")
@@ -245,12 +242,12 @@ def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_
     raw = corpora.Corpus(("a", "b"), (80, 80), held)
     quick = RealismSettings(classifier=ClassifierSettings(folds=2, steps=5, width=4, batch=8), dims=2)
     trainer = AdversarialTrainer(TINY, SETTINGS, parts.train, raw)
-    row = refiner_run.RefinerEvaluator.of(raw, parts, quick)(trainer.refiner)
+    row = RefinerEvaluator.of(raw, parts, quick)(trainer.refiner)
     assert row["jitter_m_s3_ratio"] == pytest.approx(1, abs=1e-3)  # the very same clips
     assert row["contact_speed_cm_s_ratio"] == pytest.approx(1, abs=1e-3)
     assert "told_apart" not in row  # two clips are too few
     many = corpora.Split(parts.train, parts.train, parts.train)
-    judge = refiner_run.RefinerEvaluator.of(corpora.Corpus(tuple("abcd"), (80,) * 4, held.repeat(2, 1)), many, quick)
+    judge = RefinerEvaluator.of(corpora.Corpus(tuple("abcd"), (80,) * 4, held.repeat(2, 1)), many, quick)
     first, again = judge(trainer.refiner), judge(trainer.refiner)
     assert 0 <= first["told_apart"] <= 1
     assert first == again
@@ -282,7 +279,7 @@ def begun(tmp_path_factory, data, density):
     """The folder of a run of one round."""
     out = tmp_path_factory.mktemp("begun") / "run"
     settings = replace(SETTINGS, rounds=1)
-    train(RefinerRequest(data, out, density=density, config=TINY, settings=settings, samples=3, judged=1, seconds=1.2))
+    train(RefinerRecipe(data, out, density=density, config=TINY, settings=settings, samples=3, judged=1, seconds=1.2))
     return out
 
 

@@ -1,7 +1,7 @@
 """Adversarial training of the refiner: losses against their formulas, the history, the balance, and learning."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -57,7 +57,7 @@ def trainer_of(config=TINY, **changes):
 def trained(trainer, rounds=2):
     """Past the first steps, so that no weight is zero any more."""
     for _ in range(rounds):
-        trainer.train_round()
+        trainer.train_step()
     return trainer
 
 
@@ -84,7 +84,7 @@ def slopes(loss, model):
 def test_the_refiner_follows_equations_9_and_13(root):
     """-ln D of what it made, and the squared distance of the decoded hips' ways."""
     trainer = trained(trainer_of(root=root))
-    raw = drawn_next(trainer, trainer._sample_raw_windows)
+    raw = drawn_next(trainer, lambda: trainer._draw(trainer.raw))
     made, _ = trainer.refiner(raw)
     adversarial = -logsigmoid(trainer.critic(made)).mean()
     trainer.refiner.zero_grad()
@@ -119,9 +119,9 @@ def test_the_critic_follows_equation_10_on_as_many_captured_as_made():
 
     def batch():
         with torch.no_grad():
-            fresh = trainer.refiner(trainer._sample_raw_windows())[0]
+            fresh = trainer.refiner(trainer._draw(trainer.raw))[0]
         made = history.mix(fresh, trainer.generator)
-        return trainer._sample_windows(trainer.corpus, trainer.captured, SETTINGS.window), made
+        return trainer._draw(trainer.captured), made
 
     real, made = drawn_next(trainer, batch)
     odds = trainer.critic(real), trainer.critic(made)
@@ -189,10 +189,10 @@ def test_the_balance_doubles_and_halves_at_the_stated_losses(monkeypatch, loss, 
 
     monkeypatch.setattr(trainer, "_refine", refine)
     monkeypatch.setattr(trainer, "_criticise", lambda: (loss, 0.75))
-    found = [trainer.train_round() for _ in updates]
-    assert [row.updates for row in found] == updates
+    found = [trainer.train_step() for _ in updates]
+    assert [row["updates"] for row in found] == updates
     assert counts["refine"] == sum(updates)
-    assert asdict(found[0]) == {"refiner": 0.5, "critic": loss, "told": 0.75, "updates": 2}
+    assert found[0] == {"refiner": 0.5, "critic": loss, "told": 0.75, "updates": 2}
 
 
 def test_the_head_start_is_the_critics_and_the_warm_up_of_both_and_both_come_once(monkeypatch):
@@ -200,10 +200,10 @@ def test_the_head_start_is_the_critics_and_the_warm_up_of_both_and_both_come_onc
     steps = []
     monkeypatch.setattr(trainer, "_refine", lambda: steps.append("r") or 0.5)
     monkeypatch.setattr(trainer, "_criticise", lambda: steps.append("c") or (0.5, 0.5))
-    trainer.train_round()
-    trainer.train_round()
+    trainer.train_step()
+    trainer.train_step()
     assert "".join(steps) == "ccc" + "rc" * 4 + "rrccc" * 2
-    assert trainer.round == 2
+    assert trainer.step == 2
 
 
 def test_a_rounds_losses_are_means_of_its_updates(monkeypatch):
@@ -211,8 +211,8 @@ def test_a_rounds_losses_are_means_of_its_updates(monkeypatch):
     refined, judged = iter([0.2, 0.6]), iter([(0.5, 1.0), (0.7, 0.5)])
     monkeypatch.setattr(trainer, "_refine", lambda: next(refined))
     monkeypatch.setattr(trainer, "_criticise", lambda: next(judged))
-    found = trainer.train_round()
-    assert (found.refiner, found.critic, found.told) == pytest.approx((0.4, 0.6, 0.75))
+    found = trainer.train_step()
+    assert found == pytest.approx({"refiner": 0.4, "critic": 0.6, "told": 0.75, "updates": 2})
 
 
 def test_the_critic_learns_to_tell_obviously_different_windows():
@@ -240,7 +240,7 @@ def test_the_refiner_lowers_its_loss_and_keeps_the_roots_way_where_that_weighs_m
     trainer = trainer_of(replace(TINY, limit=3.0), refiner_rate=2e-2, root=root)
     trainer.critic.load_state_dict(critic_that_knows())
     losses = [trainer._refine() for _ in range(40)]
-    raw = drawn_next(trainer, trainer._sample_raw_windows)
+    raw = drawn_next(trainer, lambda: trainer._draw(trainer.raw))
     with torch.no_grad():
         metres = float(training._compute_root_error(raw[:, 2:], trainer.refiner(raw)[0])) ** 0.5
     if root:
@@ -257,8 +257,8 @@ def test_rounds_go_on_from_a_state_to_the_bit(optimiser, bfloat16):
     whole = trained(trainer_of(**changes), 2)
     state = {name: value.clone() for name, value in whole.state().items()}
     resumed = trainer_of(**changes)
-    resumed.load_state(state)
-    assert [whole.train_round() for _ in range(3)] == [resumed.train_round() for _ in range(3)]
+    resumed.load_state(state, whole.step)
+    assert [whole.train_step() for _ in range(3)] == [resumed.train_step() for _ in range(3)]
     assert whole.state().keys() == resumed.state().keys()
     for name, value in whole.state().items():
         assert torch.equal(resumed.state()[name], value), name
@@ -273,7 +273,7 @@ def test_a_state_that_is_not_whole_is_refused(drop):
     partial = {name: value for name, value in state.items() if not name.startswith(drop)}
     assert len(partial) < len(state)
     with pytest.raises((KeyError, RuntimeError)):
-        trainer_of().load_state(partial)
+        trainer_of().load_state(partial, 1)
 
 
 def test_the_same_seed_gives_the_same_and_the_callers_random_numbers_are_left_alone():
@@ -289,7 +289,8 @@ def test_the_same_seed_gives_the_same_and_the_callers_random_numbers_are_left_al
 
 def test_windows_of_both_kinds_are_mirrored_with_even_odds():
     trainer = trainer_of(batch=200, history=200)
-    drawn = trainer._sample_windows(captured(), torch.tensor([7]), 12)
+    trainer.captured.starts = torch.tensor([7])
+    drawn = trainer._draw(trainer.captured)
     plain = captured().features[7:19]
     mirrored = int((drawn == mirror_features(plain)).all(-1).all(-1).sum())
     assert mirrored + int((drawn == plain).all(-1).all(-1).sum()) == 200
@@ -341,7 +342,7 @@ def test_impossible_recipes_are_refused(change, said):
 
 
 def test_the_shortest_window_allowed_can_be_judged():
-    assert trained(trainer_of(window=4)).train_round().finite
+    assert all(map(math.isfinite, trained(trainer_of(window=4)).train_step().values()))
 
 
 def test_samples_shorter_than_a_window_are_refused():
@@ -368,8 +369,8 @@ def test_the_critic_can_see_slow_feet_magnified():
 def test_what_is_kept_is_the_running_mean_of_the_weights():
     last, mean = (trained(trainer_of(average=average), rounds=1) for average in (0.0, 0.9))
     for name, value in last.refiner.state_dict().items():
-        assert torch.equal(value, last.averaged_refiner.state_dict()[name])
-    kept, latest = (model.last.weight.detach().norm() for model in (mean.averaged_refiner, mean.refiner))
+        assert torch.equal(value, last.network.state_dict()[name])
+    kept, latest = (model.last.weight.detach().norm() for model in (mean.network, mean.refiner))
     assert 0 < float(kept) < 0.7 * float(latest)
 
 

@@ -1,4 +1,4 @@
-"""What `mapctl train denoiser` is made of; its runs are tested in test_window_run."""
+"""What `mapctl train denoiser` is made of; its runs are tested in test_network_runs."""
 
 import math
 from dataclasses import replace
@@ -9,27 +9,31 @@ from helpers import corpus, generator
 
 from mapctl import cli
 from mapctl.commands.train import Train
-from mapctl.commands.train import windows as train_windows
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.denoiser.network import DenoiserConfig
 from priors.training.augmentation.corruption import CorruptionSettings
 from priors.training.corpus import Corpus
-from priors.training.denoiser_run import DenoiserRequest, train
 from priors.training.recipes.denoiser import (
+    DenoiserRecipe,
     DenoiserSettings,
     DenoiserTrainer,
-    FeatureWindows,
     compute_denoiser_losses,
-    validate,
+    draw_performers,
 )
+from priors.training.run import train
+from priors.training.windows import FeatureWindows
 
 TINY = DenoiserConfig(width=8, dilations=(1, 2))
 SETTINGS = DenoiserSettings(steps=6, batch=3, window=16)
 
 
+def drawn_of(data, settings, seed=0):
+    return draw_performers(FeatureWindows(data, settings.window, evenness=settings.evenness), settings, generator(seed))
+
+
 def test_clips_shorter_than_the_window_are_left_out(tmp_path, data):
-    request = DenoiserRequest(data, tmp_path / "run", config=TINY, settings=replace(SETTINGS, window=90))
+    request = DenoiserRecipe(data, tmp_path / "run", config=TINY, settings=replace(SETTINGS, window=90))
     with pytest.raises(RequestError, match="no clip is as long as the window"):
         train(request)
 
@@ -38,19 +42,19 @@ def test_a_width_of_nothing_is_refused():
     given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", "--width", "0"])
     assert isinstance(given, Train)
     with pytest.raises(RequestError, match="--width must be at least 1"):
-        train_windows.build_window_request(given)
+        given.model.recipe()
 
 
 def test_windows_are_clips_mirrored_half_of_the_time():
     plain = replace(SETTINGS, calibration_deg=0.0, batch=64, corruption=CorruptionSettings(size=0.0))
     whole = corpus(2, 40)
-    drawn = FeatureWindows(whole, plain).draw(generator())
+    drawn = drawn_of(whole, plain)
     assert drawn.shape == (64, 16, LAYOUT.size)
     every = whole.features.unfold(0, 16, 1).transpose(1, 2)
     same = torch.cdist(drawn.flatten(1), every.flatten(1)).amin(dim=1) < 1e-3
     assert 0.3 < same.double().mean() < 0.7
-    assert torch.equal(drawn, FeatureWindows(whole, plain).draw(generator()))
-    assert not torch.equal(drawn, FeatureWindows(whole, plain).draw(generator(1)))
+    assert torch.equal(drawn, drawn_of(whole, plain))
+    assert not torch.equal(drawn, drawn_of(whole, plain, seed=1))
 
 
 def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
@@ -60,7 +64,7 @@ def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
     )
 
     def share(evenness):
-        windows = FeatureWindows(uneven, replace(SETTINGS, batch=600, evenness=evenness)).draw(generator())
+        windows = drawn_of(uneven, replace(SETTINGS, batch=600, evenness=evenness))
         return float((windows[:, 0, LAYOUT.slices["root_height"]] > 50).double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.05)
@@ -71,7 +75,7 @@ def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
     """Joint frames turned by a constant: what does not move still does not, the hips' place stays."""
     still = corpus(1, 16).features[:1].expand(16, -1).contiguous()
     settings = replace(SETTINGS, batch=20, calibration_deg=10.0, corruption=CorruptionSettings(size=0.0))
-    drawn = FeatureWindows(Corpus(("a",), (16,), still), settings).draw(generator())
+    drawn = drawn_of(Corpus(("a",), (16,), still), settings)
     joints = LAYOUT.pick(drawn, "joint_rotations")
     assert torch.diff(joints, dim=1).abs().max() < 1e-5
     turned = (joints - joints[:1]).abs().amax(dim=(1, 2)) > 0.05
@@ -104,7 +108,7 @@ def test_the_loss_falls_on_windows_that_it_sees_again_and_again():
 
 def test_validation_is_the_same_each_time():
     trainer = DenoiserTrainer(TINY, SETTINGS, corpus(1, 30))
-    first, again = (validate(trainer.network, corpus(2, 30), SETTINGS) for _ in range(2))
+    first, again = (trainer.validate(corpus(2, 30)) for _ in range(2))
     assert first == again
     assert set(first) == {"loss", "error_cm", "feet_cm_frame", "angles_deg", "contacts_nats"}
 

@@ -1,4 +1,4 @@
-"""What `mapctl train infiller` is made of; its runs are tested in test_window_run."""
+"""What `mapctl train infiller` is made of; its runs are tested in test_network_runs."""
 
 import math
 from dataclasses import replace
@@ -14,7 +14,7 @@ from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL
 from priors.infiller.network import InfillerConfig
 from priors.training.augmentation.gap_masks import GapSettings
-from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, compute_infiller_losses, validate
+from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, compute_infiller_losses
 from priors.training.windows import PositionWindows
 
 SETTINGS = InfillerSettings(steps=6, batch=4, window=32)
@@ -114,7 +114,7 @@ def test_gaps_grow_in_the_course_of_training():
 def test_validation_is_the_same_each_time_and_compares_with_the_guess():
     settings = replace(SETTINGS, window=80)
     trainer = InfillerTrainer(CONFIG, settings, corpus(1, 100))
-    first, again = (validate(trainer.network, corpus(2, 100), settings) for _ in range(2))
+    first, again = (trainer.validate(corpus(2, 100)) for _ in range(2))
     assert first == again
     assert set(first) == {f"{name}_{gap}_cm" for name in ("error", "guess") for gap in (15, 30, 60)}
     assert all(first[f"error_{gap}_cm"] == first[f"guess_{gap}_cm"] for gap in (15, 30, 60))  # untrained
@@ -123,7 +123,7 @@ def test_validation_is_the_same_each_time_and_compares_with_the_guess():
 
 def test_validation_leaves_out_gaps_that_leave_nothing_of_a_window():
     trainer = InfillerTrainer(CONFIG, SETTINGS, corpus(1, 40))
-    found = validate(trainer.network, corpus(2, 40), SETTINGS)
+    found = trainer.validate(corpus(2, 40))
     assert set(found) == {"error_15_cm", "guess_15_cm"}
 
 

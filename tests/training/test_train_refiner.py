@@ -9,16 +9,16 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 from mapctl import cli
-from mapctl.commands.train import Train, refiner
+from mapctl.commands.train import Train
 from priors.refiner.network import RefinerConfig
-from priors.training import refiner_run
+from priors.training import run
 from priors.training.recipes.refiner import PAPER, AdversarialSettings
 
 
 def requested(*words):
     command = cli.parse(["train", "refiner", "--data", "data", "-o", "run", *words])
     assert isinstance(command, Train)
-    return refiner.build_refiner_request(command)
+    return command.model.recipe()
 
 
 def test_what_is_not_asked_for_is_the_measured_recipe():
@@ -47,8 +47,6 @@ def test_every_option_reaches_the_trainer():
         "--resume",
         "--licence",
         "CC0",
-        "--device",
-        "cpu",
         "--strict-data",
         "--minutes-between-checkpoints",
         "0.5",
@@ -64,7 +62,7 @@ def test_every_option_reaches_the_trainer():
 
 def test_help_names_what_a_refiner_takes(capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["train", "--help"])
+        cli.main(["train", "refiner", "--help"])
     assert stop.value.code == 0
     told = capsys.readouterr().out
     for word in (
@@ -85,7 +83,7 @@ def test_help_names_what_a_refiner_takes(capsys):
 
 
 def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
-    train = refiner_run.train
+    train = run.train
 
     def tiny(request, say, *, warn):
         settings = replace(request.settings, window=10, batch=4, history=8, head_start=1, warm_up=1, critic_width=6)
@@ -94,7 +92,7 @@ def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
             replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say, warn=warn
         )
 
-    monkeypatch.setattr(refiner_run, "train", tiny)
+    monkeypatch.setattr(run, "train", tiny)
     data, prior = write_corpus(tmp_path / "data"), str(save_tiny_prior(tmp_path / "tiny.safetensors"))
     words = ["train", "refiner", "--data", data, "-o", tmp_path / "run", "--density", prior, "--steps", 2]
     assert cli.main([str(word) for word in words]) == 0

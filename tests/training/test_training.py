@@ -17,23 +17,34 @@ from mapctl.features import LAYOUT, encode, ground_speed, mirror_features
 from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import free_run, initial_states, run
-from priors.training.recipes.lstm_gmm import PAPER, DensityTrainer, TrainingSettings, compute_feature_statistics
-from priors.training.run import DensityRequest, train
+from priors.training import density_quality, initial_states
+from priors.training.recipes.lstm_gmm import (
+    PAPER,
+    DensityRecipe,
+    DensityTrainer,
+    TrainingSettings,
+    compute_feature_statistics,
+)
+from priors.training.run import train
 
 TINY = LstmGmmConfig(width=8, components=2)
+MEASURE = density_quality.measure_free_runs
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
+
+
+def shorten_free_runs(monkeypatch):
+    monkeypatch.setattr(density_quality, "measure_free_runs", partial(MEASURE, runs=2, frames=20))
 
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
+    shorten_free_runs(monkeypatch)
 
 
 def request_in(out, data, **changes):
     """Checkpoints at every step, so that a kill can come anywhere."""
     settings = replace(SETTINGS, **changes.pop("settings", {}))
-    return DensityRequest(
+    return DensityRecipe(
         data,
         out,
         config=TINY,
@@ -81,7 +92,7 @@ def test_steps_lower_the_loss(recipe):
     config, settings = (TINY, SETTINGS) if recipe == "ours" else PAPER
     config, settings = replace(config, width=8), replace(settings, steps=400, batch=8, window=20, learning_rate=5e-3)
     trainer = DensityTrainer(config, settings, corpus())
-    losses = [trainer.train_step() for _ in range(60)]
+    losses = [trainer.train_step()["loss"] for _ in range(60)]
     assert sum(losses[-5:]) < sum(losses[:5]) - 10
 
 
@@ -97,7 +108,7 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert "mapctl train lstm-gmm" in card.training["command"]
     assert "--skip-first" not in card.training["command"]
     other = request_in(out, data, skip_first=True, settings={"bfloat16": True})
-    assert "--skip-first --bfloat16" in run.format_density_command(other)
+    assert "--skip-first --bfloat16" in other.format_command()
     held = card.data["held_out"]["validation"] + card.data["held_out"]["test"]
     assert len(held) == 2
     assert not set(held) & set(card.data["starts"])
@@ -220,11 +231,11 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, 
 
     def diverging(trainer):
         if trainer.step == 3 and how == "weights":
-            trainer.model.fc1.weight.data[0, 0] = torch.nan
+            trainer.network.fc1.weight.data[0, 0] = torch.nan
             trainer.step += 1
-            return 1.0
+            return {"loss": 1.0}
         if trainer.step == 3:
-            trainer.features = trainer.features * torch.nan
+            trainer.windows.features = trainer.windows.features * torch.nan
         return step(trainer)
 
     monkeypatch.setattr(DensityTrainer, "train_step", diverging)
@@ -233,12 +244,12 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, 
     assert json.loads((out / "checkpoint.json").read_text())["step"] == 3
     assert not (out / "model.safetensors").exists()
     monkeypatch.undo()
-    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
+    shorten_free_runs(monkeypatch)
     assert train(request_in(out, data, resume=True)).exists()
 
 
 def test_what_is_not_finite_is_null_in_the_curve(tmp_path, data, monkeypatch):
-    monkeypatch.setattr(run, "measure_free_runs", lambda model, corpus: {"free_run_speed_ratio": math.inf})
+    monkeypatch.setattr(density_quality, "measure_free_runs", lambda model, corpus: {"free_run_speed_ratio": math.inf})
     card = priors.load(str(train(request_in(tmp_path / "run", data)))).card
     assert card.training["curve"][-1]["free_run_speed_ratio"] is None
     for file in (tmp_path / "run").glob("*.json"):
@@ -280,14 +291,14 @@ def test_a_trainer_leaves_the_callers_random_numbers_alone():
     first = DensityTrainer(TINY, SETTINGS, corpus())
     assert torch.equal(torch.rand(3), expected)
     second = DensityTrainer(TINY, SETTINGS, corpus())
-    assert torch.equal(first.model.fc1.weight, second.model.fc1.weight)
+    assert torch.equal(first.network.fc1.weight, second.network.fc1.weight)
 
 
 def test_each_window_is_mirrored_with_even_odds():
     trainer = DensityTrainer(TINY, replace(SETTINGS, batch=1), corpus())
-    trainer.starts = trainer.starts[:1]
-    plain = trainer.features[: SETTINGS.window + 1]
-    drawn = [trainer._sample_windows()[0][0] for _ in range(200)]
+    trainer.windows.starts = trainer.windows.starts[:1]
+    plain = trainer.windows.features[: SETTINGS.window + 1]
+    drawn = [trainer._draw_windows()[0][0] for _ in range(200)]
     mirrored = sum(torch.equal(window, mirror_features(plain)) for window in drawn)
     assert mirrored + sum(torch.equal(window, plain) for window in drawn) == 200
     assert 70 < mirrored < 130
@@ -361,7 +372,7 @@ def test_a_cache_of_other_rig_tables_or_contact_thresholds_is_not_taken(tmp_path
     corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     table, contacts = corpora.rigs.known_rigs(), corpora.ContactSettings
     for what, other in (
-        ("rigs.known", lambda: (*table[:-1], replace(table[-1], straighten=("leftHand",)))),
+        ("rigs.known_rigs", lambda: (*table[:-1], replace(table[-1], straighten=("leftHand",)))),
         ("ContactSettings", partial(contacts, slow=0.4)),
     ):
         with monkeypatch.context() as patch:
@@ -399,13 +410,13 @@ def test_statistics_are_symmetric_and_floored():
 def test_starts_are_the_states_after_stretches_of_clips():
     data = corpus()
     trainer = DensityTrainer(TINY, SETTINGS, data)
-    found = initial_states.select_initial_states(trainer.model, data, count=3, generator=generator())
+    found = initial_states.select_initial_states(trainer.network, data, count=3, generator=generator())
     assert len(set(found.names)) == 3
     clips = dict(zip(data.names, data.clips(), strict=True))
     for row, name in enumerate(found.names):
         clip = clips[name]
         end = 1 + int((clip == found.state.last_frame[row]).all(-1).nonzero()[0])
-        expected = trainer.model.advance(trainer.model.start_after(clip[:1]), clip[None, 1:end])
+        expected = trainer.network.advance(trainer.network.start_after(clip[:1]), clip[None, 1:end])
         torch.testing.assert_close(found.state.hidden[:, row], expected.hidden[:, 0])
         assert float(found.speed[row]) == pytest.approx(float(ground_speed(clip[end - 30 : end]).mean()), rel=1e-5)
 
@@ -421,7 +432,7 @@ def test_abilities_are_the_speeds_and_turns_of_the_data():
 
 def test_free_runs_are_compared_with_the_data():
     data = corpus()
-    found = free_run.measure_free_runs(DensityTrainer(TINY, SETTINGS, data).model, data, runs=4, frames=40)
+    found = MEASURE(DensityTrainer(TINY, SETTINGS, data).network, data, runs=4, frames=40)
     assert found["free_run_finite"] == 1
     assert found["free_run_speed_ratio"] == pytest.approx(1, abs=0.3)
     assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)

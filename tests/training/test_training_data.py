@@ -14,10 +14,10 @@ import priors
 from mapctl import retarget
 from mapctl.errors import RequestError
 from priors.training import corpus as corpora
-from priors.training import denoiser_run, free_run, infiller_run
-from priors.training import run as density_run
+from priors.training import density_quality
+from priors.training import run as training_run
 from priors.training.gathering import DataSource, gather
-from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, validate
+from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer
 
 BALL = (
     "HIERARCHY\nROOT Ball\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\nEnd Site\n{\nOFFSET 0 1 0\n}\n}\n"
@@ -27,7 +27,8 @@ ONE_FRAME = "one.bvh: features need at least two frames"
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(density_run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
+    whole = density_quality.measure_free_runs
+    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
 
 
 def write_walks(folder, *lengths):
@@ -154,12 +155,13 @@ MODELS = {
 @pytest.fixture(params=MODELS)
 def model(request, monkeypatch):
     """Its name, words for a small one, and what loads it."""
-    tiny = {"denoiser": (denoiser_run, tiny_denoiser.CONFIG), "infiller": (infiller_run, tiny_infiller.CONFIG)}
+    tiny = {"denoiser": tiny_denoiser.CONFIG, "infiller": tiny_infiller.CONFIG}
     if request.param in tiny:
-        runs, config = tiny[request.param]
-        train = runs.train
+        config, train = tiny[request.param], training_run.train
         monkeypatch.setattr(
-            runs, "train", lambda request, *words, **options: train(replace(request, config=config), *words, **options)
+            training_run,
+            "train",
+            lambda recipe, *words, **options: train(replace(recipe, config=config), *words, **options),
         )
     return (request.param, *MODELS[request.param])
 
@@ -229,4 +231,4 @@ def test_five_clips_are_held_out_whole():
 def test_a_window_longer_than_what_is_held_out_does_not_end_a_run():
     settings = DenoiserSettings(steps=1, batch=2, window=90)
     trainer = DenoiserTrainer(tiny_denoiser.CONFIG, settings, corpus(2, 100))
-    assert validate(trainer.network, corpus(1, 80), settings)["error_cm"] > 0
+    assert trainer.validate(corpus(1, 80))["error_cm"] > 0

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -21,38 +20,28 @@ from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
 from mapctl import cli
-from mapctl.commands.shared import resumption
-from mapctl.commands.train import Train
+from mapctl.commands import SUBCOMMANDS
 from mapctl.runtime import interruption
 from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner.network import RefinerConfig
-from priors.training import corpus, denoiser_run, free_run, infiller_run, refiner_run, run, run_files, window_run
-from priors.training.recipes import lstm_gmm, refiner
+from priors.training import corpus, density_quality, run, run_files
+from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, refiner
 
 
 @dataclass(frozen=True)
 class Model:
     """A model, and a recipe of six steps that are judged at every other."""
 
-    name: str
-    runs: ModuleType
-    """`train` is there."""
-    run: type
-    """What `loop.go` is given."""
     trainer: type
-    step: str
-    """The trainer's method."""
-    counter: str
-    """Its steps so far."""
-    request: Callable[[Path, Path, str], Any]
+    recipe: Callable[[Path, Path, str], Any]
     """Of data, run folder and density."""
 
 
 def _density(data, out, prior):
     settings = lstm_gmm.TrainingSettings(steps=6, batch=4, window=20)
-    return run.DensityRequest(
+    return lstm_gmm.DensityRecipe(
         data,
         out,
         config=LstmGmmConfig(width=8, components=2),
@@ -76,7 +65,7 @@ def _refiner(data, out, prior):
         critic_around=1,
     )
     config = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
-    return refiner_run.RefinerRequest(
+    return refiner.RefinerRecipe(
         data,
         out,
         density=prior,
@@ -85,43 +74,52 @@ def _refiner(data, out, prior):
         samples=6,
         judged=2,
         seconds=1.2,
-        report_rounds=2,
-        judge_rounds=2,
+        report_steps=2,
+        validate_steps=2,
     )
 
 
-def _windowed(runs, request, config):
+def _windowed(recipe, config):
     def made(data, out, prior):
-        usual = request(data, out, config=config, validate_steps=2)
+        usual = recipe(data, out, config=config, validate_steps=2)
         return replace(usual, settings=replace(usual.settings, steps=6, batch=3, window=32))
 
-    return Model(runs.KIND.name, runs, window_run._WindowRun, runs.KIND.trainer, "train_step", "step", made)
+    return made
 
 
-MODELS = (
-    Model("lstm-gmm", run, run._DensityRun, lstm_gmm.DensityTrainer, "train_step", "step", _density),
-    Model(
-        "refiner", refiner_run, refiner_run._RefinerRun, refiner.AdversarialTrainer, "train_round", "round", _refiner
-    ),
-    _windowed(denoiser_run, denoiser_run.DenoiserRequest, tiny_denoiser.CONFIG),
-    _windowed(infiller_run, infiller_run.InfillerRequest, tiny_infiller.CONFIG),
-)
+def _timing(data, out, prior):
+    settings = keyframe_timing.KeyframeTimingSettings(steps=6)
+    return keyframe_timing.KeyframeTimingRecipe(data, out, settings=settings, validate_steps=2)
 
 
-@pytest.fixture(params=MODELS, ids=lambda model: model.name)
+MODELS = {
+    "lstm-gmm": Model(lstm_gmm.DensityTrainer, _density),
+    "refiner": Model(refiner.AdversarialTrainer, _refiner),
+    "denoiser": Model(denoiser.DenoiserTrainer, _windowed(denoiser.DenoiserRecipe, tiny_denoiser.CONFIG)),
+    "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
+    "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
+}
+
+
+def test_whatever_can_be_trained_is_ended_here():
+    assert list(MODELS) == list(SUBCOMMANDS["train"])
+
+
+@pytest.fixture(params=MODELS)
 def model(request):
-    return request.param
+    return MODELS[request.param]
 
 
 @pytest.fixture(autouse=True)
 def short_free_runs(monkeypatch):
-    monkeypatch.setattr(run, "measure_free_runs", partial(free_run.measure_free_runs, runs=2, frames=20))
+    whole = density_quality.measure_free_runs
+    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
 
 
 @pytest.fixture
 def request_in(data, model, prior):
     """Without checkpoints but at the end and where a run is ended."""
-    return lambda out, **changes: replace(model.request(data, out, prior), **changes)
+    return lambda out, **changes: replace(model.recipe(data, out, prior), **changes)
 
 
 def send(number=signal.SIGTERM):
@@ -141,25 +139,25 @@ def handlers():
 
 
 def ended(model, request, *, at, method=None, how=send):
-    """Trains until a step or another method of the trainer or run is begun at so many steps, then sends a signal.
+    """Trains until a step or another method of trainer or run is begun at so many steps, then sends a signal.
 
     Returns the step that is saved, and the last one of the curve.
     """
     interruption.raise_on_signals()
-    owner, name = method or (model.trainer, model.step)
+    owner, name = method or (model.trainer, "train_step")
     whole = getattr(owner, name)
 
     def signalled(self):
-        if getattr(getattr(self, "trainer", self), model.counter) == at:
+        if getattr(self, "trainer", self).step == at:
             how()
         return whole(self)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(owner, name, signalled)
         with pytest.raises(KeyboardInterrupt):
-            model.runs.train(request)
+            run.train(request)
     index = json.loads((request.out / "checkpoint.json").read_text())
-    return index["step"], index["curve"][-1][model.counter] if index["curve"] else 0
+    return index["step"], index["curve"][-1][request.counter] if index["curve"] else 0
 
 
 FILES = ("model.safetensors", "model.json", "step-6-checkpoint.safetensors", "checkpoint.json")
@@ -168,7 +166,7 @@ FILES = ("model.safetensors", "model.json", "step-6-checkpoint.safetensors", "ch
 @pytest.fixture
 def whole(tmp_path, model, request_in):
     """The folder of an uninterrupted run."""
-    model.runs.train(request_in(tmp_path / "whole"))
+    run.train(request_in(tmp_path / "whole"))
     return tmp_path / "whole"
 
 
@@ -186,38 +184,40 @@ def test_ended_in_a_step_it_goes_on_to_the_bit(tmp_path, model, request_in, whol
     request = replace(request, resume=True)
     assert ended(model, request, at=2, how=partial(send, signal.SIGINT)) == (3, 2)
     assert ended(model, request, at=5, how=partial(send, signal.SIGHUP)) == (6, 4)
-    model.runs.train(request)
+    run.train(request)
     assert_same(tmp_path / "parts", whole)
 
 
 def test_ended_in_a_judgement_it_is_judged_again(tmp_path, model, request_in, whole):
-    request, judge = request_in(tmp_path / "parts"), (model.run, "judge")
+    request, judge = request_in(tmp_path / "parts"), (run.TrainingRun, "judge")
     assert ended(model, request, at=4, method=judge) == (4, 2)
     assert ended(model, replace(request, resume=True), at=6, method=judge) == (6, 4)
-    model.runs.train(replace(request, resume=True))
+    run.train(replace(request, resume=True))
     assert_same(tmp_path / "parts", whole)
 
 
 def test_ended_just_after_a_judgement_it_is_not_judged_again(tmp_path, model, request_in, whole):
+    request = request_in(tmp_path / "parts")
+
     def news(line):
-        if line.startswith("{") and json.loads(line)[model.counter] == 4:
+        if line.startswith("{") and json.loads(line)[request.counter] == 4:
             send()
 
     interruption.raise_on_signals()
     with pytest.raises(KeyboardInterrupt):
-        model.runs.train(request_in(tmp_path / "parts"), news)
-    model.runs.train(request_in(tmp_path / "parts", resume=True))
+        run.train(request, news)
+    run.train(request_in(tmp_path / "parts", resume=True))
     assert_same(tmp_path / "parts", whole)
 
 
 def test_ended_while_it_exports_it_exports_again(tmp_path, model, request_in, whole, monkeypatch):
     interruption.raise_on_signals()
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoints, "save", lambda *words: send())
+        patch.setattr(checkpoints, "save", lambda *words, **options: send())
         with pytest.raises(KeyboardInterrupt):
-            model.runs.train(request_in(tmp_path / "parts"))
+            run.train(request_in(tmp_path / "parts"))
     assert not (tmp_path / "parts" / "model.safetensors").exists()
-    model.runs.train(request_in(tmp_path / "parts", resume=True))
+    run.train(request_in(tmp_path / "parts", resume=True))
     assert_same(tmp_path / "parts", whole)
 
 
@@ -235,7 +235,7 @@ def test_signals_while_it_saves_do_not_stop_that(tmp_path, model, request_in, wh
     with monkeypatch.context() as patch:
         patch.setattr(run_files, "write_checkpoint", bothered)
         assert ended(model, request_in(tmp_path / "parts"), at=2) == (3, 2)
-    model.runs.train(request_in(tmp_path / "parts", resume=True))
+    run.train(request_in(tmp_path / "parts", resume=True))
     assert_same(tmp_path / "parts", whole)
 
 
@@ -262,7 +262,7 @@ def test_ended_before_the_first_step_it_saves_nothing(tmp_path, model, request_i
 
     monkeypatch.setattr(interruption, "DeferredSignals", held_from_the_beginning)
     with pytest.raises(KeyboardInterrupt):
-        model.runs.train(request_in(tmp_path / "run"))
+        run.train(request_in(tmp_path / "run"))
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
@@ -347,7 +347,7 @@ def test_every_option_is_in_the_line():
     ]
     given = cli.parse(words)
     assert isinstance(given, Train)
-    assert cli.parse(resumption.format_command(given)[1:]) == given
+    assert cli.parse(given.model.format_command()[1:]) == given
 
 
 def test_a_full_disk_ends_it_with_its_last_checkpoint(tmp_path, data, monkeypatch, capsys):

@@ -1,48 +1,40 @@
-"""`mapctl train refiner`: the options of `mapctl train` that a refiner has, and the run."""
+"""`mapctl train refiner`: the options of a refiner."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated
 
-from mapctl.commands.shared import outputs
-from mapctl.commands.shared.threads import use_single_thread
-from mapctl.commands.train import checks
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.train.options import NetworkOptions
 
 if TYPE_CHECKING:
-    from mapctl.commands.train import Train
-    from priors.training.refiner_run import RefinerRequest
-
-_FOREIGN_OPTIONS = ("width", "components", "learning_rate", "labels", "init", "skip_first", "architecture")
+    from priors.training.recipes.refiner import RefinerRecipe
 
 
-def train_refiner(given: "Train", say: Callable[[str], None]) -> Path:
-    """Check, train, and return where the refiner lies."""
-    wanted = build_refiner_request(given)
-    outputs.check_folder(given.out)
-    use_single_thread()
-    from priors.training import refiner_run
+@dataclass(frozen=True)
+class TrainRefiner(NetworkOptions):
+    """Train a refiner, which makes a density's samples look captured."""
 
-    return refiner_run.train(wanted, say, warn=checks.warn)
+    model = "refiner"
+    used_by = "use it with --refiner"
 
+    match: Annotated[str | None, arg(metavar="REGEX")] = None
+    """Only clips whose path below the data folder holds this regular expression; by default the clips that the density
+    was trained on."""
+    steps: options.MaybeCount = None
+    """Rounds of some updates of the refiner and of its critic."""
+    density: options.Name = "locomotion"
+    """The prior whose samples it refines."""
+    paper: bool = False
+    """The paper's own network and recipe instead of the measured better one; other options still hold."""
 
-def build_refiner_request(given: "Train") -> "RefinerRequest":
-    """The options as the trainer takes them; RequestError for those that a refiner has not."""
-    from priors.training.recipes.refiner import PAPER, AdversarialSettings
-    from priors.training.refiner_run import RefinerConfig, RefinerRequest
+    def recipe(self) -> "RefinerRecipe":
+        """The options as the trainer takes them; RequestError for numbers that make no sense."""
+        from priors.training.recipes.refiner import PAPER, AdversarialSettings, RefinerConfig, RefinerRecipe
 
-    checks.check_options(given, model="a refiner", foreign=_FOREIGN_OPTIONS)
-    config, settings = PAPER if given.paper else (RefinerConfig(), AdversarialSettings())
-    recipe = checks.select_given(given, "batch", "window", "seed", rounds="steps")
-    return RefinerRequest(
-        data=given.data,
-        out=given.out,
-        density=given.density,
-        match=given.match,
-        config=config,
-        settings=replace(settings, bfloat16=given.bfloat16, **recipe),
-        resume=given.resume,
-        checkpoint_minutes=given.minutes_between_checkpoints,
-        licence=given.licence,
-        strict_data=given.strict_data,
-    )
+        common = self.common()
+        config, settings = PAPER if self.paper else (RefinerConfig(), AdversarialSettings())
+        given = self.select_given("batch", "window", "seed", rounds="steps")
+        settings = replace(settings, bfloat16=self.bfloat16, **given)
+        return RefinerRecipe(**common, config=config, settings=settings, density=self.density)

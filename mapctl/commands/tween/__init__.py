@@ -29,6 +29,8 @@ class Tween(Command):
     suggest_timing: bool = False
     """Tell how many frames the way from each whole pose to the next takes in mocap, beside what is given; the motion
     keeps the given timing."""
+    timing: options.MaybeName = None
+    """The file or run folder of a trained keyframe timing for --suggest-timing; the bundled one if not given."""
     method: Annotated[Literal["map", "infiller", "slerp"], arg(metavar="map|infiller|slerp")] = "map"
     """map: the infiller proposes, or a density is rolled between keys so far apart that the infiller would slide, and
     the MAP stage finishes; a note tells for every gap who proposed. infiller: its proposal on rigid bones. slerp: none

@@ -50,7 +50,10 @@ def _tell(command: Tween, done: InfillResult, asked: KeyframeClip, intervals: Se
 
 
 def _suggest_timing(command: Tween, asked: KeyframeClip) -> list[KeyInterval]:
-    return suggest_intervals(asked.motion, asked.keys, asked.rig) if command.suggest_timing else []
+    if not command.suggest_timing:
+        return []
+    timing = priors.load_keyframe_timing(command.timing or "keyframe-timing")
+    return suggest_intervals(asked.motion, asked.keys, timing, asked.rig)
 
 
 def _is_key_file(command: Tween) -> bool:
@@ -64,6 +67,8 @@ def _read_key_request(command: Tween) -> KeyRequest | None:
 
 def _check(command: Tween, given: Sequence[Path]) -> None:
     """Of the options; files that are given are read, and so not written."""
+    if command.timing is not None and not command.suggest_timing:
+        raise RequestError("--timing is what --suggest-timing asks; without that it does nothing")
     if command.joints is not None and command.root_only:
         raise RequestError("--joints and --root-only are two kinds of keys; choose one")
     idle = [

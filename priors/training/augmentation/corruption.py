@@ -2,7 +2,6 @@
 anything. How much of each is drawn anew for every window, and the network is told the noise as a file's would be.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +13,7 @@ from mapctl.features import GroundPose
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
+from priors.training.augmentation.draws import Draws
 
 _JOINTS = CANONICAL.num_joints
 
@@ -54,26 +54,6 @@ class CorruptionSettings:
     """Spread of a performer's size: of the logarithm of the way of the hips."""
 
 
-LIMBS = tuple(
-    tuple(CANONICAL.index(name) for name in names)
-    for names in (
-        ("leftShoulder", "leftUpperArm", "leftLowerArm", "leftHand"),
-        ("leftUpperArm", "leftLowerArm", "leftHand"),
-        ("rightShoulder", "rightUpperArm", "rightLowerArm", "rightHand"),
-        ("rightUpperArm", "rightLowerArm", "rightHand"),
-        ("leftLowerArm", "leftHand"),
-        ("rightLowerArm", "rightHand"),
-        ("leftUpperLeg", "leftLowerLeg", "leftFoot", "leftToes"),
-        ("leftFoot", "leftToes"),
-        ("rightUpperLeg", "rightLowerLeg", "rightFoot", "rightToes"),
-        ("rightFoot", "rightToes"),
-        ("neck", "head"),
-        ("spine", "chest"),
-    )
-)
-"""Joints that are lost together."""
-
-
 def make_clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
     """The features as a perfect capture, from the origin."""
     batch, frames = features.shape[:2]
@@ -92,17 +72,16 @@ def make_clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
 
 def corrupt(clean: Capture, settings: CorruptionSettings, generator: torch.Generator) -> Capture:
     """A spoilt copy; what is masked keeps its values, which nobody should look at."""
-    draw = _CorruptionSampler(generator)
-    batch, frames = clean.root.shape[:2]
-    sigma, sigma_root = _sample_sigmas(batch, settings, draw)
-    angles, spiky = _sample_angles(batch, frames, sigma, settings, draw)
+    draw = Draws(generator, *clean.root.shape[:2])
+    sigma, sigma_root = _sample_sigmas(settings, draw)
+    angles, spiky = _sample_angles(sigma, settings, draw)
     quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
     quats = rotations.multiply(quats, rotations.from_rotation_vector(angles))
-    lost, nothing = _sample_missing(batch, frames, settings, draw)
-    found = spiky & (draw.uniform(batch, frames, _JOINTS) < settings.found)
-    error = torch.exp(settings.told * draw.normal(batch, _JOINTS + 1))
+    lost, nothing = _sample_missing(settings, draw)
+    found = spiky & (draw.uniform(draw.frames, _JOINTS) < settings.found)
+    error = torch.exp(settings.told * draw.normal(_JOINTS + 1))
     return Capture(
-        clean.root + draw.normal(batch, frames, 3) * sigma_root[:, None, None],
+        clean.root + draw.normal(draw.frames, 3) * sigma_root[:, None, None],
         quats[:, :, 0],
         rotations.to_rotation_vector(quats[:, :, 1:]),
         ~nothing,
@@ -123,55 +102,35 @@ def _bone_lengths() -> Float[Tensor, " joints"]:
     )
 
 
-class _CorruptionSampler:
-    """Random numbers of one generator."""
-
-    def __init__(self, generator: torch.Generator):
-        self.generator = generator
-
-    def uniform(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator)
-
-    def normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator)
-
-    def log_uniform(self, low: float, high: float, *shape: int) -> Tensor:
-        return low * torch.exp(self.uniform(*shape) * math.log(high / low))
-
-    def below(self, bound: Tensor) -> Tensor:
-        """Whole numbers from 0 up to each bound, exclusive."""
-        return (self.uniform(len(bound)) * bound).long().minimum(bound - 1)
-
-
-def _sample_sigmas(batch: int, settings: CorruptionSettings, draw: _CorruptionSampler) -> tuple[Tensor, Tensor]:
+def _sample_sigmas(settings: CorruptionSettings, draw: Draws) -> tuple[Tensor, Tensor]:
     """By joint, radians (batch, joints), and of the hips' place, metres (batch,)."""
-    angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, batch, 1)) * (draw.uniform(batch, 1) > settings.clean)
-    uneven = torch.where(draw.uniform(batch, 1) < 0.5, settings.uneven, 0.0) * draw.normal(batch, _JOINTS)
-    root = draw.log_uniform(*settings.root_cm, batch) / 100 * (draw.uniform(batch) > settings.clean)
-    place = draw.log_uniform(*settings.marker_cm, batch, 1) / 100
+    angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, 1)) * (draw.uniform(1) > settings.clean)
+    uneven = torch.where(draw.uniform(1) < 0.5, settings.uneven, 0.0) * draw.normal(_JOINTS)
+    root = draw.log_uniform(*settings.root_cm) / 100 * (draw.uniform() > settings.clean)
+    place = draw.log_uniform(*settings.marker_cm, 1) / 100
     of_places = (place / _bone_lengths()).clamp(max=_MAX_NOISE_RAD)
-    marked = draw.uniform(batch, 1) < settings.markers
+    marked = draw.uniform(1) < settings.markers
     return torch.where(marked, of_places, angle * torch.exp(uneven)), torch.where(marked[:, 0], place[:, 0], root)
 
 
 def _sample_angles(
-    batch: int, frames: int, sigma: Tensor, settings: CorruptionSettings, draw: _CorruptionSampler
+    sigma: Tensor, settings: CorruptionSettings, draw: Draws
 ) -> tuple[Float[Tensor, "batch frames joints 3"], Tensor]:
     """Rotation vectors to add, and which joints a spike has hit (batch, frames, joints).
 
     Noise is added to a rig's three channels, whose axes are square at best: near gimbal lock two of them are one.
     """
-    noise = draw.normal(batch, frames, _JOINTS, 3)
-    stays = torch.where(draw.uniform(batch) < settings.correlated, 0.8 * draw.uniform(batch), 0.0)
+    noise = draw.normal(draw.frames, _JOINTS, 3)
+    stays = torch.where(draw.uniform() < settings.correlated, 0.8 * draw.uniform(), 0.0)
     noise = _correlate_in_time(noise, stays) * sigma[:, None, :, None]
-    share = settings.spikes * draw.uniform(batch) * (draw.uniform(batch) < 0.5)
-    hit = draw.uniform(batch, frames, _JOINTS, 3) < share[:, None, None, None]
+    share = settings.spikes * draw.uniform() * (draw.uniform() < 0.5)
+    hit = draw.uniform(draw.frames, _JOINTS, 3) < share[:, None, None, None]
     low, high = settings.spike_deg
-    height = torch.deg2rad(low + (high - low) * draw.uniform(batch, 1, 1, 1))
-    noise = noise + hit * height * torch.sign(draw.normal(batch, frames, _JOINTS, 3))
-    skewed = torch.nn.functional.normalize(draw.normal(batch, _JOINTS, 3, 3), dim=-1)
-    square = torch.linalg.qr(draw.normal(batch, _JOINTS, 3, 3))[0]
-    axes = torch.where(draw.uniform(batch, 1, 1, 1) < 0.5, square, skewed)
+    height = torch.deg2rad(low + (high - low) * draw.uniform(1, 1, 1))
+    noise = noise + hit * height * torch.sign(draw.normal(draw.frames, _JOINTS, 3))
+    skewed = torch.nn.functional.normalize(draw.normal(_JOINTS, 3, 3), dim=-1)
+    square = torch.linalg.qr(draw.normal(_JOINTS, 3, 3))[0]
+    axes = torch.where(draw.uniform(1, 1, 1) < 0.5, square, skewed)
     return torch.einsum("btjk,bjkc->btjc", noise, axes), hit.any(dim=-1)
 
 
@@ -186,25 +145,18 @@ def _correlate_in_time(noise: Float[Tensor, "batch frames joints 3"], stays: Flo
     return torch.stack(out, dim=1)
 
 
-def _sample_missing(
-    batch: int, frames: int, settings: CorruptionSettings, draw: _CorruptionSampler
-) -> tuple[Tensor, Tensor]:
+def _sample_missing(settings: CorruptionSettings, draw: Draws) -> tuple[Tensor, Tensor]:
     """Which joints are lost (batch, frames, joints), and in which frames all are (batch, frames)."""
-    share = settings.dropout * draw.uniform(batch, 1, 1) * (draw.uniform(batch, 1, 1) < 0.25)
-    lost = draw.uniform(batch, frames, _JOINTS) < share
-    limbs = torch.zeros(len(LIMBS), _JOINTS, dtype=torch.bool)
-    for row, joints in enumerate(LIMBS):
-        limbs[row, list(joints)] = True
-    limb = limbs[draw.below(torch.full((batch,), len(LIMBS)))]
-    during = _sample_interval(batch, frames, 10, frames, draw) & (draw.uniform(batch, 1) < settings.limb)
-    nothing = _sample_interval(batch, frames, 3, frames // 3, draw) & (draw.uniform(batch, 1) < settings.gap)
+    share = settings.dropout * draw.uniform(1, 1) * (draw.uniform(1, 1) < 0.25)
+    lost = draw.uniform(draw.frames, _JOINTS) < share
+    limb = draw.limb()
+    during = _sample_interval(10, draw.frames, draw) & (draw.uniform(1) < settings.limb)
+    nothing = _sample_interval(3, draw.frames // 3, draw) & (draw.uniform(1) < settings.gap)
     return lost | (limb[:, None] & during[..., None]), nothing
 
 
-def _sample_interval(batch: int, frames: int, shortest: int, longest: int, draw: _CorruptionSampler) -> Tensor:
+def _sample_interval(shortest: int, longest: int, draw: Draws) -> Tensor:
     """One run of true frames in each window (batch, frames), never all of them."""
-    shortest, longest = min(shortest, frames - 1), min(longest, frames - 1)
-    length = shortest + draw.below(torch.full((batch,), longest - shortest + 1))
-    start = draw.below(frames - length + 1)
-    frame = torch.arange(frames)
-    return (frame >= start[:, None]) & (frame < (start + length)[:, None])
+    shortest, longest = min(shortest, draw.frames - 1), min(longest, draw.frames - 1)
+    length = shortest + draw.below(torch.full((draw.batch,), longest - shortest + 1))
+    return draw.mark(draw.below(draw.frames - length + 1), length)

@@ -1,4 +1,4 @@
-"""Gaps as they are cut into training motions (infilling paper, section 3.3).
+"""Gaps as they are cut into training motions (Kaufmann et al. 2020, section 3.3).
 
 Blocks of frames that grow in the course of training, joints that are lost throughout; and what the paper's masks lack:
 keys far apart, poses known in part, joints dropped frame by frame.
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.corruption import LIMBS
+from priors.training.augmentation.draws import Draws
 
 _JOINTS = CANONICAL.num_joints
 
@@ -48,7 +48,7 @@ def sample_observation_mask(
     present: Bool[Tensor, "batch frames"], settings: GapSettings, *, progress: float, generator: torch.Generator
 ) -> Bool[Tensor, "batch frames joints"]:
     """Which places of each window stay known; in every window some frame is known whole or in part."""
-    draw = _GapSampler(generator, *present.shape)
+    draw = Draws(generator, *present.shape)
     length = settings.interpolate_mean_length(progress)
     kind = draw.uniform()
     frames = _sample_gaps(draw, length, settings)
@@ -64,67 +64,48 @@ def sample_observation_mask(
     return known | (lost[:, None] & first)[..., None]
 
 
-class _GapSampler:
-    """Random numbers of one generator, for a batch of windows."""
-
-    def __init__(self, generator: torch.Generator, batch: int, frames: int):
-        self.generator, self.batch, self.frames = generator, batch, frames
-        self.frame = torch.arange(frames)
-
-    def uniform(self, *shape: int) -> Tensor:
-        """(batch, *shape)."""
-        return torch.rand(self.batch, *shape, generator=self.generator)
-
-    def normal(self) -> Tensor:
-        """(batch,)."""
-        return torch.randn(self.batch, generator=self.generator)
-
-    def sample_interval(self, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
-        """One run of so many frames, that may reach beyond the window's ends."""
-        start = self.uniform() * (self.frames + 8 - length).clamp_min(1) - 4
-        return (self.frame >= start[:, None]) & (self.frame < (start + length)[:, None])
+def _sample_interval(draw: Draws, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
+    """One run of so many frames, that may reach beyond the window's ends."""
+    return draw.mark(draw.uniform() * (draw.frames + 8 - length).clamp_min(1) - 4, length)
 
 
-def _sample_gaps(draw: _GapSampler, length: float, settings: GapSettings) -> Bool[Tensor, "batch frames"]:
+def _sample_gaps(draw: Draws, length: float, settings: GapSettings) -> Bool[Tensor, "batch frames"]:
     """True where a frame is known."""
     known = torch.ones(draw.batch, draw.frames, dtype=torch.bool)
     count = (1 + draw.uniform() * settings.several).floor()
     for number in range(settings.several):
         size = (length + settings.spread * draw.normal()).clamp(2, draw.frames - 10)
-        known &= ~(draw.sample_interval(size / count.sqrt()) & (number < count)[:, None])
+        known &= ~(_sample_interval(draw, size / count.sqrt()) & (number < count)[:, None])
     return known
 
 
-def _sample_keyframes(draw: _GapSampler, length: float) -> Bool[Tensor, "batch frames"]:
+def _sample_keyframes(draw: Draws, length: float) -> Bool[Tensor, "batch frames"]:
     """Single frames, on average `length` apart, in half of the windows with the frame after it: a pose and its pace."""
     known = draw.uniform(draw.frames) < 1 / (2 + draw.uniform(1) * (2 * length))
     after = torch.cat([torch.zeros(draw.batch, 1, dtype=torch.bool), known[:, :-1]], dim=1)
     return known | (after & (draw.uniform(1) < 0.5))
 
 
-def _sample_partial(draw: _GapSampler, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
+def _sample_partial(draw: Draws, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """Some joints, or all but some, known for a stretch."""
     some = _sample_joints(draw)
     other = draw.uniform(1) < 0.25
-    stretch = draw.sample_interval(1 + draw.uniform() ** 2 * draw.frames)
+    stretch = _sample_interval(draw, 1 + draw.uniform() ** 2 * draw.frames)
     return stretch[..., None] & torch.where(other, ~some, some)[:, None]
 
 
-def _sample_missing_joints(draw: _GapSampler, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
+def _sample_missing_joints(draw: Draws, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """All known but 1 to 3 joints, or a limb, throughout or for a stretch; or any joint now and then."""
     lost = _sample_joints(draw)[:, None].expand(-1, draw.frames, -1)
-    during = draw.sample_interval(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
+    during = _sample_interval(draw, 10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     lost = torch.where((draw.uniform() < settings.dropout)[:, None, None], dropped, lost & during[..., None])
     return ~lost
 
 
-def _sample_joints(draw: _GapSampler) -> Bool[Tensor, "batch joints"]:
+def _sample_joints(draw: Draws) -> Bool[Tensor, "batch joints"]:
     """1 to 3 joints at random, or a limb."""
-    limbs = torch.zeros(len(LIMBS), _JOINTS, dtype=torch.bool)
-    for row, joints in enumerate(LIMBS):
-        limbs[row, list(joints)] = True
-    limb = limbs[(draw.uniform() * len(LIMBS)).long()]
+    limb = draw.limb()
     order = draw.uniform(_JOINTS).argsort(dim=1).argsort(dim=1)
     some = order < (1 + draw.uniform(1) * 3).floor()
     return torch.where(draw.uniform(1) < 0.5, some, limb)

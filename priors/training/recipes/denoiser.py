@@ -1,7 +1,7 @@
 """Training of the denoiser: windows of clean motion, spoilt anew each time, and how far from them it comes back."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -11,21 +11,23 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, mirror_features
+from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
-from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
-from priors.training.trainer import Trainer
+from priors.training.corpus import Corpus, Split
+from priors.training.recipe import NetworkRecipe
+from priors.training.trainer import GradientTrainer
+from priors.training.windows import FeatureWindows
 
 _TOES = list(TOE_JOINTS)
 
 
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """The recipe."""
+    """How a denoiser is trained."""
 
     steps: int = 16_000
     """Updates."""
@@ -61,12 +63,13 @@ class DenoiserSettings:
             raise RequestError(f"window must be at least 16 frames, got {self.window}")
 
 
-class DenoiserTrainer(Trainer[DenoiserNetwork]):
+class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
     """Draws windows, spoils them, and brings the network nearer to cleaning them."""
 
     def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
         """RequestError where no clip is as long as a window."""
-        self.settings, self.windows = settings, FeatureWindows(corpus, settings)
+        self.settings = settings
+        self.windows = FeatureWindows(corpus, settings.window, evenness=settings.evenness)
         super().__init__(
             lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16),
             steps=settings.steps,
@@ -76,43 +79,53 @@ class DenoiserTrainer(Trainer[DenoiserNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Of a batch drawn anew."""
-        return compute_denoiser_losses(self.network, self.windows.draw(self.generator), self.settings, self.generator)
+        windows = draw_performers(self.windows, self.settings, self.generator)
+        return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
+
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """The errors on 6 batches of unseen windows, spoilt in the same way each time."""
+        settings, generator, rows = self.settings, torch.Generator().manual_seed(0), []
+        # What is held out may have no clip as long as a window; that must not end a run after an hour.
+        drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=settings.evenness)
+        with torch.no_grad():
+            for _ in range(6):
+                windows = draw_performers(drawn, settings, generator)
+                rows.append(compute_denoiser_losses(self.network, windows, settings, generator))
+        means = torch.stack([torch.stack(list(row.values())) for row in rows]).mean(dim=0)
+        return dict(zip(rows[0], means.tolist(), strict=True))
 
 
-class FeatureWindows:
-    """Windows of clean motion, as they are drawn for training."""
+@dataclass(frozen=True)
+class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTrainer]):
+    """What to train a denoiser on, and how."""
 
-    def __init__(self, corpus: Corpus, settings: DenoiserSettings):
-        """RequestError where no clip is as long as a window."""
-        self.corpus, self.settings = corpus, settings
-        starts = find_window_starts(corpus.lengths, settings.window)
-        folder = number_clip_folders(corpus).repeat_interleave(torch.tensor(corpus.lengths))
-        # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
-        self.groups = [starts[folder[starts] == number] for number in folder.unique()]
-        self.groups = [group for group in self.groups if len(group)]
-        self.probabilities = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - settings.evenness)
+    kind = "denoiser"
+    config: DenoiserConfig = field(default_factory=DenoiserConfig)
+    """The network."""
+    settings: DenoiserSettings = field(default_factory=DenoiserSettings)
+    """How it is trained."""
 
-    def draw(self, generator: torch.Generator) -> Float[Tensor, "batch window size"]:
-        """Half of them mirrored, of performers a little larger or smaller, on rigs calibrated a little differently."""
-        settings = self.settings
-        groups = torch.multinomial(self.probabilities, settings.batch, replacement=True, generator=generator)
-        shares = torch.rand(settings.batch, generator=generator)
-        picked = torch.stack(
-            [
-                self.groups[group][int(share * len(self.groups[group]))]
-                for group, share in zip(groups.tolist(), shares.tolist(), strict=True)
-            ]
-        )
-        windows = self.corpus.features[picked[:, None] + torch.arange(settings.window)]
-        mirrored = torch.rand(settings.batch, generator=generator) < 0.5
-        windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows).clone()
-        size = torch.exp(settings.corruption.size * torch.randn(settings.batch, 1, 1, generator=generator))
-        for block in ("root_displacement_heading", "root_height"):
-            windows[..., LAYOUT.slices[block]] *= size
-        windows[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(
-            windows, settings.calibration_deg, generator
-        )
-        return windows
+    def make_untaught(self, parts: Split) -> DenoiserTrainer:
+        """The trainer, its weights drawn."""
+        return DenoiserTrainer(self.config, self.settings, parts.train)
+
+    def format_shape(self) -> list[str]:
+        """The width, if it is another than usual."""
+        return [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
+
+
+def draw_performers(
+    windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator
+) -> Float[Tensor, "batch window size"]:
+    """A batch of windows of performers a little larger or smaller, on rigs calibrated a little differently."""
+    features = windows.draw(settings.batch, generator).features.clone()
+    size = torch.exp(settings.corruption.size * torch.randn(settings.batch, 1, 1, generator=generator))
+    for block in ("root_displacement_heading", "root_height"):
+        features[..., LAYOUT.slices[block]] *= size
+    features[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(
+        features, settings.calibration_deg, generator
+    )
+    return features
 
 
 def _perturb_joint_frames(
@@ -163,22 +176,6 @@ def compute_denoiser_losses(
         "angles_deg": torch.rad2deg(turned),
         "contacts_nats": contacts,
     }
-
-
-def validate(network: DenoiserNetwork, corpus: Corpus, settings: DenoiserSettings) -> dict[str, Any]:
-    """The errors on 6 batches of unseen windows, spoilt in the same way each time."""
-    generator = torch.Generator().manual_seed(0)
-    # What is held out may have no clip as long as a window; that must not end a run after an hour.
-    drawn = FeatureWindows(corpus, replace(settings, window=min(settings.window, max(corpus.lengths))))
-    rows = []
-    with torch.no_grad():
-        for _ in range(6):
-            windows = drawn.draw(generator)
-            rows.append(
-                [float(value) for value in compute_denoiser_losses(network, windows, settings, generator).values()]
-            )
-    names = ("loss", "error_cm", "feet_cm_frame", "angles_deg", "contacts_nats")
-    return dict(zip(names, torch.tensor(rows).mean(dim=0).tolist(), strict=True))
 
 
 def _smooth_norm(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:

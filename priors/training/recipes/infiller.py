@@ -13,10 +13,14 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
-from priors.training.corpus import Corpus
-from priors.training.trainer import Trainer
+from priors.training.corpus import Corpus, Split
+from priors.training.recipe import NetworkRecipe
+from priors.training.trainer import GradientTrainer
 from priors.training.windows import PositionWindows, Window
 
+VALIDATED_GAPS = (15, 30, 60)
+"""Gaps that are validated, frames, where a window has room for them."""
+_MARGIN_FRAMES = 8  # frames of a window that a gap must leave
 _ERROR_OFFSET_CM = 0.5  # cm that the guess may be off by before a window's weight falls
 _MAX_ERROR_CM = 4.0  # cm beyond which it falls no more
 _MIN_STD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
@@ -24,7 +28,7 @@ _MIN_STD = 0.05  # metres: of a place that hardly moves, as the hips' over their
 
 @dataclass(frozen=True)
 class InfillerSettings:
-    """The recipe."""
+    """How an infiller is trained."""
 
     steps: int = 8_000
     """Updates."""
@@ -55,7 +59,7 @@ class InfillerSettings:
             raise RequestError(f"window must be at least 32 frames, got {self.window}")
 
 
-class InfillerTrainer(Trainer[InfillerNetwork]):
+class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     """Draws windows, cuts gaps into them, and brings the network nearer to filling them."""
 
     def __init__(self, config: InfillerConfig, settings: InfillerSettings, corpus: Corpus):
@@ -77,16 +81,54 @@ class InfillerTrainer(Trainer[InfillerNetwork]):
         known = sample_observation_mask(window.present, self.settings.gaps, progress=progress, generator=self.generator)
         return compute_infiller_losses(self.network, window, known, self.settings)
 
+    @torch.no_grad()
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Root-aligned joint error over a gap in the middle of unseen windows, cm, beside that of the guess."""
+        frames, row = self.settings.window, {}
+        windows = PositionWindows(corpus, frames=frames, evenness=self.settings.evenness)
+        for gap in [gap for gap in VALIDATED_GAPS if gap + _MARGIN_FRAMES <= frames]:
+            window = windows.draw(192, torch.Generator().manual_seed(gap))
+            middle = (frames - gap) // 2
+            known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()
+            known[:, middle : middle + gap] = False
+            lacking, image = window.present[..., None] & ~known, window.image(known)
+            wanted = image.from_world(window.places)
+            for name, places in (("error", self.network(image).places), ("guess", image.places)):
+                wrong = 100 * (places - wanted)
+                wrong = (wrong - wrong[..., :1, :]).norm(dim=-1) * lacking
+                row[f"{name}_{gap}_cm"] = float(wrong.sum() / lacking.sum())
+        return row
+
+
+@dataclass(frozen=True)
+class InfillerRecipe(NetworkRecipe[InfillerConfig, InfillerSettings, InfillerTrainer]):
+    """What to train an infiller on, and how."""
+
+    kind = "infiller"
+    config: InfillerConfig = field(default_factory=InfillerConfig)
+    """The network."""
+    settings: InfillerSettings = field(default_factory=InfillerSettings)
+    """How it is trained."""
+
+    def make_untaught(self, parts: Split) -> InfillerTrainer:
+        """The trainer, its weights drawn."""
+        return InfillerTrainer(self.config, self.settings, parts.train)
+
+    def format_shape(self) -> list[str]:
+        """The architecture, if it is another than usual."""
+        usual = InfillerConfig.architecture
+        return [] if self.config.architecture == usual else [f"--architecture {self.config.architecture}"]
+
 
 def compute_infiller_losses(
     network: InfillerNetwork, window: Window, known: Tensor, settings: InfillerSettings
 ) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
-    L1 over the whole motion (section 3.3), window by window divided by the number of coordinates that had to be made:
-    two joints that are lost count as much as a gap. A network that keeps what is known is so judged on what is not, an
-    autoencoder on everything. A window in which the guess would do counts for more, or a network learns to fidget where
-    nobody moves.
+    L1 over the whole motion (Kaufmann et al. 2020, section 3.3), window by window divided by the number of coordinates
+    that had to be made: two joints that are lost count as much as a gap. A network that keeps what is known is so
+    judged on what is not, an autoencoder on everything. A window in which the guess would do counts for more, or a
+    network learns to fidget where nobody moves.
     """
     image = window.image(known)
     wanted = image.from_world(window.places)
@@ -120,27 +162,3 @@ def _weigh_windows(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tens
     """Of windows: the less, the more the guess is off (mean over coordinates, cm); 1 at 2 cm."""
     off = (100 * (guess - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
     return (2 + _ERROR_OFFSET_CM) / (off.clamp(max=_MAX_ERROR_CM) + _ERROR_OFFSET_CM)
-
-
-VALIDATED_GAPS = (15, 30, 60)
-"""Gaps that are validated, frames, where a window has room for them."""
-_MARGIN_FRAMES = 8  # frames of a window that a gap must leave
-
-
-@torch.no_grad()
-def validate(network: InfillerNetwork, corpus: Corpus, settings: InfillerSettings) -> dict[str, Any]:
-    """Root-aligned joint error over a gap in the middle of unseen windows, cm, beside that of the guess."""
-    windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
-    row = {}
-    for gap in [gap for gap in VALIDATED_GAPS if gap + _MARGIN_FRAMES <= settings.window]:
-        window = windows.draw(192, torch.Generator().manual_seed(gap))
-        middle = (settings.window - gap) // 2
-        known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()
-        known[:, middle : middle + gap] = False
-        image = window.image(known)
-        wanted = image.from_world(window.places)
-        for name, places in (("error", network(image).places), ("guess", image.places)):
-            wrong = 100 * (places - wanted)
-            wrong = (wrong - wrong[..., :1, :]).norm(dim=-1) * (window.present[..., None] & ~known)
-            row[f"{name}_{gap}_cm"] = float(wrong.sum() / (window.present[..., None] & ~known).sum())
-    return row

@@ -1,30 +1,36 @@
-"""Training of the LSTM-GMM: rnn paper, section 4.1.3, with departures kept as settings.
+"""Training of the LSTM-GMM: Wang et al. 2019, section 4.1.3, with departures kept as settings.
 
 Windows of clips with noise on the inputs; loss is the negative log density of the next frame (Eq. 8). Everything random
 comes from one generator whose state is in the checkpoint, so a resumed run continues bit for bit.
 """
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
-from mapctl.problem import density_selection
 from priors.config import require_at_least
+from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
-from priors.training.corpus import Corpus, find_window_starts
+from priors.training import density_quality
+from priors.training.corpus import Corpus, Split
+from priors.training.gathering import describe_skipped
+from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
+from priors.training.recipe import Export, Gathered, Recipe, Row, average
+from priors.training.trainer import GradientTrainer
+from priors.training.windows import FeatureWindows
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """The recipe."""
+    """How a density is trained."""
 
     steps: int = 20_000
     """Optimiser steps in all."""
@@ -100,8 +106,8 @@ def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[
     return mean, torch.maximum(std, floor)
 
 
-class DensityTrainer:
-    """Model, optimiser and generator, one step at a time."""
+class DensityTrainer(GradientTrainer[LstmGmm]):
+    """Draws windows, spoils the inputs, and makes the frames after them likelier."""
 
     def __init__(
         self,
@@ -114,82 +120,68 @@ class DensityTrainer:
         init: Mapping[str, Tensor] | None = None,
     ):
         """`labels` of the corpus' clips, the network's own; `init` holds weights and statistics to begin with."""
-        self.settings, self.device, self.step = settings, device, 0
-        self.generator = torch.Generator().manual_seed(settings.seed)
+        self.settings, self.device = settings, device
         mean, std = compute_feature_statistics(corpus.features)
-        with torch.random.fork_rng(devices=[]):  # torch draws weights from its global generator, which is the caller's
-            torch.default_generator.manual_seed(settings.seed)
-            self.model = LstmGmm(config, mean=mean, std=std).to(device)
+        super().__init__(
+            lambda: LstmGmm(config, mean=mean, std=std).to(device),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
         if init is not None:
-            self.model.load_state_dict(dict(init))
-        self.features, self.labels = corpus.features, labels or Labels.none(len(corpus.lengths))
+            self.network.load_state_dict(dict(init))
+        self.labels = labels or Labels.none(len(corpus.lengths))
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
-        self.starts = find_window_starts(corpus.lengths, settings.window + 1)
-        self.optimiser = self._make_optimiser()
+        self.windows = FeatureWindows(corpus, settings.window + 1)
+        self._latest = corpus.features[:0]  # windows of the step under way
 
-    def train_step(self) -> float:
-        """One optimiser step; returns the loss in nats a frame. MapctlError, and no step, where that is no number."""
-        settings = self.settings
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate()
-        windows, condition = self._sample_windows()
-        loss = -self._log_prob(windows, condition).mean()
-        if not torch.isfinite(loss):
-            raise _make_divergence_error(self.step + 1, f"the loss is {loss.item()} nats")
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        return {"model": self.network}
+
+    def losses(self) -> dict[str, Tensor]:
+        """Of a batch drawn anew, nats a frame."""
+        self._latest, condition = self._draw_windows()
+        return {"loss": -self._log_prob(self._latest, condition).mean()}
+
+    def limit_gradients(self) -> None:
+        """Clip, and add the gradient of free runs where it is time for it."""
+        settings, matching = self.settings, self.settings.matching
         if settings.optimiser == "rmsprop":
-            torch.nn.utils.clip_grad_value_(self.model.parameters(), settings.gradient_clip)
+            nn.utils.clip_grad_value_(self.network.parameters(), settings.gradient_clip)
         else:
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.gradient_clip)
-        matching = settings.matching
+            nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
         if self.step >= matching.begin * settings.steps and self.step % matching.every == 0:
-            self._add_moment_gradient(windows)
-        self.optimiser.step()
-        self.step += 1
-        return loss.item()
+            self._add_moment_gradient(self._latest)
 
-    def learning_rate(self) -> float:
+    def compute_learning_rate(self) -> float:
         """At the current step."""
         settings = self.settings
         if settings.schedule == "epochs":
-            passes = self.step * settings.batch * settings.window // max(1, len(self.features))
+            passes = self.step * settings.batch * settings.window // max(1, len(self.windows.features))
             return settings.learning_rate * 0.95**passes
         warm = min(1.0, (self.step + 1) / 200)
         return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / settings.steps)))
 
-    def check_finite(self) -> None:
-        """MapctlError unless every weight is a number."""
-        if not all(bool(torch.isfinite(values).all()) for values in self.model.parameters()):
-            raise _make_divergence_error(self.step, "its weights are not finite")
-
-    def state(self) -> dict:
-        """Everything a bit-exact continuation needs; tensors and plain numbers only."""
-        return {
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "step": self.step,
-            "generator": self.generator.get_state(),
-            "settings": asdict(self.settings),
-        }
-
-    def load_state(self, state: dict) -> None:
-        """Continue from what `state` gave."""
-        self.model.load_state_dict(state["model"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["generator"])
-        self.step = state["step"]
-
-    def _make_optimiser(self) -> torch.optim.Optimizer:
-        settings, parameters = self.settings, self.model.parameters()
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """The recipe's own."""
+        settings, parameters = self.settings, self.network.parameters()
         if settings.optimiser == "rmsprop":
             return torch.optim.RMSprop(parameters, lr=settings.learning_rate, alpha=0.9)
         return torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay)
 
+    def validate(self, corpus: Corpus) -> dict[str, float]:
+        """Likelihood and the health of free runs: likelihood does not predict stability."""
+        self.network.eval()
+        row = {"validation_nats": density_quality.compute_validation_nats(self.network, corpus)}
+        row |= density_quality.measure_free_runs(self.network, corpus)
+        self.network.train()
+        return row
+
     def _add_moment_gradient(self, windows: Tensor) -> None:
         """Add the gradient of the free runs' mismatch, clipped on its own: neither loss drowns the other."""
-        parameters = [p for p in self.model.parameters() if p.requires_grad]
-        loss = free_run_moment_loss(self.model, windows, self.settings.matching, self.generator)
+        parameters = [p for p in self.network.parameters() if p.requires_grad]
+        loss = free_run_moment_loss(self.network, windows, self.settings.matching, self.generator)
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         found = [(p, g) for p, g in zip(parameters, gradients, strict=True) if g is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for _, g in found]))
@@ -199,20 +191,14 @@ class DensityTrainer:
             share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
             parameter.grad = share * gradient if parameter.grad is None else parameter.grad + share * gradient
 
-    def _sample_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
+    def _draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
         """Windows of clips and the labels that are told of them."""
-        settings = self.settings
-        picked = torch.randint(len(self.starts), (settings.batch,), generator=self.generator)
-        frames = self.starts[picked, None] + torch.arange(settings.window + 1)
-        windows = self.features[frames]
-        labels = self.labels.held[torch.searchsorted(self.clip_ends, frames[:, 0].contiguous(), right=True)]
-        if settings.mirror:
-            chosen = torch.rand(settings.batch, 1, 1, generator=self.generator) < 0.5
-            windows = torch.where(chosen, mirror_features(windows), windows)
-            labels = torch.where(chosen[:, :, 0], labels[:, self.labels.mirrored], labels)
-        return windows.to(self.device), self._told(labels).to(self.device)
+        drawn = self.windows.draw(self.settings.batch, self.generator, mirror=self.settings.mirror)
+        labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
+        labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
+        return drawn.features.to(self.device), self._tell_some(labels).to(self.device)
 
-    def _told(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
+    def _tell_some(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
         """Most often nothing is told, or one group only, so that the network does well with whatever it is told."""
         if not self.labels.names:
             return labels
@@ -223,7 +209,7 @@ class DensityTrainer:
 
     def _log_prob(self, windows: Tensor, told: Tensor) -> Tensor:
         """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
-        model, size = self.model, self.model.layout.continuous
+        model, size = self.network, self.network.layout.continuous
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.start_after(windows[:, 0])
         condition = torch.cat([level / NOISE_UNIT, told], -1) if model.config.knows_noise else told
@@ -236,7 +222,7 @@ class DensityTrainer:
         """Inputs with noise and flipped bits, and each window's level of noise."""
         settings, shape = self.settings, inputs.shape
         share = torch.rand(shape[0], 1, 1, generator=self.generator)
-        if self.model.config.knows_noise:
+        if self.network.config.knows_noise:
             level = settings.input_noise * settings.noise_range * share.square()
         else:
             level = settings.input_noise * torch.exp(share * math.log(settings.noise_range))
@@ -250,35 +236,102 @@ class DensityTrainer:
 _KEEP_GROUP_PROBABILITY = 0.7
 
 
-def _make_divergence_error(step: int, how: str) -> MapctlError:
-    return MapctlError(f"training diverged at step {step}: {how}; the last checkpoint, if there is one, is kept")
+@dataclass(frozen=True)
+class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
+    """What to train a density on, and how."""
+
+    kind = "lstm-gmm"
+    config: LstmGmmConfig = field(default_factory=LstmGmmConfig)
+    """The network."""
+    settings: TrainingSettings = field(default_factory=TrainingSettings)
+    """How it is trained."""
+    device: str = "auto"
+    """`auto`, `cpu` or `cuda`."""
+    starts: int = 64
+    """Moments of mocap that the finished prior carries."""
+    labels: str = ""
+    """Regular expression whose named groups read labels from a clip's path, which the density can then be told."""
+    init: str | None = None
+    """Prior whose weights and statistics training begins with; the network is then that prior's."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, 1, "starts")
+
+    def check(self) -> None:
+        """Before anything is read."""
+        _select_device(self.device)
+        super().check()
+
+    def make_trainer(self, parts: Split) -> DensityTrainer:
+        """Of a new network for the clips' labels, or of the one to begin with and its own labels."""
+        device, known = _select_device(self.device), labels.read(parts.train.names, self.labels)
+        if self.init is None:
+            config = replace(self.config, labels=known.names)
+            return DensityTrainer(config, self.settings, parts.train, device, labels=known)
+        before = density.load(self.init).reference
+        known = known.renamed(before.config.labels)
+        return DensityTrainer(before.config, self.settings, parts.train, device, labels=known, init=before.state_dict())
+
+    def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
+        """Of the network that is trained."""
+        return trainer.network.config
+
+    def describe_data(self, corpus: Corpus) -> dict[str, str]:
+        """What tells the data of this run from others'."""
+        return corpus.identity() | {
+            "match": self.match or "",
+            "split seed": str(self.settings.seed),
+            "labels": self.labels,
+            "init": self.init or "",
+        }
+
+    def format_news(self, rows: Sequence[Row]) -> str:
+        """One line on the losses of some steps."""
+        return f"{average(rows, 'loss'):.2f} nats"
+
+    def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """The network with moments to start from, and what the data show to be possible."""
+        model, corpus, parts = trainer.network.cpu().eval(), gathered.corpus, gathered.parts
+        seeded = torch.Generator().manual_seed(self.settings.seed)
+        found = select_initial_states(model, parts.train, count=self.starts, generator=seeded)
+        data = {
+            "clips": len(corpus.names),
+            "frames": len(corpus.features),
+            **describe_skipped(corpus),
+            "match": self.match or "",
+            "labels": self.labels,
+            "split_seed": self.settings.seed,
+            "starts": list(found.names),
+            "held_out": gathered.held_out(),
+        }
+        return Export(
+            {
+                **model.state_dict(),
+                "starts.previous": found.state.last_frame,
+                "starts.hidden": found.state.hidden,
+                "starts.cell": found.state.cell,
+                "starts.speed": found.speed,
+                "starts.weight": found.weight,
+            },
+            data,
+            density_quality.measure_quality(model, parts),
+            asdict(measure_data_limits(parts.train)),
+        )
+
+    def format_command(self) -> str:
+        """What to type for the same run, for the card; options that are the defaults are left out."""
+        parts = [f"mapctl train lstm-gmm --data DATA -o RUN --match '{self.match or ''}'"]
+        parts += [f"--labels '{self.labels}'"] if self.labels else []
+        parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
+        parts += ["--skip-first"] * self.skip_first + ["--bfloat16"] * self.settings.bfloat16
+        parts += self.format_changed(TrainingSettings(), "steps", "batch", "window", "learning_rate", "seed")
+        return " ".join(parts) + (" --paper" if self.config.retain == 0 else "")
 
 
-def compute_validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:
-    """Mean negative log density a frame over the first frames of every clip, clean inputs, from an empty memory."""
-    total, count = 0.0, 0
-    with torch.no_grad():
-        for clip in corpus.clips():
-            clip = clip[:frames].unsqueeze(0).to(model.mean.device)
-            nats = -model.log_prob(clip[:, 1:], model.start_after(clip[:, 0]))
-            total, count = total + nats.sum().item(), count + nats.numel()
-    return total / count
-
-
-def compute_window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, float]:
-    """Log density a frame, physical units, of motion as wrong as a proposal is: mean over windows, and the value that
-    98 % of them reach. By it a density's trust is told (see mapctl.problem.density_selection); clips begin with an
-    empty memory.
-    """
-    blurred, found = model.cpu().with_observation_noise(density_selection.proposal_sigma()), []
-    with torch.no_grad():
-        for clip in (clip for corpus in corpora for clip in corpus.clips() if len(clip) > 1):
-            nats = blurred.log_prob(clip[None, 1:], blurred.start_after(clip[:1]))[0]
-            parts = density_selection.to_physical_log_density(nats, blurred.std).split(
-                density_selection.SELECTION_WINDOW
-            )
-            found += [
-                part.mean() for part in parts if len(part) == density_selection.SELECTION_WINDOW or len(parts) == 1
-            ]
-    values = torch.stack(found)
-    return {"mean": float(values.mean()), "p2": float(values.quantile(0.02))}
+def _select_device(wanted: str) -> str:
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise RequestError("this machine has no CUDA device; use --device cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted

@@ -1,8 +1,10 @@
-"""Adversarial training of the refiner: rnn paper, sections 4.2.1 and 4.2.2, with departures kept as settings."""
+"""Adversarial training of the refiner: Wang et al. 2019, sections 4.2.1 and 4.2.2, with departures kept as settings."""
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -10,23 +12,31 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
+from mapctl.metrics.realism import RealismSettings
 from priors.config import require_at_least
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.end_effectors import compute_end_effectors
 from priors.refiner.network import RefinerConfig, RefinerNetwork
-from priors.training import run_files
 from priors.training.adversarial import Critic, HistoryBuffer
-from priors.training.corpus import Corpus, find_window_starts
+from priors.training.corpus import Corpus, Split, find_window_starts
+from priors.training.gathering import DataSource, describe_skipped
 from priors.training.moment_matching import MatchingSettings, moment_loss
+from priors.training.recipe import Export, Gathered, Recipe, Row, average
+from priors.training.refiner_quality import RefinerEvaluator, compute_realism_gap, sample_corpus
+from priors.training.trainer import Trainer, draw_weights
+from priors.training.windows import FeatureWindows
 
 REFINER_MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)
 """That a refiner is held to, as pieces of a window show them."""
+_CRITIC_WON = 0.98  # share that the critic tells apart, over a report, from which it has won
 _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
 
 
 @dataclass(frozen=True)
 class AdversarialSettings:
-    """The recipe."""
+    """How a refiner is trained."""
 
     rounds: int = 4000
     """Rounds after the warm-up: some updates of the refiner, then one of the critic."""
@@ -117,56 +127,38 @@ PAPER = (
 """The variant as the paper prints it; it does not say how long it trained."""
 
 
-@dataclass
-class RoundLosses:
-    """Of one round."""
+class AdversarialTrainer(Trainer[RefinerNetwork]):
+    """Refiner, critic and history, one round at a time. What is kept is the running mean of the refiner's weights."""
 
-    refiner: float
-    """Mean of Eq. 9, nats."""
-    critic: float
-    """Eq. 10 halved, nats: 0.69 where it can tell nothing."""
-    told: float
-    """Share of the critic's batch that it told apart."""
-    updates: int
-    """Of the refiner."""
-
-    @property
-    def finite(self) -> bool:
-        """Whether training has not diverged."""
-        return math.isfinite(self.refiner) and math.isfinite(self.critic)
-
-
-class AdversarialTrainer:
-    """Refiner, critic, history and generator, one round at a time."""
-
-    def __init__(self, config: RefinerConfig, settings: AdversarialSettings, corpus: Corpus, raw: Corpus):
-        """`corpus` is captured, `raw` sampled from the density that is to be refined."""
-        self.settings, self.round, self.updates = settings, 0, settings.refiner_updates
-        self.generator = torch.Generator().manual_seed(settings.seed)
-        self.corpus, self.raw = corpus, raw
+    def __init__(
+        self,
+        config: RefinerConfig,
+        settings: AdversarialSettings,
+        corpus: Corpus,
+        raw: Corpus,
+        evaluate: Callable[[RefinerNetwork], Row] = lambda network: {},
+    ):
+        """`corpus` is captured, `raw` sampled from the density that is to be refined; `evaluate` measures a refiner."""
+        super().__init__(steps=settings.rounds, seed=settings.seed)
+        self.settings, self.updates, self.evaluate = settings, settings.refiner_updates, evaluate
         statistics = _compute_statistics(corpus, config, settings.window)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(settings.seed)
-            self.refiner = RefinerNetwork(config, **statistics)
-            reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
-            self.critic = Critic(
-                config.joints,
-                width=settings.critic_width,
-                around=settings.critic_around,
-                slow=settings.critic_slow,
-                **reach,
-            )
-        self.averaged_refiner = deepcopy(self.refiner).requires_grad_(False)
-        self.given = settings.window + self.refiner.before + config.lookahead
-        self.captured = find_window_starts(corpus.lengths, settings.window)
-        self.sampled = find_window_starts(raw.lengths, self.given)
-        self.optimisers = [
-            self._make_optimiser(self.refiner, settings.refiner_rate),
-            self._make_optimiser(self.critic, settings.critic_rate),
-        ]
+        self.refiner, self.critic = draw_weights(lambda: _make_sides(config, settings, statistics), settings.seed)
+        self.network = deepcopy(self.refiner).requires_grad_(False)
+        self.captured = FeatureWindows(corpus, settings.window)
+        self.raw = FeatureWindows(raw, settings.window + self.refiner.before + config.lookahead)
+        self.refiner_optimiser = self._make_optimiser(self.refiner, settings.refiner_rate)
+        self.critic_optimiser = self._make_optimiser(self.critic, settings.critic_rate)
         with torch.no_grad():
-            first = [self.refiner(self._sample_raw_windows())[0] for _ in range(-(-settings.history // settings.batch))]
+            first = [self.refiner(self._draw(self.raw))[0] for _ in range(-(-settings.history // settings.batch))]
         self.history = HistoryBuffer(torch.cat(first)[: settings.history])
+
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        return {"averaged": self.network, "refiner": self.refiner, "critic": self.critic}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """One for each side."""
+        return {"refiner-optimiser": self.refiner_optimiser, "critic-optimiser": self.critic_optimiser}
 
     def warm_up(self) -> None:
         """Before the rounds: the critic alone, then both."""
@@ -176,9 +168,13 @@ class AdversarialTrainer:
             self._refine()
             self._criticise()
 
-    def train_round(self) -> RoundLosses:
-        """Updates of the refiner, then of the critic, and the balance of section 4.2.2."""
-        if self.round == 0:
+    def train_step(self) -> dict[str, float]:
+        """Updates of the refiner, then of the critic, and the balance of section 4.2.2.
+
+        Mean of Eq. 9 and half of Eq. 10 in nats, where 0.69 is a critic that can tell nothing; the share of its batch
+        that the critic told apart; and how often the refiner was updated.
+        """
+        if self.step == 0:
             self.warm_up()
         updates, settings = self.updates, self.settings
         refiner = sum(self._refine() for _ in range(updates)) / updates
@@ -188,38 +184,27 @@ class AdversarialTrainer:
             self.updates = min(2 * updates, settings.most_updates)
         elif critic > settings.weak:
             self.updates = max(1, updates // 2)
-        self.round += 1
-        return RoundLosses(refiner, critic, told, updates)
+        self.step += 1
+        return {"refiner": refiner, "critic": critic, "told": told, "updates": updates}
+
+    def validate(self, corpus: Corpus) -> Row:
+        """Measures of refined samples beside mocap's (see `RefinerEvaluator`, which has the unseen clips)."""
+        return self.evaluate(self.network)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything a bit-exact continuation needs, flat."""
-        tensors = {
-            "generator": self.generator.get_state(),
-            "history": self.history.windows,
-            "counts": torch.tensor([self.round, self.updates]),
-        }
-        tensors |= {f"averaged.{name}": value for name, value in self.averaged_refiner.state_dict().items()}
-        for kind, model, optimiser in self._sides():
-            tensors |= {f"{kind}.{name}": value for name, value in model.state_dict().items()}
-            tensors |= run_files.flatten_optimiser(optimiser, f"{kind}-optimiser")
-        return tensors
+        """Everything that a bit-exact continuation needs."""
+        counts = torch.tensor([self.step, self.updates])
+        return {**super().state(), "history": self.history.windows, "counts": counts}
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Continue from what `state` gave; KeyError or RuntimeError where it is not whole."""
-        self.generator.set_state(tensors["generator"])
+    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Go on from what `state` gave; KeyError or RuntimeError where it is not whole."""
+        super().load_state(tensors, step)
         self.history = HistoryBuffer(tensors["history"])
-        self.round, self.updates = tensors["counts"].tolist()
-        self.averaged_refiner.load_state_dict(_strip_prefix("averaged.", tensors))
-        for kind, model, optimiser in self._sides():
-            model.load_state_dict(_strip_prefix(f"{kind}.", tensors))
-            optimiser.load_state_dict(run_files.unflatten_optimiser(optimiser, f"{kind}-optimiser", tensors))
-
-    def _sides(self) -> list[tuple[str, nn.Module, torch.optim.Optimizer]]:
-        return [("refiner", self.refiner, self.optimisers[0]), ("critic", self.critic, self.optimisers[1])]
+        _, self.updates = tensors["counts"].tolist()
 
     def _refine(self) -> float:
         """One update of the refiner (Eq. 13), and of its running mean."""
-        raw = self._sample_raw_windows()
+        raw = self._draw(self.raw)
         with self._autocast():
             refined, _ = self.refiner(raw)
             odds = self.critic(refined.float())
@@ -227,29 +212,29 @@ class AdversarialTrainer:
         loss = cross_entropy(odds.float(), torch.ones(odds.shape))
         total = loss + self.settings.root * _compute_root_error(raw[:, self.refiner.before :], refined)
         if self.settings.moments > 0:
-            captured = self._sample_windows(self.corpus, self.captured, self.settings.window)
+            captured = self._draw(self.captured)
             total = total + self.settings.moments * moment_loss(refined, captured, REFINER_MOMENTS)
-        self._step(self.optimisers[0], self.refiner, total)
+        self._step(self.refiner_optimiser, self.refiner, total)
         with torch.no_grad():
-            for mean, latest in zip(self.averaged_refiner.parameters(), self.refiner.parameters(), strict=True):
+            for mean, latest in zip(self.network.parameters(), self.refiner.parameters(), strict=True):
                 mean.lerp_(latest, 1 - self.settings.average)
         return loss.item()
 
     def _criticise(self) -> tuple[float, float]:
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
         with torch.no_grad(), self._autocast():
-            fresh, _ = self.refiner(self._sample_raw_windows())
+            fresh, _ = self.refiner(self._draw(self.raw))
         made = self.history.mix(fresh.float(), self.generator)
-        both = torch.cat([self._sample_windows(self.corpus, self.captured, self.settings.window), made])
+        both = torch.cat([self._draw(self.captured), made])
         with self._autocast():
             odds = self.critic(both).float()
         truth = torch.cat([torch.ones(len(odds) - len(made)), torch.zeros(len(made))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
-        self._step(self.optimisers[1], self.critic, loss)
+        self._step(self.critic_optimiser, self.critic, loss)
         return loss.item(), float(((odds.mean(1) > 0) == (truth > 0.5)).float().mean())
 
     def _step(self, optimiser: torch.optim.Optimizer, model: nn.Module, loss: Tensor) -> None:
-        for each in self.optimisers:
+        for each in self.optimisers().values():
             each.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
@@ -258,19 +243,122 @@ class AdversarialTrainer:
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self.settings.bfloat16)
 
-    def _sample_raw_windows(self) -> Float[Tensor, "batch given size"]:
-        return self._sample_windows(self.raw, self.sampled, self.given)
-
-    def _sample_windows(self, corpus: Corpus, starts: Tensor, length: int) -> Tensor:
-        picked = torch.randint(len(starts), (self.settings.batch,), generator=self.generator)
-        windows = corpus.features[starts[picked, None] + torch.arange(length)]
-        mirrored = torch.rand(len(windows), 1, 1, generator=self.generator) < 0.5
-        return torch.where(mirrored, mirror_features(windows), windows)
+    def _draw(self, windows: FeatureWindows) -> Float[Tensor, "batch frames size"]:
+        return windows.draw(self.settings.batch, self.generator).features
 
     def _make_optimiser(self, model: nn.Module, rate: float) -> torch.optim.Optimizer:
         if self.settings.optimiser == "rmsprop":
             return torch.optim.RMSprop(model.parameters(), lr=rate, alpha=0.9)
         return torch.optim.Adam(model.parameters(), lr=rate, betas=(0.5, 0.9))
+
+
+@dataclass(frozen=True)
+class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTrainer]):
+    """What to train a refiner on, and how.
+
+    A guard watches held-out samples: the best refiner seen is kept, and training stops and restores it where one side
+    wins.
+    """
+
+    kind = "refiner"
+    counter = "round"
+    guards = ("refiner", "critic", "told")
+    config: RefinerConfig = field(default_factory=RefinerConfig)
+    """The network."""
+    settings: AdversarialSettings = field(default_factory=AdversarialSettings)
+    """How it is trained."""
+    match: str | None = None
+    """Regular expression for the clips; the density's own if None."""
+    report_steps: int = 50
+    """Rounds between lines of news."""
+    validate_steps: int = 300
+    """Rounds between measures of held-out samples."""
+    density: str = "locomotion"
+    """Prior whose samples are refined."""
+    samples: int = 300
+    """Motions of `seconds` drawn from the density to train on."""
+    seconds: float = 10.0
+    """Of each."""
+    judged: int = 24
+    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
+    realism: RealismSettings = field(default_factory=RealismSettings)
+    """How samples are told from mocap."""
+
+    @cached_property
+    def prior(self) -> LstmGmmDensity:
+        """The density, loaded."""
+        return density.load(self.density)
+
+    def source(self) -> DataSource:
+        """Where motion comes from: split as the density's, so that what it has not seen stays unseen."""
+        seed = self.prior.card.data.get("split_seed", self.settings.seed)
+        return replace(super().source(), match=self._find_match(), seed=seed)
+
+    def make_trainer(self, parts: Split) -> AdversarialTrainer:
+        """With samples of the density, to train on and to be measured."""
+        generator, frames = torch.Generator().manual_seed(self.settings.seed), round(self.seconds * PRIOR_FPS)
+        raw = sample_corpus(self.prior, parts.train, self.samples, frames, generator)
+        measured = sample_corpus(self.prior, parts.train, self.judged, frames, generator)
+        evaluate = RefinerEvaluator.of(measured, parts, self.realism)
+        return AdversarialTrainer(self.config, self.settings, parts.train, raw, evaluate)
+
+    def describe_data(self, corpus: Corpus) -> dict[str, str]:
+        """What tells the data of this run from others'."""
+        return corpus.identity() | {"density": self.density, "match": self._find_match()}
+
+    def format_news(self, rows: Sequence[Row]) -> str:
+        """One line on the losses of some rounds."""
+        refiner, critic, told = (average(rows, name) for name in self.guards)
+        return f"refiner {refiner:.3f}, critic {critic:.3f} nats, {told:.2f} told apart, {rows[-1]['updates']} updates"
+
+    def find_stop_reason(self, trainer: AdversarialTrainer, rows: Sequence[Row]) -> str | None:
+        """Why to stop after these losses since the last line of news, if there is a reason."""
+        if not all(math.isfinite(rows[-1][name]) for name in ("refiner", "critic")):
+            return f"training diverged at round {trainer.step}"
+        if len(rows) >= self.report_steps and average(rows, "told") > _CRITIC_WON:
+            return "the critic has won"
+        return None
+
+    def score(self, row: Row) -> float:
+        """How far feet, tremble and what is told apart are from mocap's."""
+        return compute_realism_gap(row)
+
+    def export(self, trainer: AdversarialTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """The best refiner seen."""
+        data = {
+            "density_config": self.prior.reference.config.as_card(),
+            "samples": self.samples,
+            **self.describe_data(gathered.corpus),
+            **describe_skipped(gathered.corpus),
+        }
+        return Export(trainer.network.state_dict(), data, min(curve, key=compute_realism_gap))
+
+    def format_command(self) -> str:
+        """What to type for the same run, for the card; options that are the defaults are left out."""
+        paper = self.config == PAPER[0]
+        parts = [f"mapctl train refiner --data DATA -o RUN --density {self.density}"]
+        parts += [f"--match '{self.match}'"] if self.match is not None else []
+        usual = PAPER[1] if paper else AdversarialSettings()
+        parts += self.format_changed(usual, "batch", "window", "seed", rounds="steps")
+        return " ".join(parts + ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper)
+
+    def _find_match(self) -> str:
+        return self.prior.card.data.get("match", "") if self.match is None else self.match
+
+
+def _make_sides(
+    config: RefinerConfig, settings: AdversarialSettings, statistics: dict[str, Tensor]
+) -> tuple[RefinerNetwork, Critic]:
+    """Refiner and critic, their weights drawn in this order."""
+    refiner = RefinerNetwork(config, **statistics)
+    critic = Critic(
+        config.joints,
+        width=settings.critic_width,
+        around=settings.critic_around,
+        slow=settings.critic_slow,
+        **{name: statistics[name] for name in ("reach_mean", "reach_std")},
+    )
+    return refiner, critic
 
 
 def _compute_root_error(before: Tensor, after: Tensor) -> Tensor:
@@ -296,7 +384,3 @@ def _compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> d
         ]
     )
     return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}
-
-
-def _strip_prefix(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -15,26 +14,23 @@ from helpers import killing, run
 
 import priors
 from mapctl import cli
-from mapctl.commands.train import Train, windows
+from mapctl.commands.train import Train
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors.denoiser.network import DenoiserConfig
 from priors.infiller.network import InfillerConfig
-from priors.training import denoiser_run, infiller_run
-from priors.training.recipes.denoiser import DenoiserSettings
-from priors.training.recipes.infiller import InfillerSettings
-from priors.training.window_run import format_window_command
+from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings, DenoiserTrainer
+from priors.training.recipes.infiller import InfillerRecipe, InfillerSettings, InfillerTrainer
+from priors.training.run import train
 
 
 @dataclass(frozen=True)
 class Model:
     """One of those that are trained so."""
 
-    runs: ModuleType
-    """`train` and `KIND`."""
-    request: Callable[..., Any]
-    """Of its run."""
-    of_command: Callable[[Train], Any]
-    """The request that a command line makes."""
+    recipe: Any
+    """Class of what is trained."""
+    trainer: type
+    """That its runs use."""
     load: Callable[[str], Any]
     """As controllers get it."""
     tiny: Any
@@ -42,25 +38,24 @@ class Model:
     other: Any
     """Another shape of it."""
     usual: Any
-    """The recipe that is the default."""
+    """Settings that are the default."""
     shape: tuple[tuple[str, ...], Any]
     """Words for another shape, and the shape."""
 
     @property
     def name(self) -> str:
-        return self.runs.KIND.name
+        return self.recipe.kind
 
     @property
     def settings(self):
-        """A recipe of six steps."""
+        """Six steps."""
         return replace(self.usual, steps=6, batch=3, window=32)
 
 
 MODELS = (
     Model(
-        denoiser_run,
-        denoiser_run.DenoiserRequest,
-        windows.build_window_request,
+        DenoiserRecipe,
+        DenoiserTrainer,
         priors.load_denoiser,
         tiny_denoiser.CONFIG,
         replace(tiny_denoiser.CONFIG, width=7),
@@ -68,9 +63,8 @@ MODELS = (
         (("--width", "12"), DenoiserConfig(width=12)),
     ),
     Model(
-        infiller_run,
-        infiller_run.InfillerRequest,
-        windows.build_window_request,
+        InfillerRecipe,
+        InfillerTrainer,
         priors.load_infiller,
         tiny_infiller.CONFIG,
         replace(tiny_infiller.CONFIG, kernel=5),
@@ -92,23 +86,23 @@ def request_in(data, model):
     def made(out, **changes):
         settings = replace(model.settings, **changes.pop("settings", {}))
         given = {"checkpoint_minutes": 0.0, "report_steps": 2, "validate_steps": 4, "config": model.tiny} | changes
-        return model.request(data, out, settings=settings, **given)
+        return model.recipe(data, out, settings=settings, **given)
 
     return made
 
 
 def killed_in(model, request, number):
     """Runs until a step is begun."""
-    with killing(model.runs.KIND.trainer, "train_step", number, counter="step"):
-        model.runs.train(request)
+    with killing(model.trainer, number):
+        train(request)
 
 
 def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, model, request_in):
-    whole = model.runs.train(request_in(tmp_path / "whole"))
+    whole = train(request_in(tmp_path / "whole"))
     killed_in(model, request_in(tmp_path / "parts"), 3)
     killed_in(model, request_in(tmp_path / "parts", resume=True), 4)
     news = []
-    parts = model.runs.train(request_in(tmp_path / "parts", resume=True), news.append)
+    parts = train(request_in(tmp_path / "parts", resume=True), news.append)
     assert "resumed at step 4" in news
     for name in (whole.name, "model.json", "step-6-checkpoint.safetensors", "checkpoint.json"):
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
@@ -117,7 +111,7 @@ def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, model,
 
 def test_a_finished_run_loads_with_a_complete_card(tmp_path, model, request_in):
     news, out = [], tmp_path / "run"
-    model.runs.train(request_in(out, licence="CC0"), news.append)
+    train(request_in(out, licence="CC0"), news.append)
     found = model.load(str(out))
     card = found.card
     assert (card.kind, card.licence, found.network.config) == (model.name, "CC0", model.tiny)
@@ -130,7 +124,7 @@ def test_a_finished_run_loads_with_a_complete_card(tmp_path, model, request_in):
 
 
 def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, model, request_in):
-    out, train = tmp_path / "run", model.runs.train
+    out = tmp_path / "run"
     with pytest.raises(CheckpointError, match="no checkpoint to resume"):
         train(request_in(out, resume=True))
     killed_in(model, request_in(out), 2)
@@ -146,9 +140,9 @@ def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_pa
 
 def test_what_cannot_be_trained_on_is_refused(tmp_path, model, request_in):
     with pytest.raises(RequestError, match="not a folder of BVH"):
-        model.runs.train(replace(request_in(tmp_path / "run"), data=tmp_path / "nowhere"))
+        train(replace(request_in(tmp_path / "run"), data=tmp_path / "nowhere"))
     with pytest.raises(RequestError, match=r"no .bvh below .* matches 'dance'"):
-        model.runs.train(request_in(tmp_path / "run", match="dance"))
+        train(request_in(tmp_path / "run", match="dance"))
     for wrong in ({"window": 15}, {"steps": 0}, {"batch": 0}):
         with pytest.raises(RequestError, match=f"{next(iter(wrong))} must be at least"):
             replace(model.settings, **wrong)
@@ -156,29 +150,32 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path, model, request_in):
 
 
 def test_a_run_may_begin_with_the_weights_of_another(tmp_path, model, request_in):
-    first = model.runs.train(request_in(tmp_path / "first"))
+    first = train(request_in(tmp_path / "first"))
     wanted = replace(request_in(tmp_path / "second"), init=str(first))
     killed_in(model, wanted, 2)  # at the step after its second checkpoint
-    model.runs.train(replace(wanted, resume=True))
+    train(replace(wanted, resume=True))
     card = model.load(str(tmp_path / "second")).card
     assert "--init INIT" in card.training["command"]
-    own = model.runs.train(request_in(tmp_path / "own"))
+    own = train(request_in(tmp_path / "own"))
     assert own.read_bytes() == first.read_bytes() != (tmp_path / "second" / "model.safetensors").read_bytes()
     again = request_in(tmp_path / "second", resume=True)
     with pytest.raises(CheckpointError, match="other init"):
-        model.runs.train(again)
+        train(again)
     with pytest.raises(CheckpointError, match=f"wanted: {model.name}"):
-        model.runs.train(replace(request_in(tmp_path / "third", config=model.other), init=str(first)))
+        train(replace(request_in(tmp_path / "third", config=model.other), init=str(first)))
 
 
 def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, model, request_in, monkeypatch):
-    trainer = model.runs.KIND.trainer
-    step = trainer.train_step
+    losses = model.trainer.losses
     monkeypatch.setattr(
-        trainer, "train_step", lambda trainer: step(trainer) | ({"loss": math.nan} if trainer.step == 3 else {})
+        model.trainer,
+        "losses",
+        lambda trainer: {
+            name: value * (math.nan if trainer.step == 2 else 1) for name, value in losses(trainer).items()
+        },
     )
-    with pytest.raises(MapctlError, match="diverged at step 3"):
-        model.runs.train(request_in(tmp_path / "run"))
+    with pytest.raises(MapctlError, match=r"diverged at step 3: the loss is nan; the last checkpoint, .* is kept"):
+        train(request_in(tmp_path / "run"))
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 2
     assert not (tmp_path / "run" / "model.safetensors").exists()
 
@@ -186,13 +183,13 @@ def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, model, request_
 def requested(model, *words):
     given = cli.parse(["train", model.name, "--data", "data", "-o", "run", *words])
     assert isinstance(given, Train)
-    return model.of_command(given)
+    return given.model.recipe()
 
 
 def test_every_option_reaches_the_trainer(model):
     given = requested(model)
     assert (given.config, given.settings) == (type(model.tiny)(), model.usual)
-    assert (given.data, given.out, given.match, given.resume) == (Path("data"), Path("run"), "", False)
+    assert (given.data, given.out, given.match, given.resume) == (Path("data"), Path("run"), None, False)
     words, config = model.shape
     given = requested(
         model,
@@ -226,17 +223,17 @@ def test_every_option_reaches_the_trainer(model):
 
 @pytest.mark.parametrize(
     "words",
-    [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"], ["--paper"]],
+    [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"], ["--paper"], ["--device", "cpu"]],
     ids=lambda words: words[0],
 )
-def test_options_of_other_models_are_refused(model, words):
-    with pytest.raises(RequestError, match=f"{words[0]} is for other models; an? {model.name} has no such option"):
+def test_options_of_other_models_are_unknown(model, words):
+    with pytest.raises(RequestError, match=f"Unrecognized options: {words[0]}.* .see mapctl train {model.name} --help"):
         requested(model, *words)
 
 
-def test_a_shape_that_only_another_model_has_is_refused(model):
+def test_a_shape_that_only_another_model_has_is_unknown(model):
     (other,) = (each for each in MODELS if each is not model)
-    with pytest.raises(RequestError, match=f"{other.shape[0][0]} is for other models"):
+    with pytest.raises(RequestError, match=f"Unrecognized options: {other.shape[0][0]}"):
         requested(model, *other.shape[0])
 
 
@@ -251,7 +248,6 @@ def test_a_shape_that_only_another_model_has_is_refused(model):
         (["--learning-rate", "2"], "learning rate"),
         (["--learning-rate", "0"], "learning"),
         (["--minutes-between-checkpoints", "0"], "minutes between"),
-        (["--device", "cuda"], "leave --device out"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
@@ -262,16 +258,11 @@ def test_numbers_that_make_no_sense_are_refused(model, words, message):
 
 def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, model):
     settings = replace(model.usual, steps=7, bfloat16=True, seed=3, learning_rate=2e-4)
-    wanted = model.request(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings, skip_first=True)
-    words = (
-        format_window_command(wanted, model.runs.KIND)
-        .replace("'", "")
-        .replace("DATA", str(data))
-        .replace("RUN", str(tmp_path))
-    )
+    wanted = model.recipe(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings, skip_first=True)
+    words = wanted.format_command().replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path))
     given = cli.parse(words.split()[1:])
     assert isinstance(given, Train)
-    assert model.of_command(given) == wanted
+    assert given.model.recipe() == wanted
 
 
 def test_the_command_line_trains_what_can_be_loaded(tmp_path, data, model, capsys):

@@ -14,8 +14,11 @@ from mapctl.metrics.realism import RealismSettings, canonical_positions, cut_win
 from mapctl.metrics.realism.classifier import compute_held_out_accuracy
 from mapctl.pose import decode
 from priors import checkpoints
+from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.network import LstmRefiner, RefinerNetwork
 from priors.training.corpus import Corpus, Split
+
+_WARM_UP_FRAMES = 60  # frames of a clip that the density has seen before it is let go
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,20 @@ class RefinerEvaluator:
                 made, self.windows, generator=seeded, settings=self.settings.classifier
             )
         return row
+
+
+def sample_corpus(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, generator: torch.Generator) -> Corpus:
+    """Free runs of the density, each after two seconds of a clip; clips are drawn by their length.
+
+    So the samples have the data's own shares of gaits and speeds, and the critic is left with their quality.
+    """
+    clips = [clip for clip in corpus.clips() if len(clip) >= _WARM_UP_FRAMES]
+    lengths = torch.tensor([float(len(clip)) for clip in clips])
+    picked = torch.multinomial(lengths, count, replacement=True, generator=generator).tolist()
+    state = prior.start_after(torch.stack([clips[i][0] for i in picked]))
+    state = prior.advance(state, torch.stack([clips[i][1:_WARM_UP_FRAMES] for i in picked]))
+    features, _ = prior.sample(state, frames, generator)
+    return Corpus(tuple(f"sample {k}" for k in range(count)), (frames,) * count, features.float().flatten(0, 1))
 
 
 def compute_realism_gap(row: Mapping[str, float | None]) -> float:

@@ -1,0 +1,55 @@
+"""`mapctl train lstm-gmm`: the options of a density."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import arg
+
+from mapctl.commands.shared import options
+from mapctl.commands.train.options import TunableOptions
+from mapctl.errors import RequestError
+
+if TYPE_CHECKING:
+    from priors.training.recipes.lstm_gmm import DensityRecipe
+
+
+@dataclass(frozen=True)
+class TrainDensity(TunableOptions):
+    """Train the density that follow, generate, steer and others use as their prior."""
+
+    model = "lstm-gmm"
+    used_by = "use it with --prior"
+    single_thread = False
+
+    width: options.MaybeCount = None
+    """Units of every hidden layer."""
+    components: options.MaybeCount = None
+    """Gaussians in the mixture."""
+    paper: bool = False
+    """The paper's own network and recipe instead of the measured better one; other options still hold."""
+    labels: Annotated[str, arg(metavar="REGEX")] = ""
+    """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
+    device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
+    """Where to compute."""
+
+    def recipe(self) -> "DensityRecipe":
+        """The options as the trainer takes them; RequestError for numbers that make no sense."""
+        from priors.lstm_gmm.network import LstmGmmConfig
+        from priors.training.recipes.lstm_gmm import PAPER, DensityRecipe, TrainingSettings
+
+        common, shape = self.common(), self.select_given("width", "components")
+        if self.init is not None and (self.paper or shape):
+            raise RequestError(
+                "with --init the network is that prior's; --width, --components and --paper do not apply"
+            )
+        config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
+        given = self.select_given("steps", "batch", "window", "learning_rate", "seed")
+        return DensityRecipe(
+            **common,
+            config=replace(config, **shape),
+            settings=replace(settings, bfloat16=self.bfloat16, **given),
+            device=self.device,
+            skip_first=self.skip_first,
+            labels=self.labels,
+            init=self.init,
+        )

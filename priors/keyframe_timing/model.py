@@ -1,0 +1,83 @@
+"""How long the way from one pose to the next takes people: a regression over mocap, by which a timing is suggested.
+
+The logarithm of the seconds is linear in what two poses show (see mapctl.inbetweening.pose_pairs).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.errors import RequestError
+from mapctl.inbetweening.pose_pairs import MAX_FITTED_DISTANCE, PAIR_FEATURES, TRAVELLING_DISTANCE
+from priors import checkpoints
+from priors.config import NetworkConfig
+
+
+@dataclass(frozen=True)
+class KeyframeTimingConfig(NetworkConfig):
+    """Shape of the regression."""
+
+    features: tuple[str, ...] = PAIR_FEATURES
+    """What is looked at of a pair of poses."""
+    shortest: float = 0.25
+    """Seconds that are said at least, and that the pairs of the fit are apart."""
+    longest: float = 4.0
+    """Seconds that are said at most, where a pair is no farther apart than the fit's."""
+
+    def __post_init__(self):
+        if self.features != PAIR_FEATURES:
+            raise RequestError(f"a keyframe timing looks at {', '.join(PAIR_FEATURES)}, got {', '.join(self.features)}")
+        if not 0 < self.shortest < self.longest:
+            raise RequestError(f"shortest must lie between 0 and longest, got {self.shortest:g} and {self.longest:g}")
+
+
+class KeyframeTimingNetwork(nn.Module):
+    """Weights of the regression, and how far off it is."""
+
+    weights: Float[Tensor, " features"]
+    ratios: Float[Tensor, "2 2"]
+
+    def __init__(self, config: KeyframeTimingConfig):
+        """Unfitted, it says a second for everything."""
+        super().__init__()
+        self.config = config
+        self.register_buffer("weights", torch.zeros(len(config.features)))
+        # 10th and 90th percentile of true over suggested seconds, of pairs about in place and of pairs on their way.
+        self.register_buffer("ratios", torch.ones(2, 2))
+
+    def forward(
+        self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
+    ) -> Float[Tensor, "pairs 3"]:
+        """Seconds that four of five pairs take at least, that are suggested, and that they take at most."""
+        seconds = torch.exp(features @ self.weights.to(features)).clamp(self.config.shortest, self.config.longest)
+        seconds = seconds * (metres / MAX_FITTED_DISTANCE).clamp_min(1)
+        low, high = self.ratios.to(features)[(metres >= TRAVELLING_DISTANCE).long()].unbind(dim=-1)
+        return torch.stack([low * seconds, seconds, high * seconds], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeTiming:
+    """A fitted regression, as controllers get it."""
+
+    name: str
+    """As it was asked for."""
+    network: KeyframeTimingNetwork
+    """Weights."""
+    card: checkpoints.Card
+    """What they are."""
+
+    def estimate_seconds(
+        self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
+    ) -> Float[Tensor, "pairs 3"]:
+        """Seconds that four of five pairs take at least, that are suggested, and that they take at most."""
+        return self.network(features, metres)
+
+
+def load(name: str) -> KeyframeTiming:
+    """The bundled timing by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    with checkpoints.open_checkpoint(name, "keyframe-timing", called="keyframe timing") as (tensors, card):
+        network = KeyframeTimingNetwork(KeyframeTimingConfig.of_card(card.config))
+        network.load_state_dict(tensors)
+    return KeyframeTiming(name, network.eval(), card)

@@ -1,0 +1,233 @@
+"""What a training run is told: on what, and how. A model's own recipe says what is learnt, judged and described."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from mapctl.errors import CheckpointError, RequestError
+from priors import checkpoints
+from priors.config import NetworkConfig, require_at_least
+from priors.training.corpus import Corpus, Split
+from priors.training.gathering import DataSource, describe_skipped
+from priors.training.trainer import Trainer
+
+Row = dict[str, Any]
+"""Losses of a step, or measures of held-out clips; in a curve None stands for what is not finite."""
+
+
+@runtime_checkable
+class Settings(Protocol):
+    """How a model is trained: a frozen dataclass with at least a seed."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def seed(self) -> int:
+        """Of everything random, the split of the clips among it."""
+        ...
+
+
+_TOLD = ("steps", "batch", "window", "pairs", "learning_rate", "seed")  # settings that are options of the command
+
+C = TypeVar("C", bound=NetworkConfig)
+S = TypeVar("S", bound=Settings)
+T = TypeVar("T", bound=Trainer[Any])
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """What a run is trained on."""
+
+    corpus: Corpus
+    """All clips."""
+    parts: Split
+    """The same, by what they are for."""
+
+    def held_out(self) -> dict[str, list[str]]:
+        """For a card: the clips that training does not see."""
+        return {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
+
+
+@dataclass(frozen=True)
+class Export:
+    """What a finished run writes, beside what every card tells."""
+
+    tensors: Mapping[str, Tensor]
+    """By name."""
+    data: Row
+    """What it was trained on, for the card."""
+    quality: Row
+    """Measures, for the card."""
+    abilities: dict[str, float] = field(default_factory=dict)
+    """Speeds and turning that the data show."""
+    half: bool = True
+    """Whether weights are kept in float16."""
+
+
+@dataclass(frozen=True)
+class Recipe(ABC, Generic[C, S, T]):
+    """What to train on, and how. A model's subclass gives `config` and `settings` their defaults."""
+
+    kind: ClassVar[str]
+    """Of the model, in its card and on the command line."""
+    counter: ClassVar[str] = "step"
+    """What one step of its trainer is called."""
+    guards: ClassVar[tuple[str, ...]] = ()
+    """Losses by which training may end by itself (see `find_stop_reason`). Where there are any, they are saved with the
+    checkpoints, and the best weights seen (see `score`) are exported instead of the last."""
+
+    data: Path
+    """Folder of BVH files, searched below."""
+    out: Path
+    """Run folder: checkpoint, curve, finished model."""
+    config: C
+    """The network."""
+    settings: S
+    """How it is trained."""
+    match: str | None = None
+    """Regular expression that a file's path below `data` must contain."""
+    resume: bool = False
+    """Continue from the run folder's last checkpoint."""
+    checkpoint_minutes: float = 3.0
+    """Between checkpoints."""
+    report_steps: int = 100
+    """Between lines of news."""
+    validate_steps: int = 1000
+    """Between validations."""
+    licence: str = "that of the training data"
+    """Of the weights, for the card."""
+    skip_first: bool = False
+    """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    strict_data: bool = False
+    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "report_steps", "validate_steps")
+
+    @abstractmethod
+    def make_trainer(self, parts: Split) -> T:
+        """As it is before the first step."""
+
+    def check(self) -> None:
+        """Before anything is read."""
+        if not self.data.is_dir():
+            raise RequestError(f"{self.data} is not a folder of BVH files")
+
+    def source(self) -> DataSource:
+        """Where motion comes from."""
+        return DataSource(
+            self.data, self.out, self.match or "", self.skip_first, self.strict_data, seed=self.settings.seed
+        )
+
+    def find_shape(self, trainer: T) -> C:
+        """Of the network that is trained."""
+        return self.config
+
+    def describe_data(self, corpus: Corpus) -> dict[str, str]:
+        """What tells the data of this run from others'."""
+        return corpus.identity()
+
+    def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
+        """What must not change between a run's parts."""
+        return {
+            "settings": asdict(self.settings),
+            "network": self.find_shape(trainer).as_card(),
+            "data": self.describe_data(corpus),
+        }
+
+    def format_news(self, rows: Sequence[Row]) -> str:
+        """One line on the losses of some steps."""
+        return ", ".join(f"{name} {average(rows, name):.3f}" for name in rows[0])
+
+    def find_stop_reason(self, trainer: T, rows: Sequence[Row]) -> str | None:
+        """Why to stop after these losses since the last line of news, if there is a reason."""
+        return None
+
+    def score(self, row: Row) -> float:
+        """How far measures are from what is wanted."""
+        return 0.0
+
+    def export(self, trainer: T, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """What is written at the end."""
+        corpus = gathered.corpus
+        data = {
+            **self.describe_data(corpus),
+            **describe_skipped(corpus),
+            "match": self.match or "",
+            "split_seed": self.settings.seed,
+            "held_out": gathered.held_out(),
+        }
+        return Export(trainer.network.state_dict(), data, {"test": trainer.validate(gathered.parts.test)})
+
+    def format_shape(self) -> list[str]:
+        """Options of the command that the network's shape needs; those that are the defaults are left out."""
+        return []
+
+    def format_command(self) -> str:
+        """What to type for the same run, for the card; options that are the defaults are left out."""
+        told = [name for name in _TOLD if hasattr(self.settings, name)]
+        parts = [f"mapctl train {self.kind} --data DATA -o RUN"]
+        parts += [f"--match '{self.match}'"] if self.match else []
+        parts += ["--skip-first"] * self.skip_first + self.format_shape()
+        return " ".join(parts + self.format_changed(type(self.settings)(), *told))
+
+    def format_changed(self, usual: Any, *names: str, **renamed: str) -> list[str]:
+        """Options for settings that are not the `usual` ones; `renamed` are those whose option is called otherwise."""
+        options = {name: name for name in names} | renamed
+        return [
+            f"--{option.replace('_', '-')} {getattr(self.settings, name)}"
+            for name, option in options.items()
+            if getattr(self.settings, name) != getattr(usual, name)
+        ]
+
+
+@dataclass(frozen=True)
+class NetworkRecipe(Recipe[C, S, T]):
+    """Of one network on the usual card, that may begin with another's weights."""
+
+    init: str | None = None
+    """Begin with the weights of this model, bundled or trained."""
+
+    @abstractmethod
+    def make_untaught(self, parts: Split) -> T:
+        """The trainer, its weights drawn."""
+
+    def make_trainer(self, parts: Split) -> T:
+        """As it is before the first step."""
+        trainer = self.make_untaught(parts)
+        if self.init is not None and not self.resume:
+            trainer.network.load_state_dict(self._read_initial_weights(self.init))
+        return trainer
+
+    def _read_initial_weights(self, name: str) -> dict[str, Tensor]:
+        """Another model's weights; CheckpointError if they are not of this network."""
+        tensors, card = checkpoints.load(checkpoints.locate(name))
+        if card.kind != self.kind or card.config != self.config.as_card():
+            wanted = f"{self.kind} of {self.config.as_card()}"
+            raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
+        return tensors
+
+    def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
+        """What must not change between a run's parts."""
+        return {**super().pin(trainer, corpus), "init": {"name": self.init}}
+
+    def format_command(self) -> str:
+        """What to type for the same run, for the card; options that are the defaults are left out."""
+        parts = ["--init INIT"] if self.init is not None else []
+        parts += ["--bfloat16"] * bool(getattr(self.settings, "bfloat16", False))
+        return " ".join([super().format_command(), *parts])
+
+
+def average(rows: Sequence[Row], name: str) -> float:
+    """Mean of a part of the loss."""
+    return sum(row[name] for row in rows) / len(rows)
+
+
+def copy_weights(network: torch.nn.Module) -> dict[str, Tensor]:
+    """As they are now."""
+    return {name: value.clone() for name, value in network.state_dict().items()}

@@ -1,0 +1,136 @@
+"""Fit of the keyframe timing: least absolute deviations of the logarithm of seconds, over pairs of poses of mocap."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.errors import RequestError
+from mapctl.features import GroundPose
+from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sample_pose_pairs
+from mapctl.pose import decode
+from priors.config import require_at_least
+from priors.keyframe_timing.model import KeyframeTimingConfig, KeyframeTimingNetwork
+from priors.training.corpus import Corpus, Split
+from priors.training.recipe import Export, Gathered, Recipe, Row
+from priors.training.trainer import Trainer
+
+_PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
+
+
+@dataclass(frozen=True)
+class KeyframeTimingSettings:
+    """How a timing is fitted."""
+
+    steps: int = 15
+    """Reweightings of the least squares."""
+    pairs: int = 5
+    """Pairs of poses drawn of every clip."""
+    ridge: float = 1.0
+    """Weight of the squared weights, of features of about unit spread."""
+    min_deviation: float = 0.15
+    """Of the logarithm of seconds, below which all deviations count alike."""
+    seed: int = 1
+    """Of the pairs and of the split of the clips."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps", "pairs")
+        if not (self.ridge > 0 and self.min_deviation > 0):
+            raise RequestError(f"ridge and min_deviation must be positive, got {self.ridge:g}, {self.min_deviation:g}")
+
+
+class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
+    """Solves for the weights again and again, with less and less said by pairs that are far off."""
+
+    def __init__(self, config: KeyframeTimingConfig, settings: KeyframeTimingSettings, corpus: Corpus):
+        super().__init__(steps=settings.steps, seed=settings.seed)
+        self.settings = settings
+        self.network = KeyframeTimingNetwork(config).double()
+        self.pairs = draw_pairs(corpus, config, settings.pairs, self.generator)
+
+    def train_step(self) -> dict[str, float]:
+        """Solve once, and see within which bounds the truth lies; the factor by which half of the pairs are off."""
+        network, pairs = self.network, self.pairs
+        weights = solve_weights(pairs, network.weights if self.step else None, self.settings)
+        network.weights.copy_(weights)
+        ratio = pairs.seconds / network(pairs.features, pairs.metres)[:, 1]
+        for row, which in enumerate(_split_by_distance(pairs)):
+            if bool(which.any()):
+                network.ratios[row] = torch.quantile(ratio[which], ratio.new_tensor(_PERCENTILES))
+        self.step += 1
+        return {"half_off_by": _measure_error(ratio)}
+
+    def validate(self, corpus: Corpus) -> Row:
+        """The factor by which half of unseen pairs are off, and the share that lies within the bounds."""
+        pairs = draw_pairs(corpus, self.network.config, self.settings.pairs, torch.Generator().manual_seed(0))
+        low, suggested, high = self.network(pairs.features, pairs.metres).unbind(dim=-1)
+        ratio, inside = pairs.seconds / suggested, (pairs.seconds >= low) & (pairs.seconds <= high)
+        row: Row = {"pairs": len(ratio), "half_off_by": _measure_error(ratio), "within": float(inside.double().mean())}
+        for name, which in zip(("in_place", "on_the_way"), _split_by_distance(pairs), strict=True):
+            if bool(which.any()):
+                row[f"{name}_half_off_by"] = _measure_error(ratio[which])
+        return row
+
+    def check_finite(self) -> None:
+        """The weights are solved for, and the ridge leaves no equations without a solution."""
+
+
+@dataclass(frozen=True)
+class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, KeyframeTimingTrainer]):
+    """What to fit a keyframe timing to, and how."""
+
+    kind = "keyframe-timing"
+    config: KeyframeTimingConfig = field(default_factory=KeyframeTimingConfig)
+    """The regression."""
+    settings: KeyframeTimingSettings = field(default_factory=KeyframeTimingSettings)
+    """How it is fitted."""
+
+    def make_trainer(self, parts: Split) -> KeyframeTimingTrainer:
+        """With the pairs of poses that it is fitted to."""
+        return KeyframeTimingTrainer(self.config, self.settings, parts.train)
+
+    def export(self, trainer: KeyframeTimingTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """In float32: it is no kilobyte."""
+        made = super().export(trainer, gathered, curve)
+        tensors = {name: value.float() for name, value in made.tensors.items()}
+        return replace(made, tensors=tensors, data={**made.data, "pairs": len(trainer.pairs.seconds)}, half=False)
+
+
+def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, count: int, generator: torch.Generator) -> PosePairs:
+    """Of every clip of a corpus; RequestError where no clip is long enough."""
+    origin = GroundPose.origin(torch.float64)
+    bodies = (decode(clip.double(), origin) for clip in corpus.clips())
+    return sample_pose_pairs(bodies, generator, count=count, shortest=config.shortest, longest=config.longest)
+
+
+def solve_weights(
+    pairs: PosePairs, before: Float[Tensor, " features"] | None, settings: KeyframeTimingSettings
+) -> Float[Tensor, " features"]:
+    """Of the regression: least squares of the logarithm of seconds with a ridge over features of about unit spread,
+    every pair weighted by one over how far the weights `before` are off there. So, repeated, deviations count by their
+    size and not by its square.
+    """
+    mean, spread = pairs.features.mean(dim=0), pairs.features.std(dim=0) + 1e-9
+    mean[0], spread[0] = 0.0, 1.0
+    unit, told = (pairs.features - mean) / spread, pairs.seconds.log()
+    counts = torch.ones_like(told)
+    if before is not None:
+        counts = 1 / (told - pairs.features @ before).abs().clamp_min(settings.min_deviation)
+    heavy = unit * counts[:, None]
+    ridge = settings.ridge * torch.eye(unit.shape[1], dtype=unit.dtype)
+    weights = torch.linalg.solve(heavy.T @ unit + ridge, heavy.T @ told) / spread
+    weights[0] -= (weights[1:] * mean[1:]).sum()
+    return weights
+
+
+def _split_by_distance(pairs: PosePairs) -> tuple[Tensor, Tensor]:
+    """Which pairs are about in place, and which are on their way."""
+    going = pairs.metres >= TRAVELLING_DISTANCE
+    return ~going, going
+
+
+def _measure_error(ratio: Float[Tensor, " pairs"]) -> float:
+    """The factor by which half of the pairs are off at most."""
+    return float(ratio.log().abs().median().exp())
