@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import torch
 
+from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.solver import follow_to_end
-from controllers.benchmarks.tables import Row
 from controllers.following.follow import FollowSettings
 from mapctl import curves
 from mapctl.curves import Curve

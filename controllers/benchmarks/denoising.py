@@ -10,9 +10,9 @@ import torch
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 from torch import Tensor
 
-from controllers.benchmarks.corruptions import CONDITIONS, CorruptedClip, detect_true_contacts
-from controllers.benchmarks.held_out import CleanClip
-from controllers.benchmarks.tables import Row, average_rows
+from controllers.benchmarks.shared.corruptions import CONDITIONS, CorruptedClip, detect_true_contacts
+from controllers.benchmarks.shared.held_out import CleanClip
+from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.denoising.denoise import denoise
 from controllers.denoising.result import DenoiseResult
 from controllers.inbetweening.infill import infill

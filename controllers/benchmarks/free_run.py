@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.generation.generate import GenerateSettings, initialise_generation
 from mapctl.features import LAYOUT, PRIOR_FPS, ground_speed
 from mapctl.metrics.states import summarise_states

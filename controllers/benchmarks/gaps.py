@@ -5,7 +5,7 @@ from functools import partial
 
 import torch
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.error_estimates import is_travelling
 from controllers.inbetweening.pipeline import InfillResult, fill
 from controllers.inbetweening.proposers.selection import choose_proposals

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from controllers.benchmarks.tables import Row, average_rows
+from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import GenerateSettings, generate, sample_stratified_starts
 from mapctl.errors import RequestError

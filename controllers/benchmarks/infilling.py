@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillMethod, InfillSettings
 from mapctl import contacts

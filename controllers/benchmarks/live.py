@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.benchmarks.infilling import WINDOW_FRAMES, scale_to_canonical_bones, slice_middle
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import infill
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener

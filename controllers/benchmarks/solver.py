@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.common.initial_state import select_initial_state
 from controllers.following.follow import FollowSettings, build_follow_terms, follow
 from mapctl import curves

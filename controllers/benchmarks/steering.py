@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import torch
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, drive, summarise_step_timing
 from controllers.steering.pure_pursuit import PurePursuit

@@ -3,12 +3,11 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from controllers.benchmarks.tables import Row, average_rows
+from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.proposers.rollout import roll_through_gaps, select_likeliest_density
 from controllers.inbetweening.tween import tween
@@ -33,7 +32,7 @@ _NUM_ALTERNATIVES = 4  # answers
 def benchmark_tweening(
     kinds: Mapping[str, Sequence[Motion]],
     infiller: Inbetweener,
-    densities: Sequence[Any],
+    densities: Sequence[Density],
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:

@@ -88,7 +88,7 @@ def _candidate_energy(
 
 
 def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:
-    """rms of the root's sideways departure from its own smoothed way, metres (DESIGN's sway, without a curve)."""
+    """Sway without a curve: rms of the root's sideways departure from its own smoothed trajectory, metres."""
     ground, _ = integrate_root(features, GroundPose.origin())
     smooth = gaussian.averaging_matrix(ground.shape[1], _SWAY_SECONDS * fps, ground.dtype) @ ground
     way = torch.nn.functional.normalize(torch.gradient(smooth, dim=1)[0], dim=-1)

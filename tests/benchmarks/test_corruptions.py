@@ -5,7 +5,7 @@ import torch
 from captures import apart_deg, error_cm, on_rig
 from helpers import generator
 
-from controllers.benchmarks.corruptions import (
+from controllers.benchmarks.shared.corruptions import (
     CONDITIONS,
     add_drift,
     add_noise,

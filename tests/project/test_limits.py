@@ -139,15 +139,15 @@ def lines_out_of_format() -> Iterable[str]:
 
 
 CEILINGS = {
-    crowded_folders: 1,
-    late_imports: 49,
-    modules_in_cycles: 28,
-    docstrings_that_begin_with_of: 68,
-    docstrings_that_cite_what_is_not_here: 4,
-    models_of_any_type: 69,
-    advances_elsewhere: 6,
-    shortest_arcs_of_their_own: 4,
-    terms_without_a_controller: 1,
+    crowded_folders: 0,
+    late_imports: 26,
+    modules_in_cycles: 19,
+    docstrings_that_begin_with_of: 49,
+    docstrings_that_cite_what_is_not_here: 0,
+    models_of_any_type: 0,
+    advances_elsewhere: 2,
+    shortest_arcs_of_their_own: 0,
+    terms_without_a_controller: 0,
     lines_out_of_format: 0,
 }
 

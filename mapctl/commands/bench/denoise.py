@@ -2,7 +2,7 @@
 
 import priors
 from controllers.benchmarks.denoising import benchmark_denoising
-from controllers.benchmarks.held_out import load_clean_clips
+from controllers.benchmarks.shared.held_out import load_clean_clips
 from mapctl.commands.bench import Denoise
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress

@@ -2,7 +2,7 @@
 
 import priors
 from controllers.benchmarks.gaps import benchmark_gaps
-from controllers.benchmarks.held_out import load_canonical
+from controllers.benchmarks.shared.held_out import load_canonical
 from mapctl.commands.bench import Gaps
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress

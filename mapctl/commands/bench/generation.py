@@ -2,7 +2,7 @@
 
 import priors
 from controllers.benchmarks.generation import GenerationBenchmarkSettings, benchmark_generation
-from controllers.benchmarks.held_out import find_held_out
+from controllers.benchmarks.shared.held_out import find_held_out
 from mapctl import formats, retarget
 from mapctl.commands.bench import Generation
 from mapctl.commands.bench.output import print_rows

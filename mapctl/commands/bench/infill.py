@@ -1,9 +1,9 @@
 """`mapctl bench infill`: clips with pieces taken out."""
 
 import priors
-from controllers.benchmarks.held_out import load_canonical
 from controllers.benchmarks.infilling import benchmark_infilling, benchmark_infilling_by_kind
 from controllers.benchmarks.lost_joints import benchmark_missing_joints
+from controllers.benchmarks.shared.held_out import load_canonical
 from mapctl.commands.bench import Infill
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress

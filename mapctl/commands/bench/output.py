@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from controllers.benchmarks.tables import Row
+from controllers.benchmarks.shared.tables import Row
 from mapctl import report
 from mapctl.commands.bench import TABLES, Table
 from mapctl.commands.shared.tables import print_records

@@ -1,8 +1,8 @@
 """`mapctl bench timing`: suggested times between poses beside the true ones."""
 
 import priors
-from controllers.benchmarks.held_out import load_canonical
 from controllers.benchmarks.keyframe_timing import benchmark_keyframe_timing
+from controllers.benchmarks.shared.held_out import load_canonical
 from mapctl.commands.bench import Timing
 from mapctl.commands.bench.output import print_rows
 

@@ -1,7 +1,7 @@
 """`mapctl bench tween`: motion through a few keys, and ends extended."""
 
 import priors
-from controllers.benchmarks.held_out import load_canonical
+from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.tweening import benchmark_tweening
 from mapctl.commands.bench import Tween
 from mapctl.commands.bench.output import print_rows

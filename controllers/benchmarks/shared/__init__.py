@@ -1,0 +1,1 @@
+"""Clips, corruptions and table rows that several benchmarks share."""
