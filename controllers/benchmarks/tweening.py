@@ -25,6 +25,7 @@ from mapctl.skeleton import TOES
 TWEEN_FRAMES = 6 * PRIOR_FPS
 """Of a clip that are looked at."""
 _INNER_KEYS = 5  # keys, beside the first and the last
+_END_SOURCE_FRAMES = 4 * PRIOR_FPS  # of a clip, the end of which is taken away
 _END_LENGTHS = (30, 60)  # frames
 _NUM_ALTERNATIVES = 4  # answers
 
@@ -59,7 +60,7 @@ def benchmark_tweening(
             for method, each in told.items()
             if each
         ]
-        shown = [clip.slice(0, 4 * PRIOR_FPS) for clip in clips if clip.num_frames >= 4 * PRIOR_FPS]
+        shown = [clip.slice(0, _END_SOURCE_FRAMES) for clip in clips if clip.num_frames >= _END_SOURCE_FRAMES]
         for count in _END_LENGTHS:
             for by, rollout_densities in (("infiller", ()), ("density", densities)):
                 each = [_evaluate_end(clip, count, infiller, rollout_densities) for clip in shown]

@@ -11,7 +11,7 @@ from mapctl import features, rotations
 from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root, mirror_features
 from mapctl.motion import Motion
-from mapctl.pose import decode
+from mapctl.pose import BodyPose, decode
 from mapctl.skeleton import CANONICAL
 
 MOTIONS = {"walk": walk(40, turn_rate=1.0), "anything": random_motion(CANONICAL, 30)}
@@ -114,9 +114,8 @@ def test_batches_are_integrated_each_on_its_own():
 
 def test_rotations_from_features_are_local():
     motion = MOTIONS["walk"]
-    vectors, start = encode(motion)
-    _, heading = integrate_root(vectors, start)
-    assert turn_between(features.decode_local_rotations(vectors, heading), motion.local_quat_xyzw) < 1e-6
+    pose = BodyPose.of_features(*encode(motion))
+    assert turn_between(pose.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
 
 
 def test_the_layout_tiles_the_vector_and_its_fingerprint_tells_it_from_others():

@@ -76,7 +76,7 @@ def test_the_command_counts_so_too(words, said, tmp_path, monkeypatch):
         seen.append((source.fps, borrowed.start, borrowed.stop, borrowed.at))
         raise RequestError("caught")
 
-    monkeypatch.setattr(blending, "blend", catch)
+    monkeypatch.setattr("mapctl.commands.blend.run.blend", catch)
     paths = (tmp_path / "in.bvh", "--from", tmp_path / "other.bvh", "-o", tmp_path / "out.bvh", "--joints", "leftHand")
     assert run("blend", *paths, *words) == 2
     assert seen == [(120, *said)]

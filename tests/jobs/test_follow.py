@@ -111,7 +111,7 @@ def test_an_interrupted_walk_keeps_what_was_solved():
 
 def test_the_deadlines_clock_starts_with_the_call(monkeypatch):
     module = sys.modules["controllers.following.follow"]
-    slow = partial(after_a_while, module.choose_start)
+    slow = partial(after_a_while, module.select_initial_state)
     monkeypatch.setattr(module, "select_initial_state", slow)
     assert follow(curves.circle(radius=2), seconds=5, deadline_seconds=0.05).motion.num_frames == 1
 

@@ -45,8 +45,8 @@ def errors(cleaned, truth):
     """Root mean square: of the place in cm, of the angles in degrees."""
     angles = torch.cat([truth.tilt, truth.joints.flatten(2)], dim=-1)
     return (
-        100 * float((cleaned.root - truth.root).square().mean().sqrt()),
-        float(torch.rad2deg((cleaned.angles - angles).square().mean().sqrt())),
+        100 * float((cleaned.pose.root_position - truth.root).square().mean().sqrt()),
+        float(torch.rad2deg((cleaned.pose.angles - angles).square().mean().sqrt())),
     )
 
 
@@ -56,7 +56,7 @@ def test_untrained_it_smooths():
     place, angle = errors(cleaned, truth)
     assert place < 0.6 * 3
     assert angle < 0.6 * 5
-    assert float(torch.rad2deg((cleaned.heading - truth.heading).square().mean().sqrt())) < 0.6 * 5
+    assert float(torch.rad2deg((cleaned.pose.heading - truth.heading).square().mean().sqrt())) < 0.6 * 5
 
 
 @pytest.mark.parametrize("drawn", [0.0, 0.3])
@@ -67,7 +67,7 @@ def test_without_noise_what_was_seen_is_what_comes_back(drawn):
     place, angle = errors(cleaned, seen)
     assert place < 1e-3
     assert angle < 1e-3
-    assert torch.allclose(cleaned.heading, seen.heading, atol=1e-5)
+    assert torch.allclose(cleaned.pose.heading, seen.heading, atol=1e-5)
 
 
 def test_little_noise_changes_little():
@@ -83,9 +83,9 @@ def test_drawn_weights_do_something():
     """Or the tests with them would say nothing."""
     noisy = capture(degrees=5, centimetres=3)
     plain, other = network()(noisy), network(drawn=0.3)(noisy)
-    assert (plain.angles - other.angles).abs().max() > 0.01
-    assert (plain.root - other.root).abs().max() > 0.001
-    assert other.contacts.std() > 0.01
+    assert (plain.pose.angles - other.pose.angles).abs().max() > 0.01
+    assert (plain.pose.root_position - other.pose.root_position).abs().max() > 0.001
+    assert other.contact_logits.std() > 0.01
 
 
 def moved(given, angle, offset):
@@ -101,14 +101,14 @@ def test_it_does_not_matter_where_the_capture_stands_and_faces(drawn):
     noisy = capture(degrees=5, centimetres=3)
     noisy = replace(noisy, seen=torch.rand(noisy.seen.shape, generator=generator(1)) > 0.1)
     here, there = network(drawn=drawn)(noisy), network(drawn=drawn)(moved(noisy, 2.2, (5.0, 0.0, -3.0)))
-    turn = torch.full_like(here.heading, 2.2)
-    ground = rotations.rotate_ground(here.root[..., ::2], turn) + torch.tensor([5.0, -3.0])
-    assert torch.allclose(there.root[..., ::2], ground, atol=1e-4)
-    assert torch.allclose(there.root[..., 1], here.root[..., 1], atol=1e-5)
-    off = rotations.wrap_angle(there.heading - here.heading - 2.2)
+    turn = torch.full_like(here.pose.heading, 2.2)
+    ground = rotations.rotate_ground(here.pose.root_position[..., ::2], turn) + torch.tensor([5.0, -3.0])
+    assert torch.allclose(there.pose.root_position[..., ::2], ground, atol=1e-4)
+    assert torch.allclose(there.pose.root_position[..., 1], here.pose.root_position[..., 1], atol=1e-5)
+    off = rotations.wrap_angle(there.pose.heading - here.pose.heading - 2.2)
     assert off.abs().max() < 1e-4
-    assert torch.allclose(there.angles, here.angles, atol=1e-4)
-    assert torch.allclose(there.contacts, here.contacts, atol=1e-3)
+    assert torch.allclose(there.pose.angles, here.pose.angles, atol=1e-4)
+    assert torch.allclose(there.contact_logits, here.contact_logits, atol=1e-3)
 
 
 def test_what_was_not_seen_does_not_matter():
@@ -131,22 +131,24 @@ def test_a_batch_is_its_members():
     names = ("root", "hips", "joints", "seen_root", "seen", "sigma_root", "sigma")
     both = Capture(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
     together, alone = network(drawn=0.3)(both), network(drawn=0.3)(second)
-    assert torch.allclose(together.angles[1:], alone.angles, atol=1e-5)
-    assert torch.allclose(together.root[1:], alone.root, atol=1e-5)
+    assert torch.allclose(together.pose.angles[1:], alone.pose.angles, atol=1e-5)
+    assert torch.allclose(together.pose.root_position[1:], alone.pose.root_position, atol=1e-5)
 
 
 def test_gaps_are_filled_with_something_finite():
     noisy = capture(degrees=5, centimetres=3)
     noisy.seen[:] = False
     noisy.seen_root[:] = False
-    assert all(bool(value.isfinite().all()) for value in vars(network(drawn=0.3)(noisy)).values())
+    proposal = network(drawn=0.3)(noisy)
+    assert proposal.pose.pack().isfinite().all()
+    assert proposal.contact_logits.isfinite().all()
 
 
 @pytest.mark.parametrize("frames", [1, 2, 9])
 def test_short_captures_break_nothing(frames):
     cleaned = tiny_denoiser(drawn=0.3).clean(capture(frames, degrees=5))
-    assert cleaned.root.shape == (1, frames, 3)
-    assert cleaned.local_quat_xyzw.shape == (1, frames, JOINTS, 4)
+    assert cleaned.pose.root_position.shape == (1, frames, 3)
+    assert cleaned.pose.local_quat_xyzw.shape == (1, frames, JOINTS, 4)
 
 
 def test_a_long_capture_in_pieces_is_one_pass(monkeypatch):
@@ -155,20 +157,20 @@ def test_a_long_capture_in_pieces_is_one_pass(monkeypatch):
     whole = tiny_denoiser(drawn=0.1).clean(noisy)
     monkeypatch.setattr(denoiser, "_CHUNK_FRAMES", 100)
     pieces = tiny_denoiser(drawn=0.1).clean(noisy)
-    assert whole.root.shape == pieces.root.shape
-    assert torch.allclose(pieces.root, whole.root, atol=1e-3)
-    assert torch.allclose(pieces.angles, whole.angles, atol=1e-3)
-    assert torch.allclose(pieces.contacts, whole.contacts, atol=1e-2)
-    assert torch.diff(pieces.heading, dim=1).abs().max() < 1.0
-    apart = (pieces.heading - whole.heading)[0]
+    assert whole.pose.root_position.shape == pieces.pose.root_position.shape
+    assert torch.allclose(pieces.pose.root_position, whole.pose.root_position, atol=1e-3)
+    assert torch.allclose(pieces.pose.angles, whole.pose.angles, atol=1e-3)
+    assert torch.allclose(pieces.contact_logits, whole.contact_logits, atol=1e-2)
+    assert torch.diff(pieces.pose.heading, dim=1).abs().max() < 1.0
+    apart = (pieces.pose.heading - whole.pose.heading)[0]
     assert (apart - apart.mean()).abs().max() < 1e-2
-    assert pieces.heading[0, -1] - pieces.heading[0, 0] > 2 * 2 * math.pi
+    assert pieces.pose.heading[0, -1] - pieces.pose.heading[0, 0] > 2 * 2 * math.pi
 
 
 def test_rotations_of_a_proposal_are_its_heading_tilt_and_joints():
     cleaned = network()(capture(20))
     motion = walk(20, turn_rate=0.8)
-    dots = (cleaned.local_quat_xyzw[0].double() * motion.local_quat_xyzw).sum(-1).abs()
+    dots = (cleaned.pose.local_quat_xyzw[0].double() * motion.local_quat_xyzw).sum(-1).abs()
     assert (dots > 1 - 1e-5).all()
 
 
@@ -180,7 +182,9 @@ def test_a_saved_denoiser_loads_as_it_was(tmp_path):
         assert isinstance(loaded, Denoiser)
         assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "denoiser")
         noisy = capture(degrees=5)
-        assert torch.allclose(loaded.clean(noisy).angles, wanted(noisy).angles, atol=1e-3)  # float16 in the file
+        assert torch.allclose(
+            loaded.clean(noisy).pose.angles, wanted(noisy).pose.angles, atol=1e-3
+        )  # float16 in the file
 
 
 def test_what_is_no_denoiser_is_refused(tmp_path):

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from helpers import corpus, generator
+from helpers import corpus, generator, tiny_density
 from tiny_horizon import ARCS, BEGUN, CURVE, DENSITY, METHOD, SHORT, context, solver, terms_of
 
 from mapctl.errors import RequestError

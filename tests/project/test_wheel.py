@@ -14,7 +14,7 @@ from mapctl import __version__
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
-DATA = ("mapctl/rigs/*.toml", "priors/weights/*", "scenes/*.toml", "scenes/data/*")
+DATA = ("mapctl/retarget/presets/*.toml", "priors/weights/*", "scenes/*.toml", "scenes/data/*")
 LOCAL = shutil.ignore_patterns("__pycache__", ".*")
 # No path of the checkout may leak into the clean environment.
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
@@ -83,7 +83,7 @@ def test_every_source_and_data_file_is_held(held):
 
 
 def test_data_is_held(held):
-    assert {"mapctl/rigs/bandai_namco.toml", "mapctl/rigs/cmu_daz.toml"} <= held
+    assert {"mapctl/retarget/presets/bandai_namco.toml", "mapctl/retarget/presets/cmu_daz.toml"} <= held
     weights = {Path(name).suffix for name in held if name.startswith("priors/weights/")}
     assert {".safetensors", ".json"} <= weights
     assert any(name.startswith("scenes/") and name.endswith(".toml") for name in held)

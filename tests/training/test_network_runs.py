@@ -14,7 +14,7 @@ from helpers import killing, run
 
 import priors
 from mapctl import cli
-from mapctl.commands.train import Train
+from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors.denoiser.network import DenoiserConfig
 from priors.infiller.network import InfillerConfig
@@ -182,8 +182,8 @@ def test_a_diverged_run_stops_with_its_last_checkpoint(tmp_path, model, request_
 
 def requested(model, *words):
     given = cli.parse(["train", model.name, "--data", "data", "-o", "run", *words])
-    assert isinstance(given, Train)
-    return given.model.recipe()
+    assert isinstance(given, TrainOptions)
+    return given.recipe()
 
 
 def test_every_option_reaches_the_trainer(model):
@@ -261,8 +261,8 @@ def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, model):
     wanted = model.recipe(data, tmp_path, match="walk-[01]", config=model.shape[1], settings=settings, skip_first=True)
     words = wanted.format_command().replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path))
     given = cli.parse(words.split()[1:])
-    assert isinstance(given, Train)
-    assert given.model.recipe() == wanted
+    assert isinstance(given, TrainOptions)
+    assert given.recipe() == wanted
 
 
 def test_the_command_line_trains_what_can_be_loaded(tmp_path, data, model, capsys):

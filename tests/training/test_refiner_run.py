@@ -13,7 +13,7 @@ from tiny_prior import save_tiny_prior
 
 import priors
 from mapctl import cli
-from mapctl.commands.train import Train
+from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from priors import checkpoints
@@ -119,8 +119,8 @@ def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, variant, ch
     wanted = RefinerRecipe(data, tmp_path, match="walk-[01]", config=config, settings=replace(recipe, **changes))
     words = wanted.format_command().replace("'", "").replace("DATA", str(data)).replace("RUN", str(tmp_path)).split()
     given = cli.parse(words[1:])
-    assert isinstance(given, Train)
-    assert given.model.recipe() == wanted
+    assert isinstance(given, TrainOptions)
+    assert given.recipe() == wanted
 
 
 def test_samples_go_on_from_the_clips_they_are_drawn_with(data, density, tmp_path):

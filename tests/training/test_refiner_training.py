@@ -21,20 +21,9 @@ from priors.training.recipes import refiner as training
 from priors.training.recipes.refiner import REFINER_MOMENTS, AdversarialSettings, AdversarialTrainer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
-SETTINGS = AdversarialSettings(
-    rounds=5,
-    window=12,
-    batch=4,
-    warm_up=2,
-    head_start=0,
-    critic_updates=1,
-    history=10,
-    critic_width=8,
-    critic_around=1,
-    moments=0.0,
-    refiner_rate=1e-3,
-    critic_rate=1e-3,
-)
+SHORT = {"rounds": 5, "window": 12, "batch": 4, "warm_up": 2, "head_start": 0, "critic_updates": 1, "history": 10}
+SMALL = {"critic_width": 8, "critic_around": 1, "moments": 0.0, "refiner_rate": 1e-3, "critic_rate": 1e-3}
+SETTINGS = replace(AdversarialSettings(), **SHORT, **SMALL)
 SIZE = LAYOUT.continuous
 
 captured = cache(corpus)

@@ -8,7 +8,7 @@ import torch
 from helpers import corpus, generator
 
 from mapctl import cli
-from mapctl.commands.train import Train
+from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.denoiser.network import DenoiserConfig
@@ -40,9 +40,9 @@ def test_clips_shorter_than_the_window_are_left_out(tmp_path, data):
 
 def test_a_width_of_nothing_is_refused():
     given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", "--width", "0"])
-    assert isinstance(given, Train)
+    assert isinstance(given, TrainOptions)
     with pytest.raises(RequestError, match="--width must be at least 1"):
-        given.model.recipe()
+        given.recipe()
 
 
 def test_windows_are_clips_mirrored_half_of_the_time():

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 import priors
 from mapctl import cli
-from mapctl.commands.train import Train
+from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, PosePairs, TimingModel
 from priors import checkpoints
@@ -85,8 +85,8 @@ def test_a_run_leaves_float32_weights_with_a_complete_card(tmp_path, data):
 def test_every_option_reaches_the_fit(data, tmp_path):
     words = ["--steps", "3", "--pairs", "7", "--seed", "4", "--skip-first", "--match", "walk", "--licence", "CC0"]
     given = cli.parse(["train", "keyframe-timing", "--data", str(data), "-o", str(tmp_path), *words])
-    assert isinstance(given, Train)
-    recipe = given.model.recipe()
+    assert isinstance(given, TrainOptions)
+    recipe = given.recipe()
     assert recipe.settings == replace(SETTINGS, steps=3, pairs=7, seed=4)
     assert (recipe.skip_first, recipe.match, recipe.licence) == (True, "walk", "CC0")
     command = "mapctl train keyframe-timing --data DATA -o RUN --match 'walk' --skip-first --steps 3 --pairs 7 --seed 4"

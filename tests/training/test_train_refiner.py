@@ -9,7 +9,7 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 from mapctl import cli
-from mapctl.commands.train import Train
+from mapctl.commands.train.options import TrainOptions
 from priors.refiner.network import RefinerConfig
 from priors.training import run
 from priors.training.recipes.refiner import PAPER, AdversarialSettings
@@ -17,8 +17,8 @@ from priors.training.recipes.refiner import PAPER, AdversarialSettings
 
 def requested(*words):
     command = cli.parse(["train", "refiner", "--data", "data", "-o", "run", *words])
-    assert isinstance(command, Train)
-    return command.model.recipe()
+    assert isinstance(command, TrainOptions)
+    return command.recipe()
 
 
 def test_what_is_not_asked_for_is_the_measured_recipe():

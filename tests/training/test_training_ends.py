@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 
 from mapctl import cli
 from mapctl.commands import SUBCOMMANDS
+from mapctl.commands.train.options import TrainOptions
 from mapctl.runtime import interruption
 from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
@@ -346,8 +347,8 @@ def test_every_option_is_in_the_line():
         "--strict-data",
     ]
     given = cli.parse(words)
-    assert isinstance(given, Train)
-    assert cli.parse(given.model.format_command()[1:]) == given
+    assert isinstance(given, TrainOptions)
+    assert cli.parse(given.format_command()[1:]) == given
 
 
 def test_a_full_disk_ends_it_with_its_last_checkpoint(tmp_path, data, monkeypatch, capsys):
