@@ -3,6 +3,7 @@
 `timeout`, job schedulers and impatient fingers send a signal twice: what comes within a second is one signal.
 """
 
+import os
 import signal
 import threading
 import time
@@ -15,6 +16,7 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 """Signals that end work. Those that a process was told to ignore (nohup) are left ignored."""
 REPEAT_SECONDS = 1.0
 """Time within which signals count as one, seconds."""
+_RETRY_SECONDS = 0.05  # after which a signal that came while kernels are compiled comes again
 
 
 def raise_on_signals() -> list[int]:
@@ -25,9 +27,12 @@ def raise_on_signals() -> list[int]:
     received: list[int] = []
     until = 0.0
 
-    def stop(number: int, _: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal until
         if (now := time.monotonic()) < until:
+            return
+        if _is_in_compiler(frame):
+            threading.Timer(_RETRY_SECONDS, os.kill, (os.getpid(), number)).start()
             return
         until = now + REPEAT_SECONDS
         received.append(number)
@@ -100,6 +105,15 @@ def defer_signals() -> Iterator[DeferredSignals]:
         for number, handler in held._handlers.items():
             signal.signal(number, handler)
     held.release()
+
+
+def _is_in_compiler(frame: FrameType | None) -> bool:
+    """Return whether a frame is called by LLVM, which swallows what is raised in its callbacks and compiles on."""
+    while frame is not None:
+        if "llvmlite" in frame.f_code.co_filename:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _handled_signals() -> list[int]:

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -160,3 +162,20 @@ def test_a_programs_own_handler_is_asked_and_put_back():
         held.release()
         assert (found, held.wanted) == ([signal.SIGTERM], None)
     assert signal.getsignal(signal.SIGTERM) is own
+
+
+def test_a_signal_in_the_compiler_comes_again_until_it_is_out():
+    """LLVM swallows what its callbacks raise: Ctrl-C while kernels are compiled would be lost."""
+    code = """if True:
+        import signal, time
+        from mapctl.runtime.interruption import raise_on_signals
+        raise_on_signals()
+        inside = {"signal": signal, "time": time}
+        exec(compile("signal.raise_signal(signal.SIGINT); done = True", "llvmlite/callback.py", "exec"), inside)
+        try:
+            time.sleep(20)
+        except KeyboardInterrupt:
+            print("caught after", inside.get("done"))
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout == "caught after True\n"

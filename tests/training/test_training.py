@@ -343,3 +343,19 @@ def test_free_runs_are_compared_with_the_data():
     assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)
     summary = summarise_states(encode(walk(60))[0].float())
     assert summary["speed"] == pytest.approx(1.24, abs=0.02)
+
+
+def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
+    with pytest.raises(RequestError, match="not a folder"):
+        train(request_in(tmp_path / "run", tmp_path / "nowhere"))
+    with pytest.raises(RequestError, match=r"no .bvh below .* matches 'dance'"):
+        train(request_in(tmp_path / "run", data, match="dance"))
+    with pytest.raises(RequestError, match="regular expression"):
+        train(request_in(tmp_path / "run", data, match="walk("))
+    with pytest.raises(RequestError, match=r"75 frames at 30 fps, and 75 to hold out in the longest clip; got .* 80$"):
+        train(request_in(tmp_path / "run", data, match="walk-0"))
+    with pytest.raises(RequestError, match="must reach 75 frames"):
+        train(request_in(tmp_path / "run", write_corpus(tmp_path / "short", frames=60)))
+    with pytest.raises(RequestError, match="auto, cpu or cuda"):
+        train(replace(request_in(tmp_path / "run", data), device="abacus"))
+    assert not (tmp_path / "run" / "checkpoint.json").exists()
