@@ -77,5 +77,5 @@ MIN_CONTACT_FRAMES = 3
 
 
 def debounced(stands: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
-    """Close gaps in contacts at the prior's rate, then remove contacts, of less than STEADY frames."""
+    """Close gaps in contacts at the prior's rate, then remove contacts, of less than MIN_CONTACT_FRAMES frames."""
     return remove_short_runs(~remove_short_runs(~stands, MIN_CONTACT_FRAMES), MIN_CONTACT_FRAMES)

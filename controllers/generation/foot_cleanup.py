@@ -115,7 +115,7 @@ def _discard_history(done: CommittedFrames) -> CommittedFrames:
 def _debounce_window_contacts(
     before: Float[Tensor, "past size"], window: Float[Tensor, "frames size"]
 ) -> Float[Tensor, "frames size"]:
-    """The window with contacts, and gaps in them, of less than STEADY frames gone."""
+    """The window with contacts, and gaps in them, of less than MIN_CONTACT_FRAMES frames gone."""
     bits = LAYOUT.pick(torch.cat([before, window]), "contacts") > 0.5
     steady = debounced(bits)[len(before) :]
     return torch.cat([window[:, : LAYOUT.continuous], steady.to(window.dtype)], dim=-1)

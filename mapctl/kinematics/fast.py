@@ -1,6 +1,6 @@
 """Fast root integration and forward kinematics of a trial: compiled, with hand-written adjoints, on one core.
 
-Same mathematics as `features.root_places` and `kinematics.positions_from_matrices`, which remain the specification
+Same mathematics as `features.integrate_root` and `kinematics.positions_from_matrices`, which remain the specification
 and serve every case but float32 on the CPU. Each is one node of torch's graph, differentiable once.
 """
 

@@ -1,6 +1,6 @@
 """Where L-BFGS starts in a window: the last solution's tail, the best of random draws, or a particle swarm.
 
-A swarm over all the noise of a window (34 x 66 numbers) gains nothing over zero noise (design, section 11.5). Here it
+A swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise when tried. Here it
 searches a few numbers that steer: the root's noise (sideways, forward, turn) at a handful of time knots, joined
 linearly.
 """
@@ -72,7 +72,7 @@ class BestOfSamples:
     def __call__(
         self, context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
     ) -> Tensor:
-        """See Proposal."""
+        """Propose a start; see WarmStartProposal."""
         cost, start = _steering_cost(context, terms, warm, self.space), torch.zeros(self.space.size())
         found = run_best_of_samples(
             cost, start=start, spread=self.space.spread, count=self.count, meter=meter, generator=generator
@@ -92,7 +92,7 @@ class SwarmProposal:
     def __call__(
         self, context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
     ) -> Tensor:
-        """See Proposal."""
+        """Propose a start; see WarmStartProposal."""
         cost, start = _steering_cost(context, terms, warm, self.space), torch.zeros(self.space.size())
         found = run_swarm(
             cost, start=start, spread=self.space.spread, settings=self.settings, meter=meter, generator=generator

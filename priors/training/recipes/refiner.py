@@ -76,8 +76,8 @@ class AdversarialSettings:
     critic_slow: float = 0.05
     """Ground speed of feet, m/s, below which the critic sees it magnified; 0 (the paper's) leaves that out."""
     moments: float = 10.0
-    """Weight of feet, jerk and spread as they are in captured windows (see matching.compare; the paper's 0). The
-    critic alone lets feet slide twice as fast while it is still learning to see them."""
+    """Weight of feet, jerk and spread as they are in captured windows (see moment_matching.moment_loss; the paper's 0).
+    The critic alone lets feet slide twice as fast while it is still learning to see them."""
     average: float = 0.99
     """Share of the past in the running mean of the refiner's weights, which is what is kept; 0 keeps the last."""
     bfloat16: bool = False
