@@ -19,7 +19,8 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.inbetweening import PositionImage, ProposedPositions
+from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
+from mapctl.inbetweening.position_proposal import propose_from_positions
 from mapctl.recording import Capture, CaptureProposal
 
 AnyState = TypeVar("AnyState", bound="DensityState")
@@ -239,11 +240,33 @@ class Density(Protocol[State]):
 
 @runtime_checkable
 class Inbetweener(Protocol):
-    """Proposes the frames and joints that a motion lacks."""
+    """Proposes the frames and joints that a motion lacks; the MAP problem then makes the proposal exact."""
 
-    def propose(self, image: PositionImage) -> ProposedPositions:
-        """All joints in all frames; known ones may move."""
+    @property
+    def rough(self) -> "Inbetweener":
+        """A cheaper in-betweener whose trajectory foretells this one's. Default: itself."""
+        return self
+
+    @abstractmethod
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose a motion of the query's frames without gaps; what is drawn is drawn from the generator, or from a
+        new one with seed 0. The proposal names who made it, and for each gap that this one cannot fill who did and why.
+        """
         ...
+
+
+@runtime_checkable
+class PositionInfiller(Inbetweener, Protocol):
+    """An in-betweener that proposes joint positions (Kaufmann et al. 2020), which inverse kinematics makes a motion."""
+
+    @abstractmethod
+    def complete(self, image: PositionImage) -> ProposedPositions:
+        """Propose positions of all joints in all frames; known ones may move."""
+        ...
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose a motion of rigid bones near the positions of `complete`."""
+        return propose_from_positions(query, self.complete, "infiller")
 
 
 @runtime_checkable

@@ -16,7 +16,7 @@ from mapctl import __version__, metrics
 from mapctl.curves.curve import Curve
 from mapctl.formats.atomic import write_text
 from mapctl.motion import Motion
-from mapctl.problem.solution import Solution, WindowRecord
+from mapctl.problem.solution import Solution, Status, WindowRecord
 
 try:
     import resource
@@ -30,28 +30,31 @@ def build_report(
     solution: Solution,
     *,
     request: Mapping[str, Any],
-    seed: int,
-    measures: Mapping[str, float],
-    seconds: float,
-    prior: Mapping[str, Any],
+    measures: Mapping[str, Any],
+    seed: int | None = None,
+    prior: Mapping[str, Any] | None = None,
+    timing: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Build the report on one solve; `seconds` is its wall clock, `prior` its name, licence and quality.
+    """Build the report on any job; `prior` holds the name, licence and quality of what moved the character.
 
-    Keys: mapctl, request, seed, versions, prior, status, motion, ledger, measures, mocap, timing.
+    Keys: mapctl, request, seed, versions, prior, status, motion, ledger, measures, mocap, timing, and the job's own
+    (see `Solution.details`). Without `timing` it is the cost of the solution's windows.
     """
-    return {
+    report = {
         "mapctl": __version__,
         "request": dict(request),
         "seed": seed,
         "versions": package_versions(),
-        "prior": {name: value for name, value in prior.items() if name != "quality"},
-        "status": summarise_status(solution),
+        "prior": None if prior is None else {name: value for name, value in prior.items() if name != "quality"},
+        "status": summarise_status(solution.status),
         "motion": summarise_motion(solution.motion),
         "ledger": solution.ledger.summary(),
         "measures": dict(measures),
-        "mocap": reference_measures(prior.get("quality", {})),
-        "timing": summarise_timing(solution.windows, seconds=seconds),
+        "mocap": None if prior is None else reference_measures(prior.get("quality", {})),
+        "timing": timing or summarise_timing(solution.windows, seconds=solution.seconds),
+        "seconds": solution.seconds,
     }
+    return {key: value for key, value in report.items() if value is not None} | solution.details()
 
 
 def write_report(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
@@ -64,10 +67,9 @@ def to_json(values: Any) -> str:
     return json.dumps(_replace_non_finite(values), indent=1, allow_nan=False) + "\n"
 
 
-def summarise_status(solution: Solution) -> dict[str, Any]:
+def summarise_status(status: Status) -> dict[str, Any]:
     """Summarise how the solve ended: text (the message), outcome, ok, notes."""
-    ended = solution.status
-    return {"text": ended.text, "outcome": ended.outcome.value, "ok": ended.ok, "notes": list(ended.notes)}
+    return {"text": status.text, "outcome": status.outcome.value, "ok": status.ok, "notes": list(status.notes)}
 
 
 def summarise_motion(motion: Motion) -> dict[str, float]:

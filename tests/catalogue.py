@@ -4,13 +4,20 @@ from dataclasses import replace
 
 import torch
 from helpers import generator, tiny_density, tiny_model, walk
+from linear_inbetweener import LinearInbetweener
+from tiny_infiller import tiny_infiller
 from tiny_refiner import refiner_of
 from toy_density import toy_density
 
+from controllers.inbetweening.proposers import Auto, Rollouts, Slerp
+from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
-from mapctl.protocols import Density, Refiner
+from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.protocols import Density, Inbetweener, Refiner
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import (
     Clearance,
     FootContact,
@@ -130,6 +137,19 @@ class _Rounding(Refiner):
 
 REFINERS: dict[str, Refiner] = {"lstm": refiner_of(), "toy": _Rounding()}
 """The LSTM of drawn weights, and one that knows only `mapctl.protocols`."""
+
+
+_QUICK = RolloutSettings(
+    ahead=4, method=LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=8))
+)
+INBETWEENERS: dict[str, Inbetweener] = {
+    "infiller": tiny_infiller(drawn=0.02),
+    "slerp": Slerp(),
+    "rollouts": Rollouts([tiny_density()], Slerp(), _QUICK),
+    "auto": Auto(tiny_infiller(drawn=0.02), [tiny_density()]),
+    "linear": LinearInbetweener(),
+}
+"""One of each method, and one that knows only `mapctl.protocols`."""
 
 
 def moved_curve(curve: Curve, turn: float, shift: tuple[float, float]) -> Curve:

@@ -77,16 +77,16 @@ COMMANDS = {
     "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand"
     " --infiller infiller.safetensors --prior tiny.safetensors",
     "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --infiller infiller.safetensors",
-    "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method linear",
+    "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method slerp --no-finish",
     "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --infiller infiller.safetensors --report tweened.json",
     "tween file": "tween keys.toml -o keyed.bvh --infiller infiller.safetensors --prior tiny.safetensors",
     "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --infiller infiller.safetensors --suggest-timing"
-    " --method infiller",
+    " --method infiller --no-finish",
     "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,24 --infiller infiller.safetensors"
     " --prior tiny.safetensors --variations 2",
     "tween best": "tween walk.bvh -o best.bvh --keyframes 0,16 --infiller infiller.safetensors --prior tiny.safetensors"
     " --best-of 2",
-    "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp",
+    "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp --no-finish",
     "blend": "blend walk.bvh --from other.bvh --joints leftHand --frames 5:15 --at 12 -o blended.bvh"
     " --infiller infiller.safetensors",
     "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --infiller infiller.safetensors",

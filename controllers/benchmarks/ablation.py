@@ -1,6 +1,7 @@
 """Which of the solver's choices pay: starts and unknowns compared on the same curves."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -18,7 +19,7 @@ from mapctl.problem.warm_start import BestOfSamples, SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Density
 from mapctl.solver.budget import Budget
-from mapctl.terms import LatentPrior, Likelihood
+from mapctl.terms import LatentPrior, Likelihood, Term
 
 
 def benchmark_ablation(prior: Density, *, seconds: float = 5.0, seed: int = 0) -> list[Row]:
@@ -30,32 +31,32 @@ def benchmark_ablation(prior: Density, *, seconds: float = 5.0, seed: int = 0) -
         "corner": curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 3.0], [3.0, 3.0]], dtype=torch.float64)),
     }
     return [
-        {"curve": name, **_evaluate_variant(prior, curve, wishes, label, seconds, seed)}
+        {"curve": name, **_evaluate_variant(prior, curve, settings, terms, label, seconds, seed)}
         for name, curve in shapes.items()
-        for label, wishes in list_ablation_variants(prior).items()
+        for label, (settings, terms) in list_ablation_variants(prior).items()
     ]
 
 
-def list_ablation_variants(prior: Density) -> dict[str, FollowSettings]:
-    """The variants of the ablation by name."""
+def list_ablation_variants(prior: Density) -> dict[str, tuple[FollowSettings, tuple[Term, ...]]]:
+    """List the variants of the ablation by name: settings, and terms beyond those of following."""
     plain, size = LatentNoiseSolver(), LAYOUT.continuous
     best = replace(plain, proposal=BestOfSamples(count=32), budget=Budget(evaluations=152))
     flown = replace(plain, proposal=SwarmProposal(), budget=Budget(evaluations=216))
     states = FeatureStateSolver(prior.feature_std[:size], prior.feature_mean[:size])
     return {
-        "latents, zero start": FollowSettings(method=plain),
-        "latents, best of 32": FollowSettings(method=best),
-        "latents, swarm 16 x 6": FollowSettings(method=flown),
+        "latents, zero start": (FollowSettings(method=plain), ()),
+        "latents, best of 32": (FollowSettings(method=best), ()),
+        "latents, swarm 16 x 6": (FollowSettings(method=flown), ()),
         # Here the noise is that of the network's input, in units of its sigma, and the states need a density.
-        "states, 160 evaluations": FollowSettings(method=states, noise=LatentPrior(sigma=1.0), extra=(Likelihood(),)),
+        "states, 160 evaluations": (FollowSettings(method=states, noise=LatentPrior(sigma=1.0)), (Likelihood(),)),
     }
 
 
 def _evaluate_variant(
-    prior: Density, curve: Curve, wishes: FollowSettings, label: str, seconds: float, seed: int
+    prior: Density, curve: Curve, settings: FollowSettings, terms: Sequence[Term], label: str, seconds: float, seed: int
 ) -> Row:
     began = time.process_time()
-    solution = follow_to_end(prior, curve, seconds, seed, wishes)
+    solution = follow_to_end(prior, curve, seconds, seed, settings, terms)
     spent = time.process_time() - began
     found = measure(solution.motion, curve)
     return {

@@ -14,7 +14,7 @@ from controllers.benchmarks.shared.corruptions import CONDITIONS, CorruptedClip,
 from controllers.benchmarks.shared.held_out import CleanClip
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.denoising.denoise import denoise
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution
 from controllers.inbetweening.infill import infill
 from mapctl import metrics, rotations
 from mapctl.features import PRIOR_FPS
@@ -124,7 +124,7 @@ def tune_filters(truth: Motion, examined: Inspection) -> tuple[float, float]:
     return min(butterworth), min(savgol)
 
 
-def contact_f1(truth: Motion, done: DenoiseResult) -> float:
+def contact_f1(truth: Motion, done: DenoiseSolution) -> float:
     """Of planted toes in frames, against the thresholds' own answer on the clean clip; NaN where none is planted."""
     wanted, found = detect_true_contacts(truth), done.contacts
     at = (torch.arange(len(found)) * float(truth.fps) / PRIOR_FPS).round().long().clamp(max=len(wanted) - 1)

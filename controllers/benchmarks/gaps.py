@@ -1,14 +1,13 @@
 """How far answers for gaps are from the truth, by who gave them and how long the gap was: what notes on gaps tell."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import torch
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.error_estimates import is_travelling
-from controllers.inbetweening.pipeline import InfillResult, fill
-from controllers.inbetweening.proposers.selection import choose_proposals
+from controllers.inbetweening.pipeline import fill
+from controllers.inbetweening.proposers import Auto
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import worst_frame
@@ -28,8 +27,8 @@ def benchmark_gaps(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Of the middle of clips (canonical, at the prior's rate) that lack so many frames: quantiles over clips of the
-    mean error of all joints in the world, by who answered and whether the body is on its way; and the longest time
+    """Fill gaps of so many frames in the middle of clips (canonical, at PRIOR_FPS): quantiles over clips of the mean
+    error of all joints in the world, by who answered and whether the body is travelling; and the longest time
     unsupported beside mocap's.
     """
     found: dict[tuple[str, str, int, int], list[Row]] = {}
@@ -60,7 +59,7 @@ def _evaluate_gap(
     free = torch.zeros(part.num_frames, dtype=torch.bool)
     free[beside : beside + length] = True
     lost = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
-    done: InfillResult = fill(part, lost, infiller, another=partial(choose_proposals, densities=densities))
+    done = fill(part, lost, Auto(infiller, densities))
     off = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = CANONICAL.indices(TOES)
     slid, mocap = (

@@ -117,7 +117,7 @@ def _generate_clips(
 
 def _generate_clip(prior: Density, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
     generator = torch.Generator().manual_seed(seed)
-    return generate(prior, seconds=seconds, generator=generator, settings=wishes, refiner=variant.refiner)
+    return generate(prior, seconds=seconds, generator=generator, settings=wishes, refiner=variant.refiner).motion
 
 
 def _compare_gait_spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread]) -> Row:

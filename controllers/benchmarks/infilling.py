@@ -11,21 +11,22 @@ from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.pipeline import InfillMethod, InfillSettings
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.proposers import Auto, Slerp
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
+from mapctl.protocols import Inbetweener, PositionInfiller
 from mapctl.recording.masks import ALL, Mask
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
 WINDOW_FRAMES = 120
 """Frames of a clip that are looked at: the paper's 4 s."""
 _GAP_CONTEXT_FRAMES = 40  # frames on either side while the gap's length is varied
-_COMPARED_METHODS: tuple[InfillMethod, InfillMethod] = ("linear", "map")
+_UNFINISHED = InfillSettings(finish=False)
 _MEASURED_BONES = tuple(
     CANONICAL.index(side + part) for side in ("left", "right") for part in ("LowerArm", "Hand", "Foot")
 )
@@ -67,7 +68,7 @@ TASKS: tuple[Task, ...] = (
 
 def benchmark_infilling(
     clips: Sequence[Motion],
-    networks: Mapping[str, Inbetweener],
+    networks: Mapping[str, PositionInfiller],
     *,
     ours: str,
     progress: Callable[[int, int], None] | None = None,
@@ -104,8 +105,8 @@ def benchmark_infilling_by_kind(kinds: Mapping[str, Sequence[Motion]], infiller:
             masks = [Mask(ALL, (WINDOW_FRAMES - task.gap) // 2, (WINDOW_FRAMES + task.gap) // 2)]
             pairs = [
                 [
-                    float(_evaluate_infill(clip, masks, infiller, InfillSettings(method=method)).errors.mean())
-                    for method in _COMPARED_METHODS
+                    float(_evaluate_infill(clip, masks, by, settings).errors.mean())
+                    for by, settings in ((Slerp(), _UNFINISHED), (Auto(infiller), None))
                 ]
                 for clip in shown
             ]
@@ -125,7 +126,9 @@ def benchmark_infilling_by_kind(kinds: Mapping[str, Sequence[Motion]], infiller:
     return rows
 
 
-def _evaluate_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, Inbetweener], ours: str) -> list[Row]:
+def _evaluate_task(
+    task: Task, clips: Sequence[Motion], networks: Mapping[str, PositionInfiller], ours: str
+) -> list[Row]:
     """One row a method."""
     rows = []
     for name, network in networks.items():
@@ -135,16 +138,14 @@ def _evaluate_task(task: Task, clips: Sequence[Motion], networks: Mapping[str, I
         rows.append({"method": f"{name}, raw", **_summarise_clip_errors(done)})
     if task.gap:
         masks = [Mask(ALL, (task.frames - task.gap) // 2, (task.frames + task.gap) // 2)]
-        methods: tuple[tuple[str, InfillMethod], ...] = (
-            ("on rigid bones", "infiller"),
-            ("and MAP", "map"),
-            ("interpolation", "linear"),
+        methods = (
+            (f"{ours}, on rigid bones", networks[ours], _UNFINISHED),
+            (f"{ours}, and MAP", Auto(networks[ours]), None),
+            ("interpolation", Slerp(), _UNFINISHED),
         )
-        for name, method in methods:
-            settings = InfillSettings(method=method)
-            done = [_evaluate_infill(clip, masks, networks[ours], settings) for clip in clips]
-            label = name if method == "linear" else f"{ours}, {name}"
-            rows.append({"method": label, **_summarise_clip_errors(done)})
+        for name, inbetweener, settings in methods:
+            done = [_evaluate_infill(clip, masks, inbetweener, settings) for clip in clips]
+            rows.append({"method": name, **_summarise_clip_errors(done)})
     return rows
 
 
@@ -158,7 +159,7 @@ class _ClipErrors:
     """Deviations of bones from their lengths, metres."""
 
 
-def _evaluate_network(clip: Motion, task: Task, network: Inbetweener, generator: torch.Generator) -> _ClipErrors:
+def _evaluate_network(clip: Motion, task: Task, network: PositionInfiller, generator: torch.Generator) -> _ClipErrors:
     """A network's places as they are."""
     truth = clip.joint_positions().float()
     known = _sample_observation_mask(task, generator)
@@ -174,15 +175,15 @@ def _evaluate_network(clip: Motion, task: Task, network: Inbetweener, generator:
         present=torch.ones(1, len(truth), dtype=torch.bool),
         toes=TOE_JOINTS,
     )
-    places = image.to_world(network.propose(image).places)[0]
+    places = image.to_world(network.complete(image).places)[0]
     return _measure_errors(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))
 
 
 def _evaluate_infill(
-    clip: Motion, masks: Sequence[Mask], network: Inbetweener, settings: InfillSettings
+    clip: Motion, masks: Sequence[Mask], inbetweener: Inbetweener, settings: InfillSettings | None
 ) -> _ClipErrors:
     """A whole motion of rigid bones."""
-    places = infill(clip, network, masks, settings=settings).motion.joint_positions()
+    places = infill(clip, inbetweener, masks, settings=settings).motion.joint_positions()
     missing = torch.zeros(places.shape[:2], dtype=torch.bool)
     missing[masks[0].start : masks[0].stop] = True
     return _measure_errors(places, clip.joint_positions(), missing)

@@ -1,7 +1,7 @@
 """What the solver costs: milliseconds of an evaluation and of whole solves. Ratios within one run."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +18,7 @@ from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL
+from mapctl.terms import Term
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,12 @@ def _benchmark_follow(prior: Density, seconds: float, settings: SpeedBenchmarkSe
     }
 
 
-def follow_to_end(prior: Density, curve: Curve, seconds: float, seed: int, wishes: FollowSettings) -> Solution:
-    """A walk to its end: half a one has no place in a table, so Ctrl-C ends the bench."""
+def follow_to_end(
+    prior: Density, curve: Curve, seconds: float, seed: int, settings: FollowSettings, terms: Sequence[Term] = ()
+) -> Solution:
+    """Follow to the end: half a walk has no place in a table, so Ctrl-C ends the benchmark."""
     generator = torch.Generator().manual_seed(seed)
-    solution = follow(prior, curve, seconds=seconds, settings=wishes, generator=generator)
+    solution = follow(prior, curve, seconds=seconds, settings=settings, terms=terms, generator=generator)
     if solution.status.outcome is Outcome.INTERRUPTED:
         raise KeyboardInterrupt
     return solution

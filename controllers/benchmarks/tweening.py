@@ -1,15 +1,15 @@
 """What in-betweening is worth: clips that no training saw, of which a few keys are left; and their ends, extended."""
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.proposers.rollout import roll_through_gaps, select_likeliest_density
+from controllers.inbetweening.proposers import Auto, Rollouts
+from controllers.inbetweening.proposers.rolling import select_likeliest_density
+from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy
 from mapctl import metrics
@@ -47,14 +47,8 @@ def benchmark_tweening(
         for clip in shown:
             inner = (1 + torch.randperm(TWEEN_FRAMES - 2, generator=draws)[:_INNER_KEYS]).tolist()
             keys = Keys((0, *inner, TWEEN_FRAMES - 1))
-            density = select_likeliest_density(densities, to_canonical(clip)[0])
-            roll = partial(roll_through_gaps, densities=[density], generator=draws)
-            best = partial(lowest_energy, count=_NUM_ALTERNATIVES, rollout_densities=densities, generator=draws)
-            ways = (partial(tween, rollout_densities=densities), partial(tween, another=roll), best)
-            for method, way in zip(told, ways, strict=True):
-                began = time.perf_counter()
-                made = way(clip, keys, infiller).motion
-                told[method].append(_evaluate_tween(made, clip, keys.frames, time.perf_counter() - began))
+            for method, made in zip(told, _tween_all_ways(clip, keys, infiller, densities, draws), strict=True):
+                told[method].append(_evaluate_tween(made.motion, clip, keys.frames, made.seconds))
         rows += [
             {"kind": kind, "what": "keys", "by": method, "clips": len(each), **average_rows(each)}
             for method, each in told.items()
@@ -62,14 +56,28 @@ def benchmark_tweening(
         ]
         shown = [clip.slice(0, _END_SOURCE_FRAMES) for clip in clips if clip.num_frames >= _END_SOURCE_FRAMES]
         for count in _END_LENGTHS:
-            for by, rollout_densities in (("infiller", ()), ("density", densities)):
-                each = [_evaluate_end(clip, count, infiller, rollout_densities) for clip in shown]
+            for by, inbetweener in (("infiller", infiller), ("density", Auto(infiller, densities))):
+                each = [_evaluate_end(clip, count, inbetweener) for clip in shown]
                 if each:
                     told_end = {"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each)}
                     rows.append({**told_end, **average_rows(each)})
         if progress is not None:
             progress(number + 1, len(kinds))
     return rows
+
+
+def _tween_all_ways(
+    clip: Motion, keys: Keys, infiller: Inbetweener, densities: Sequence[Density], draws: torch.Generator
+) -> Iterator[InbetweenSolution]:
+    """Tween as by default, by a rollout, and as the likeliest of several answers."""
+
+    def make(inbetweener: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
+        return tween(clip, keys, inbetweener, generator=generator)
+
+    yield make(Auto(infiller, densities), draws)
+    density = select_likeliest_density(densities, to_canonical(clip)[0])
+    yield make(Rollouts([density], infiller), draws)
+    yield lowest_energy(make, Rollouts(densities, infiller), _NUM_ALTERNATIVES, generator=draws)
 
 
 def _evaluate_tween(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:
@@ -101,14 +109,13 @@ def _measure_worst_frames(places: Tensor, ends: Sequence[int], toes: Sequence[in
     }
 
 
-def _evaluate_end(clip: Motion, count: int, infiller: Inbetweener, rollout_densities: Sequence[Density]) -> Row:
+def _evaluate_end(clip: Motion, count: int, inbetweener: Inbetweener) -> Row:
     first = clip.num_frames - count
-    began = time.perf_counter()
-    made = infill(clip, infiller, [Mask(ALL, first, clip.num_frames)], rollout_densities=rollout_densities).motion
-    seconds = time.perf_counter() - began
+    done = infill(clip, inbetweener, [Mask(ALL, first, clip.num_frames)])
+    made = done.motion
     away = (made.joint_positions() - clip.joint_positions())[first:].norm(dim=-1)
     ends = [each.slice(first, clip.num_frames) for each in (made, clip)]
-    return {"error_cm": 100 * float(away.mean()), **_compare_feet(*ends), "ms_frame": 1000 * seconds / count}
+    return {"error_cm": 100 * float(away.mean()), **_compare_feet(*ends), "ms_frame": 1000 * done.seconds / count}
 
 
 def _compare_feet(made: Motion, clip: Motion) -> Row:

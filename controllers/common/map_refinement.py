@@ -7,6 +7,7 @@ ahead into the next, and the next goes on from where its committed frames end.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float
@@ -85,10 +86,18 @@ class RefinedMotion:
     """Left and right toe planted."""
     ledger: Ledger
     """By term and frame."""
-    evaluations: int
-    """Spent in all."""
-    stretches: tuple[DensityInterval, ...] = ()
-    """Of each window, which density was used; none where none was given."""
+    windows: tuple[WindowRecord, ...]
+    """Cost of each window."""
+
+    @property
+    def density_intervals(self) -> tuple[DensityInterval, ...]:
+        """Which density counted in each window, in frames at PRIOR_FPS; none where none was given."""
+        stops = list(accumulate(window.frames for window in self.windows))
+        return tuple(
+            DensityInterval(stop - window.frames, stop, choice.density.name, choice.nats, choice.weight)
+            for stop, window in zip(stops, self.windows, strict=True)
+            if (choice := window.choice) is not None
+        )
 
 
 def refine(
@@ -99,9 +108,12 @@ def refine(
     *,
     densities: Sequence[Density] = (),
     targets: EffectorTargets | None = None,
+    terms: Sequence[Term] = (),
+    first_frame: int = 0,
 ) -> RefinedMotion:
-    """Solve every window; `contacts` are log odds, `capture` tells what was seen and how noisy it was. `targets` are
-    places that joints are wanted at.
+    """Solve every window; `contacts` are logits, `capture` tells what was observed and how noisy it was. `targets` are
+    positions wanted of joints, `terms` join the others in every window and see the first frame of the proposal as
+    `first_frame` of the whole motion.
 
     In each window that density counts under which the proposal is likeliest, and less where it is out of its depth.
     """
@@ -115,33 +127,36 @@ def refine(
         HorizonSettings(settings.frames, settings.ahead, settings.past, beyond_end=False),
         proposal.skeleton,
         method=PoseOffsetSolver(
-            pose, stands, sigma, settings.smooth, settings.temperature, settings.lbfgs, settings.budget
+            pose, stands, sigma, settings.smooth, settings.temperature, settings.lbfgs, settings.budget, first_frame
         ),
     )
     # The densities' states are those that make the first window's proposal likely.
     first = slice(0, min(settings.frames, proposal.num_frames))
     states = ensemble.infer_state(pose.slice(0, first.stop).features(start, stands[first]))
     before = torch.zeros(0, proposal.num_joints, 3)
-    done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before)
-    terms_of = _lay_terms(settings, estimate_rest_height(proposal, stands), capture, targets)
+    done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before, discarded=first_frame)
+    terms_of = _lay_terms(settings, estimate_rest_height(proposal, stands), capture, targets, terms)
     done, outcome = solver.solve(done, terms_of, proposal.num_frames, generator=torch.Generator())
     if outcome is Outcome.INTERRUPTED:
         raise KeyboardInterrupt
     motion = decode(done.features, start, skeleton=proposal.skeleton)
-    evaluations = sum(window.evaluations for window in done.windows)
-    return RefinedMotion(motion, stands, done.ledger, evaluations, _list_density_intervals(done.windows))
+    return RefinedMotion(motion, stands, done.ledger, done.windows)
 
 
 def _lay_terms(
-    settings: RefinementSettings, rest_height: float, capture: Capture, targets: EffectorTargets | None
+    settings: RefinementSettings,
+    rest_height: float,
+    capture: Capture,
+    targets: EffectorTargets | None,
+    more: Sequence[Term],
 ) -> TermsOf:
-    """Terms by window."""
+    """Lay the terms of each window."""
     footing = replace(settings.footing, rest_height=rest_height)
     clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
 
     def terms_of(first: int, frames: int) -> list[Term]:
         part = slice(first, first + frames)
-        terms: list[Term] = [LatentPrior(1.0), footing]
+        terms: list[Term] = [LatentPrior(1.0), footing, *more]
         if settings.clearance is not None:
             terms.append(replace(settings.clearance, rest_height=rest_height, share=clearing[part]))
         if settings.jerk is not None:
@@ -151,17 +166,6 @@ def _lay_terms(
         return terms
 
     return terms_of
-
-
-def _list_density_intervals(windows: Sequence[WindowRecord]) -> tuple[DensityInterval, ...]:
-    """Which density was used where, if there were any."""
-    found, first = [], 0
-    for window in windows:
-        if (choice := window.choice) is not None:
-            stop = first + window.frames
-            found.append(DensityInterval(first, stop, choice.density.name, choice.nats, choice.weight))
-        first += window.frames
-    return tuple(found)
 
 
 def _extrapolate_backward(pose: BodyPose) -> GroundPose:

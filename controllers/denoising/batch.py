@@ -11,7 +11,7 @@ import torch
 from joblib import Parallel, delayed
 
 from controllers.denoising.denoise import denoise
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution
 from controllers.denoising.segment import DenoiseSettings
 from mapctl import formats
 from mapctl.errors import DiskFullError, MapctlError, RequestError
@@ -54,7 +54,7 @@ class FileDenoiser:
     """What is known of the captures."""
     rig: Rig | None = None
     """Of all files, where it is not the one that would be recognised."""
-    after: Callable[[FileJob, DenoiseResult], None] | None = None
+    after: Callable[[FileJob, DenoiseSolution], None] | None = None
     """Called with each result, in that process: to write a report."""
 
     def __call__(self, job: FileJob) -> FileResult:

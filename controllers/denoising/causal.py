@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from controllers.denoising.denoise import MIN_DENOISE_FRAMES, denoise
-from controllers.denoising.result import DenoiseResult, crossfade, join_segments
+from controllers.denoising.result import DenoiseSolution, crossfade, join_segments
 from controllers.denoising.segment import DenoiseSettings
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -74,7 +74,7 @@ class CausalDenoiser:
         """Seconds between a frame and its clean one, at most, but for the compute; at any rate of frames."""
         return self._causal.delay
 
-    def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> DenoiseResult | None:
+    def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> DenoiseSolution | None:
         """The next frames of the capture; returns those that are due by now, None if none are. Masks count from the
         first frame of all.
         """
@@ -86,12 +86,12 @@ class CausalDenoiser:
             return None
         return self._denoise_recent(come - max(0, most + 1 - step))
 
-    def finish(self) -> DenoiseResult | None:
+    def finish(self) -> DenoiseSolution | None:
         """The frames that still wait; the capture is over."""
         come = 0 if self._past is None else self._first + self._past.num_frames
         return self._denoise_recent(come) if come > self._given else None
 
-    def _denoise_recent(self, due: int) -> DenoiseResult:
+    def _denoise_recent(self, due: int) -> DenoiseSolution:
         assert self._past is not None
         # What was given back of a lost joint is written into the past: later passes may see nothing else of it.
         masks = slice_masks(
@@ -101,7 +101,8 @@ class CausalDenoiser:
         if not self._told and self._past.seconds >= _RIG_SECONDS:
             self._rig, self._told = done.rig, True
         start, count = self._given - self._first, due - self._given
-        given = replace(done.slice(start, start + count), notes=self._notes(done, due))
+        given = done.slice(start, start + count)
+        given = replace(given, status=replace(given.status, notes=self._notes(done, due)))
         if self._foreseen is not None:
             old, first = self._foreseen
             shared = min(count, first + old.num_frames - self._given)
@@ -116,7 +117,7 @@ class CausalDenoiser:
         self._discard_past()
         return given
 
-    def _notes(self, done: DenoiseResult, due: int) -> tuple[str, ...]:
+    def _notes(self, done: DenoiseSolution, due: int) -> tuple[str, ...]:
         """Of the frames that a pass decides: what it says of its beginning, the first has said."""
         assert self._past is not None
         if self._past.num_frames < MIN_DENOISE_FRAMES:
@@ -142,11 +143,11 @@ def denoise_causal(
     delay: float = CausalSettings.delay,
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> DenoiseResult:
+) -> DenoiseSolution:
     """A whole motion through a CausalDenoiser, a frame at a time."""
     began = time.perf_counter()
     stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay), rig=rig)
-    pieces: list[tuple[DenoiseResult, int]] = []
+    pieces: list[tuple[DenoiseSolution, int]] = []
     given = 0
     for frame in range(motion.num_frames):
         new = stream.push(motion.slice(frame, frame + 1), masks=masks if frame == 0 else ())
@@ -159,10 +160,11 @@ def denoise_causal(
                 progress(given, motion.num_frames)
     whole = join_segments(pieces)
     note = f"causal: a frame is decided at most {stream.delay:.2f} s after it came"
-    return replace(whole, seconds=time.perf_counter() - began, notes=(note, *whole.notes))
+    status = replace(whole.status, notes=(note, *whole.notes))
+    return replace(whole, seconds=time.perf_counter() - began, status=status).assess()
 
 
-def _concatenate_results(first: DenoiseResult | None, second: DenoiseResult | None) -> DenoiseResult | None:
+def _concatenate_results(first: DenoiseSolution | None, second: DenoiseSolution | None) -> DenoiseSolution | None:
     """One after the other, as far as they are there."""
     if first is None or second is None:
         return first or second

@@ -1,4 +1,4 @@
-"""Denoise a capture on any rig (rnn paper, section 5.4): what is to be believed, a proposal, and the MAP about it.
+"""Denoise a capture on any rig (Wang et al. 2019, section 5.4): inspection, a proposal, and the MAP stage about it.
 
 A network that has seen all kinds of motion proposes; what it leaves out and noise does not explain goes back in, so
 that out of its depth it is no worse than a low-pass filter; the MAP stage puts the feet down. The result is on the
@@ -13,10 +13,12 @@ import torch
 
 from controllers.denoising.lead_pose import has_lead_pose, restore_lead_pose
 from controllers.denoising.lead_transition import find_lead_transition
-from controllers.denoising.result import DenoiseResult, join_segments
+from controllers.denoising.result import DenoiseSolution, join_segments
 from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
+from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density
 from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import (
@@ -30,8 +32,9 @@ from mapctl.recording.masks import (
 from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
+from mapctl.terms import Term
 
-__all__ = ["DenoiseResult", "DenoiseSettings", "begins_with_tpose", "denoise"]
+__all__ = ["DenoiseSettings", "DenoiseSolution", "begins_with_tpose", "denoise"]
 
 MIN_DENOISE_FRAMES = 8
 """Frames of a capture that noise can be told in."""
@@ -49,16 +52,17 @@ def denoise(
     masks: Sequence[Mask] = (),
     settings: DenoiseSettings | None = None,
     densities: Sequence[Density] = (),
+    terms: Sequence[Term] = (),
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> DenoiseResult:
+) -> DenoiseSolution:
     """Denoise a motion on any rig that `mapctl.retarget.rigs` can tell, or on a given one; RequestError for others and
     for masks that do not fit.
 
     `denoiser` proposes (see priors.load_denoiser). Of `densities` the likeliest adds its likelihood to each window of
-    the MAP stage. A T-pose in frame 0, as many captures begin with, stays. A long capture is cleaned in pieces that
-    fade into each other, so memory beyond the capture's own does not grow with it. `progress` is called with frames
-    done and all frames.
+    the MAP stage; `terms` are the caller's own, which see the time since the capture's first frame. A T-pose in frame
+    0, as many captures begin with, stays. A long capture is cleaned in pieces that fade into each other, so memory
+    beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
     """
     settings = settings or DenoiseSettings()
     masks = resolve_joint_names(motion, masks, rig)
@@ -69,11 +73,9 @@ def denoise(
     lead = 1 if has_lead_pose(_slice_beginning(motion), beginning, rigmap) else 0
     mixed = find_lead_transition(motion, rigmap) if lead else None
     wanted = (*masks, *(mixed.masks(motion.skeleton.names) if mixed else ()))
-    frames = motion.num_frames - lead
-    long, shared = (
-        max(MIN_DENOISE_FRAMES, round(seconds * float(motion.fps))) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS)
-    )
-    pieces: list[tuple[DenoiseResult, int]] = []
+    frames, fps = motion.num_frames - lead, float(motion.fps)
+    long, shared = (max(MIN_DENOISE_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
+    pieces: list[tuple[DenoiseSolution, int]] = []
     start = stop = 0
     while stop < frames:
         before, stop = stop, frames if frames - start <= long + shared else start + long
@@ -82,12 +84,15 @@ def denoise(
             last, first = pieces[-1]
             part = write_back_masked(part, last.motion.slice(start - first, before - first), hidden)
             hidden = trim_masks_before(hidden, before - start)
-        pieces.append((_denoise_segment(part, denoiser, hidden, settings, densities, rig), start))
+        denoised = _denoise_segment(
+            part, denoiser, hidden, settings, densities, terms, rig, seconds=(lead + start) / fps
+        )
+        pieces.append((denoised, start))
         start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
     done = replace(join_segments(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
-    return restore_lead_pose(motion, done, rigmap, mixed, masks) if mixed else done
+    return (restore_lead_pose(motion, done, rigmap, mixed, masks) if mixed else done).assess()
 
 
 def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:
@@ -107,16 +112,26 @@ def _denoise_segment(
     masks: Sequence[Mask],
     settings: DenoiseSettings,
     densities: Sequence[Density],
+    terms: Sequence[Term],
     rig: Rig,
-) -> DenoiseResult:
+    *,
+    seconds: float,
+) -> DenoiseSolution:
+    """Denoise a piece that begins so many seconds after the capture."""
     began = time.perf_counter()
     examined = inspect_recording(motion, masks)
     if motion.num_frames < MIN_DENOISE_FRAMES:
-        nothing = torch.zeros(motion.num_frames, 2, dtype=torch.bool)
-        believed = torch.zeros(motion.num_frames, CANONICAL.num_joints)
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
-        return DenoiseResult(
-            motion, motion, examined.noise, examined.noise_root, (), nothing, believed, Ledger(), notes=(note,)
+        return DenoiseSolution(
+            motion,
+            Status(Outcome.DONE, (note,)),
+            Ledger(),
+            capture=motion,
+            noise=examined.noise,
+            noise_root=examined.noise_root,
+            faults=(),
+            contacts=torch.zeros(motion.num_frames, 2, dtype=torch.bool),
+            proposal_share=torch.zeros(motion.num_frames, CANONICAL.num_joints),
         )
-    done = SegmentDenoiser(examined, denoiser, settings, rig).run(densities)
+    done = SegmentDenoiser(examined, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
     return replace(done, seconds=time.perf_counter() - began)

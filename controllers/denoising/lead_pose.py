@@ -17,7 +17,7 @@ from controllers.denoising.lead_transition import (
     line_fit_frames,
     restore_lead_transition,
 )
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution, shift_frames
 from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.recording.artefacts import Artefact
@@ -54,21 +54,26 @@ def has_lead_pose(motion: Motion, canonical: Motion, rigmap: RigMap) -> bool:
 
 
 def restore_lead_pose(
-    motion: Motion, done: DenoiseResult, rigmap: RigMap, found: LeadTransition, masks: Sequence[Mask]
-) -> DenoiseResult:
+    motion: Motion, done: DenoiseSolution, rigmap: RigMap, found: LeadTransition, masks: Sequence[Mask]
+) -> DenoiseSolution:
     """What was cleaned of frame 1 on, led by the pose in frame 0 and by the frames that it is mixed into.
 
     Joints of the pose go back to rest that are there but for the noise. `masks` are the user's, of the whole capture.
     """
     pose = _snap_to_rest_pose(motion, done, rigmap)
     clean = restore_lead_transition(motion, pose, done, found, masks) if found.stop > 1 else done.motion
-    faults = tuple(_shift_fault(fault) for fault in _drop_transition_faults(motion, done.faults, found, masks))
-    stretches = tuple(replace(part, start=part.start + 1, stop=part.stop + 1) for part in done.stretches)
+    faults = shift_frames(_drop_transition_faults(motion, done.faults, found, masks), 1)
+    intervals = shift_frames(done.density_intervals, 1)
     notes = ["frame 0 is a T-pose, or the rest pose: it stays, but for noise of joints at rest"]
     if found.stop > 1:
         notes.append(f"frames 1 to {found.stop - 1} mix it into the motion, as exporters' filters do, and stay mixed")
     return replace(
-        done, motion=pose.join(clean), capture=motion, faults=faults, stretches=stretches, notes=(*notes, *done.notes)
+        done,
+        motion=pose.join(clean),
+        capture=motion,
+        faults=tuple(faults),
+        density_intervals=tuple(intervals),
+        status=replace(done.status, notes=(*notes, *done.notes)),
     )
 
 
@@ -119,7 +124,7 @@ def _is_first_frame_outlier(canonical: Motion) -> bool:
     return float(away[0] - usual) > max(_MIN_OUTLIER_ANGLE**2, _OUTLIER_RATIO * float(own.quantile(0.98) - usual))
 
 
-def _snap_to_rest_pose(motion: Motion, done: DenoiseResult, rigmap: RigMap) -> Motion:
+def _snap_to_rest_pose(motion: Motion, done: DenoiseSolution, rigmap: RigMap) -> Motion:
     """Frame 0, joints at rest that are there but for the noise."""
     first = motion.slice(0, 1)
     rest = min(
@@ -158,7 +163,3 @@ def _drop_transition_faults(
             fault = replace(fault, start=start)
         kept.append(fault)
     return kept
-
-
-def _shift_fault(fault: Artefact) -> Artefact:
-    return replace(fault, start=fault.start + 1, stop=fault.stop + 1)

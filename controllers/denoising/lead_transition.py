@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution
 from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.recording.masks import ROOT, Mask, expand_masks, travelling_joint
@@ -108,7 +108,7 @@ def _is_position_blended(
 
 
 def restore_lead_transition(
-    motion: Motion, pose: Motion, done: DenoiseResult, found: LeadTransition, masks: Sequence[Mask]
+    motion: Motion, pose: Motion, done: DenoiseSolution, found: LeadTransition, masks: Sequence[Mask]
 ) -> Motion:
     """The clean motion of frame 1 on, with what of the pose is mixed into its first frames."""
     count, last, travels = found.stop - 1, done.motion.num_frames, travelling_joint(motion)

@@ -15,12 +15,13 @@ from controllers.common.map_refinement import (
     estimate_rest_height,
     refine,
 )
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution
 from mapctl import retarget, rotations
 from mapctl.contacts import debounced
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.problem.density_selection import DensityInterval
+from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density
 from mapctl.recording import Capture, artefacts
 from mapctl.recording.frequency_bands import split_bands
@@ -32,6 +33,7 @@ from mapctl.recording.sure_smoothing import smooth_rotations
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
+from mapctl.terms import Term
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,10 @@ class SegmentDenoiser:
         self.shown = self.bands.at_prior_rate()
         self.capture = self._build_capture(seen)
 
-    def run(self, densities: Sequence[Density]) -> DenoiseResult:
-        """Propose, give back, put the feet down, return to the rig."""
+    def run(self, densities: Sequence[Density], terms: Sequence[Term], first_frame: int) -> DenoiseSolution:
+        """Propose, give back, put the feet down, return to the rig. The piece begins at frame `first_frame`, at
+        PRIOR_FPS, of the whole capture, which is what terms see.
+        """
         proposal, contacts = self._propose()
         if self.bands.exact:
             self.capture = self._redetect_spikes(proposal)
@@ -81,26 +85,36 @@ class SegmentDenoiser:
         proposal, share = self._restore_residual(proposal)
         if self.settings.anchor:
             proposal = anchor_to_contacts(proposal, debounced(contacts > 0))
-        stood = refine(proposal, contacts, self.capture, self.settings.refinement, densities=densities)
-        joined = self.bands.recombine(self.shown, stood.motion, self.sigma, self.sigma_root)
+        refined = refine(
+            proposal,
+            contacts,
+            self.capture,
+            self.settings.refinement,
+            densities=densities,
+            terms=terms,
+            first_frame=first_frame,
+        )
+        joined = self.bands.recombine(self.shown, refined.motion, self.sigma, self.sigma_root)
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
         within = self.bands.within
-        stood = replace(stood, contacts=stood.contacts[:within], ledger=stood.ledger.slice(within))
-        examined, found = self.examined, self._collect_faults(motion, proposal.slice(0, within), stood)
-        return DenoiseResult(
+        refined = replace(refined, contacts=refined.contacts[:within], ledger=refined.ledger.slice(within))
+        examined, found = self.examined, self._collect_faults(motion, proposal.slice(0, within), refined)
+        return DenoiseSolution(
             motion,
-            examined.motion,
-            examined.noise,
-            examined.noise_root,
-            found,
-            stood.contacts,
-            1 - share[:within],
-            stood.ledger,
-            stretches=self._convert_to_capture_rate(stood.stretches),
+            Status(Outcome.DONE),
+            refined.ledger,
+            refined.windows,
+            capture=examined.motion,
+            noise=examined.noise,
+            noise_root=examined.noise_root,
+            faults=found,
+            contacts=refined.contacts,
+            proposal_share=1 - share[:within],
+            density_intervals=self._convert_to_capture_rate(refined.density_intervals),
         )
 
-    def _convert_to_capture_rate(self, stretches: Sequence[DensityInterval]) -> tuple[DensityInterval, ...]:
-        """In frames of the capture; the last ends with it."""
+    def _convert_to_capture_rate(self, parts: Sequence[DensityInterval]) -> tuple[DensityInterval, ...]:
+        """Convert intervals to frames of the capture; the last ends with it."""
         frames, shown = self.examined.motion.num_frames, self.shown.num_frames
         ratio = float(self.examined.motion.fps) / float(self.shown.fps)
         moved = [
@@ -109,11 +123,13 @@ class SegmentDenoiser:
                 start=min(frames, round(part.start * ratio)),
                 stop=frames if part.stop == shown else min(frames, round(part.stop * ratio)),
             )
-            for part in stretches
+            for part in parts
         ]
         return tuple(part for part in moved if part.start < part.stop)
 
-    def _collect_faults(self, motion: Motion, proposal: Motion, stood: RefinedMotion) -> tuple[artefacts.Artefact, ...]:
+    def _collect_faults(
+        self, motion: Motion, proposal: Motion, refined: RefinedMotion
+    ) -> tuple[artefacts.Artefact, ...]:
         """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""
         examined, names = self.examined, motion.skeleton.names
         turn = rotations.multiply(rotations.inverse(examined.motion.local_quat_xyzw), motion.local_quat_xyzw)
@@ -130,9 +146,9 @@ class SegmentDenoiser:
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
         ratio = float(motion.fps) / float(self.shown.fps)
-        height = estimate_rest_height(proposal, stood.contacts)
+        height = estimate_rest_height(proposal, refined.contacts)
         steps = artefacts.list_foot_artefacts(
-            known, proposal.joint_positions()[:, toes], stood.contacts, rest_height=height, fps=float(self.shown.fps)
+            known, proposal.joint_positions()[:, toes], refined.contacts, rest_height=height, fps=float(self.shown.fps)
         )
         return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
 
@@ -153,7 +169,9 @@ class SegmentDenoiser:
         return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
 
     def _estimate_noise(self, canonical: Motion, seen: Tensor) -> tuple[Float[Tensor, " joints"], float]:
-        """Of the canonical joints' angles (radians) and of the hips' place (metres), at the capture's rate."""
+        """Estimate the noise of canonical joints' angles (radians) and the hips' position (metres), at the capture's
+        rate.
+        """
         wanted = self.settings
         sigma = estimate_angle_noise(canonical.local_quat_xyzw, seen)
         if wanted.sigma_deg is not None:

@@ -14,9 +14,8 @@ from controllers.common.initial_state import select_initial_state
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import PathRequest, SpeedProfile
-from mapctl.motion import Motion
 from mapctl.pose import decode
-from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
+from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver, TermsOf
 from mapctl.problem.solution import Solution, Status
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import Density
@@ -45,8 +44,6 @@ class FollowSettings:
     """How windows are laid."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
     """How one window is solved."""
-    extra: tuple[Term, ...] = ()
-    """Further terms, the same in every window (a likelihood for the method over states)."""
     joint: str = "hips"
     """Which joint follows the curve."""
 
@@ -70,18 +67,20 @@ def follow(
     generator: torch.Generator | None = None,
     settings: FollowSettings | None = None,
     skeleton: Skeleton = CANONICAL,
+    terms: Sequence[Term] = (),
     progress: Callable[[int, int], None] | None = None,
     deadline_seconds: float | None = None,
 ) -> Solution:
-    """A character walks the curve from its first point, facing along it.
+    """Walk a character along the curve from its first point, facing along it.
 
-    `speed` is m/s or a profile along the
-    arc; without `seconds` the curve is walked once. On another `skeleton` (canonical names) strides are as long as its
-    legs, and the toes' rest height is that of `settings.footing`. The first frame is the start pose. The
-    motion is at PRIOR_FPS; `Motion.resample` gives other rates. After `deadline_seconds` of wall clock, and at
-    Ctrl-C, what is solved by then comes back and the status says so. RequestError for wishes that make no sense;
-    wishes that cannot hold are named with numbers in the status.
+    `speed` is m/s or a profile along the arc; without `seconds` the curve is walked once. `terms` are the caller's own,
+    the same in every window; they see the character at its own size and the time since the first frame. On another
+    `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
+    `settings.footing`. The first frame is the start pose. The motion is at PRIOR_FPS; `Motion.resample` gives other
+    rates. After `deadline_seconds` of wall clock, and at Ctrl-C, what is solved by then comes back and the status says
+    so. RequestError for wishes that make no sense; wishes that cannot hold are named with numbers in the status.
     """
+    began = time.perf_counter()
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
     request, lowered = PathRequest(curve, profile, seconds).fitted(PRIOR_FPS)
@@ -92,22 +91,28 @@ def follow(
     # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
     arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
     seen, seen_arcs = person.curve(curve), arcs / person.scale
-    terms_of = build_follow_terms(seen, seen_arcs, settings.scaled_to(person))
+    more = [person.term(term) for term in terms]
+    terms_of = build_follow_terms(seen, seen_arcs, settings.scaled_to(person), more)
     start = select_initial_state(
-        prior, seen, seen_arcs, terms_of, skeleton=person.small, fps=PRIOR_FPS, generator=generator
+        prior, seen, seen_arcs, terms_of, skeleton=person.unit_skeleton, fps=PRIOR_FPS, generator=generator
     )
-    solver = RecedingHorizonSolver(prior, settings.window, person.small, method=settings.method)
+    solver = RecedingHorizonSolver(prior, settings.window, person.unit_skeleton, method=settings.method)
     done, outcome = solver.solve(
         start.committed, terms_of, frames, generator=generator, progress=progress, deadline=deadline
     )
-    known = (*([lowered] if lowered else ()), *check_path(request, arcs[:frames], person.data_limits(prior.limits)))
-    motion = person.motion(decode(done.features, start.before_first, skeleton=person.small))
-    done = replace(done, ledger=person.ledger(done.ledger))
-    return _build_solution(motion, done, Status(outcome), known, curve, settings.joint)
+    motion = person.motion(decode(done.features, start.before_first, skeleton=person.unit_skeleton))
+    notes = [lowered] if lowered else []
+    notes += check_path(request, arcs[:frames], person.data_limits(prior.limits))
+    notes += check_tracking(motion, curve, settings.joint)
+    status = Status(outcome).with_notes(notes, infeasible=bool(notes))
+    ledger, seconds = person.ledger(done.ledger), time.perf_counter() - began
+    return Solution(motion, status, ledger, done.windows, done.features, seconds)
 
 
-def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
-    """The terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
+def build_follow_terms(
+    curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings, more: Sequence[Term] = ()
+) -> TermsOf:
+    """Build the terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
     path = Path(
         curve,
         arcs,
@@ -119,13 +124,6 @@ def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: F
     )
 
     def terms(first: int, frames: int) -> Sequence[Term]:
-        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *settings.extra
+        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *more
 
     return terms
-
-
-def _build_solution(
-    motion: Motion, done: CommittedFrames, status: Status, known: Sequence[str], curve: Curve, joint: str
-) -> Solution:
-    notes = (*known, *check_tracking(motion, curve, joint))
-    return Solution(motion, status.with_notes(notes, infeasible=bool(notes)), done.ledger, done.windows, done.features)

@@ -4,14 +4,16 @@ A sliding-window MAP over the latents of the motion: the noise prior takes the t
 closeness keeps what the motion does. Works piece by piece in memory that does not grow.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from controllers.common.character import Character
+from mapctl import rotations
 from mapctl.contacts import MIN_CONTACT_FRAMES, debounced
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
@@ -20,6 +22,8 @@ from mapctl.problem.window_solvers import GuidedNoiseSolver
 from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import FootContact, LatentPrior, MotionTracking, Term
+from mapctl.terms.base import ViewedTerm
+from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)
@@ -53,26 +57,36 @@ def clean_up_feet(
     frames: int,
     state: DensityState,
     generator: torch.Generator,
+    place: GroundPose | None = None,
     settings: FootCleanupSettings | None = None,
     skeleton: Skeleton = CANONICAL,
+    terms: Sequence[Term] = (),
+    record: Callable[[CommittedFrames], None] | None = None,
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Finished features of the first `frames` of consecutive pieces, their contact labels steadied.
+    """Clean up the feet of the first `frames` of consecutive pieces of features, contact labels debounced.
 
-    `state` is the density's before the first frame (batch of one). Windows look ahead, so the pieces must hold
-    `settings.window.frames` more than are asked for; RequestError where they do not.
+    `state` and `place` (the origin) are the density's and the character's before the first frame, batch of one. `terms`
+    are the caller's own, the same in every window; `record` is called with each window that was solved. Windows look
+    ahead, so the pieces must hold `settings.window.frames` more than are asked for; RequestError where they do not.
     """
-    settings = settings or FootCleanupSettings()
+    settings, place = settings or FootCleanupSettings(), place or GroundPose.origin()
+    place = GroundPose(place.position_xz.float(), place.heading.float())
     still = torch.zeros(0, skeleton.num_joints, 3)
-    done = CommittedFrames(state, GroundPose.origin(), state.last_frame.float(), still)
+    done = CommittedFrames(state, place, state.last_frame.float(), still, discarded=-1)
+    away = torch.zeros(2)  # of the world's origin from the windows' own
     waiting, left = torch.zeros(0, LAYOUT.size), frames
     for piece in pieces:
         waiting = torch.cat([waiting, piece.float()])
         while left > 0 and len(waiting) >= settings.window.frames:
             count = min(settings.window.frames - settings.window.overlap, left)
             window = _debounce_window_contacts(done.features, waiting[: settings.window.frames])
-            done = _clean_up_window(prior, done, window, count, settings, skeleton, generator)
+            own = [ViewedTerm(term, partial(_move_trial, away=away)) for term in terms]
+            done = _clean_up_window(prior, done, window, count, settings, skeleton, generator, own)
+            if record is not None:
+                record(done)
             yield done.features[-count:]
-            waiting, left, done = waiting[count:], left - count, _discard_history(done)
+            waiting, left, away = waiting[count:], left - count, away + done.place.position_xz
+            done = _discard_history(done)
     if left > 0:
         raise RequestError(
             f"finishing needs {left + settings.window.frames - len(waiting)} more frames than it was given"
@@ -87,27 +101,34 @@ def _clean_up_window(
     settings: FootCleanupSettings,
     skeleton: Skeleton,
     generator: torch.Generator,
+    more: Sequence[Term],
 ) -> CommittedFrames:
-    """`done` and `count` more frames; a window without a finite solution is left as it was."""
+    """Commit `count` more frames; a window without a finite solution is left as it was."""
     closeness = MotionTracking(
         window,
         sigma_pose=settings.sigma_pose,
         sigma_trajectory=settings.sigma_trajectory,
         sigma_heading=settings.sigma_heading,
     )
-    terms: tuple[Term, ...] = LatentPrior(settings.sigma_noise), closeness, settings.footing
+    terms: tuple[Term, ...] = LatentPrior(settings.sigma_noise), closeness, settings.footing, *more
     method = GuidedNoiseSolver(window, share=settings.share)
     solver = RecedingHorizonSolver(prior, settings.window, skeleton, method=method)
     following, _ = solver.solve(done, lambda first, frames: terms, len(done.features) + count, generator=generator)
     return following
 
 
+def _move_trial(trial: Trial, away: Float[Tensor, "2"]) -> Trial:
+    """Move a trial over the ground to where it is in the world."""
+    start = replace(trial.start, position_xz=trial.start.position_xz + away)
+    return replace(trial, start=start, before=trial.before + rotations.lift_ground(away))
+
+
 def _discard_history(done: CommittedFrames) -> CommittedFrames:
-    """Without all that no later window looks at, and moved to the origin, where single precision is finest."""
+    """Discard all that no later window looks at, and move to the origin, where single precision is finest."""
     here = done.place.position_xz
     return replace(
         done.discard_history(MIN_CONTACT_FRAMES),
-        joints_world=done.joints_world - torch.stack([here[0], here.new_zeros(()), here[1]]),
+        joints_world=done.joints_world - rotations.lift_ground(here),
         place=GroundPose(torch.zeros_like(here), done.place.heading),
     )
 
@@ -115,7 +136,7 @@ def _discard_history(done: CommittedFrames) -> CommittedFrames:
 def _debounce_window_contacts(
     before: Float[Tensor, "past size"], window: Float[Tensor, "frames size"]
 ) -> Float[Tensor, "frames size"]:
-    """The window with contacts, and gaps in them, of less than MIN_CONTACT_FRAMES frames gone."""
+    """Remove contacts, and gaps in them, of less than MIN_CONTACT_FRAMES frames."""
     bits = LAYOUT.pick(torch.cat([before, window]), "contacts") > 0.5
     steady = debounced(bits)[len(before) :]
     return torch.cat([window[:, : LAYOUT.continuous], steady.to(window.dtype)], dim=-1)

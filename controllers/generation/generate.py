@@ -4,8 +4,10 @@ The prior is sampled frame after frame, a refiner makes the samples look capture
 stand that the motion's own contact labels call planted. All three work piece by piece.
 """
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -18,9 +20,12 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.motion import Motion
 from mapctl.pose import decode
-from mapctl.problem.receding_horizon import replay
+from mapctl.problem.ledger import Ledger
+from mapctl.problem.receding_horizon import CommittedFrames, replay
+from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Density, DensityState, Refiner
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
+from mapctl.terms import Term
 
 _CHUNK = 600
 _GOLDEN = (5**0.5 - 1) / 2
@@ -58,29 +63,23 @@ def stream(
     start_clip: Motion | None = None,
     refiner: Refiner | None = None,
     skeleton: Skeleton = CANONICAL,
-) -> Iterator[Motion]:
-    """Consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its length.
+    terms: Sequence[Term] = (),
+) -> Iterator[Solution]:
+    """Generate consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its
+    length.
 
     Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the memory.
     On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
-    `settings.finishing`. RequestError, at once, for a length or a start that cannot be.
+    `settings.foot_cleanup`. `terms` are the caller's own, in every window of the foot clean-up; they see the character
+    at its own size, in the world, and the time since the first frame. RequestError, at once, for a length or a start
+    that cannot be, and for terms without a foot clean-up.
     """
-    settings = settings or GenerateSettings()
+    settings, solved = settings or GenerateSettings(), list[CommittedFrames]()
+    if terms and settings.foot_cleanup is None:
+        raise RequestError("terms are wishes to the foot clean-up, which is left out")
     person = settings.person(skeleton)
-    return _decode_pieces(*_start_stream(prior, seconds, generator, settings, start_clip, refiner, person), person)
-
-
-def stream_features(
-    prior: Density,
-    *,
-    seconds: float,
-    generator: torch.Generator,
-    settings: GenerateSettings | None = None,
-    start_clip: Motion | None = None,
-    refiner: Refiner | None = None,
-) -> Iterator[Float[Tensor, "_ size"]]:
-    """The features of `stream`'s pieces: the motion with its own contact labels (see mapctl.features.LAYOUT)."""
-    return _start_stream(prior, seconds, generator, settings or GenerateSettings(), start_clip, refiner, Character())[0]
+    pieces, place = _start_stream(prior, seconds, generator, settings, start_clip, refiner, person, terms, solved)
+    return _decode_pieces(pieces, place, person, solved)
 
 
 def generate(
@@ -92,8 +91,9 @@ def generate(
     start_clip: Motion | None = None,
     refiner: Refiner | None = None,
     skeleton: Skeleton = CANONICAL,
-) -> Motion:
-    """The whole motion at once; see `stream`."""
+    terms: Sequence[Term] = (),
+) -> Solution:
+    """Generate the whole motion at once; see `stream`."""
     pieces = stream(
         prior,
         seconds=seconds,
@@ -102,11 +102,22 @@ def generate(
         start_clip=start_clip,
         refiner=refiner,
         skeleton=skeleton,
+        terms=terms,
     )
-    motion = next(pieces)
-    for piece in pieces:
-        motion = motion.join(piece)
-    return motion
+    return reduce(_join_pieces, pieces)
+
+
+def _join_pieces(whole: Solution, piece: Solution) -> Solution:
+    assert whole.features is not None
+    assert piece.features is not None
+    return replace(
+        whole,
+        motion=whole.motion.join(piece.motion),
+        ledger=whole.ledger.join(piece.ledger),
+        windows=whole.windows + piece.windows,
+        features=torch.cat([whole.features, piece.features]),
+        seconds=whole.seconds + piece.seconds,
+    )
 
 
 def initialise_generation(
@@ -161,8 +172,12 @@ def _start_stream(
     clip: Motion | None,
     refiner: Refiner | None,
     person: Character,
+    terms: Sequence[Term],
+    solved: list[CommittedFrames],
 ) -> tuple[Iterator[Float[Tensor, "_ size"]], GroundPose]:
-    """Pieces of features, and the place before the first; what cannot be is refused before any is drawn."""
+    """Start pieces of features, and find the place before the first; what cannot be is refused before any is drawn.
+    Windows of the foot clean-up are appended to `solved`.
+    """
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
@@ -177,8 +192,11 @@ def _start_stream(
             frames=frames,
             state=state,
             generator=generator,
+            place=place,
             settings=settings.foot_cleanup.scaled_to(person),
-            skeleton=person.small,
+            skeleton=person.unit_skeleton,
+            terms=[person.term(term) for term in terms],
+            record=solved.append,
         )
     return _rechunk(pieces, frames), place
 
@@ -204,8 +222,19 @@ def _rechunk(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator
                 return
 
 
-def _decode_pieces(pieces: Iterator[Float[Tensor, "_ size"]], place: GroundPose, person: Character) -> Iterator[Motion]:
+def _decode_pieces(
+    pieces: Iterator[Float[Tensor, "_ size"]], place: GroundPose, person: Character, solved: list[CommittedFrames]
+) -> Iterator[Solution]:
+    """Decode pieces of features, each with the ledger of its frames and the windows solved for it."""
+    ledger, began = Ledger(), time.perf_counter()
     for features in pieces:
-        yield person.motion(decode(features, place, skeleton=person.small))
+        motion = person.motion(decode(features, place, skeleton=person.unit_skeleton))
         ground, heading = integrate_root(features.double(), place)
         place = GroundPose(ground[-1], heading[-1])
+        for done in solved:
+            ledger = ledger.join(done.ledger)
+        windows, count = tuple(window for done in solved for window in done.windows), len(features)
+        solved.clear()
+        own, seconds = person.ledger(ledger.slice(count)), time.perf_counter() - began
+        yield Solution(motion, Status(Outcome.DONE), own, windows, features, seconds)
+        ledger, began = ledger.pick(slice(count, None)), time.perf_counter()

@@ -1,4 +1,4 @@
-"""Tertiary blending (infilling paper, section 4.2): a hand or foot does for a while what it does in another motion."""
+"""Tertiary blending (Kaufmann et al. 2020, section 4.2): a hand or foot moves for a while as in another motion."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,8 @@ from torch import Tensor
 
 from controllers.inbetweening.feasibility import MIN_JERK_PEAK_ACCELERATION
 from controllers.inbetweening.keyframes import effector_joint
-from controllers.inbetweening.pipeline import InfillResult, InfillSettings, fill
+from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.inbetweening.solution import InbetweenSolution
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed
@@ -22,6 +23,7 @@ from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import Stance
 from mapctl.skeleton import CANONICAL, LIMBS, Limb
+from mapctl.terms import Term
 
 _MIN_MARGIN_SECONDS = 0.3  # seconds
 _USUAL_HAND_ACCELERATION, _MAX_HAND_ACCELERATION = 20.0, 80.0  # m/s^2 of a hand
@@ -47,17 +49,19 @@ def blend(
     motion: Motion,
     source: Motion,
     borrowed: LimbTransfer,
-    infiller: Inbetweener | None,
+    inbetweener: Inbetweener,
     *,
     settings: InfillSettings | None = None,
     densities: Sequence[Density] = (),
+    terms: Sequence[Term] = (),
     rig: Rig | None = None,
-) -> InfillResult:
-    """The motion with its limbs where the source's are, seen from shoulder or hip, in size, and bent as those are; all
-    else stays to the bit. In the margins before and after, the limbs go there and come back.
+) -> InbetweenSolution:
+    """Put limbs of a motion where the source's are, seen from shoulder or hip, in size, and bent as those are; all else
+    stays to the bit. In the margins before and after, the limbs go there and come back.
 
     What is taken lasts as long as it does in the source, whatever the two frame rates. RequestError for frames that
-    either motion has not, and for joints that are no hand or foot.
+    either motion has not, and for joints that are no hand or foot; margins that no limb could do in time are named in
+    the status, which is then infeasible.
     """
     _check_transfer(source, borrowed)
     own, rigmap = to_canonical(motion, rig)
@@ -82,13 +86,12 @@ def blend(
     lost = torch.zeros_like(new)
     lost[free] = True
     lost[there] = False
-    done = fill(lent, MissingMask(lost & moved, nothing), infiller, settings=settings, densities=densities, rig=rig)
-    notes = (
-        *carried.notes,
-        *_note_infeasible_margins(own, posed, borrowed, limbs, free, there),
-        f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new",
-    )
-    return replace(done, lost=MissingMask((lost | new) & moved, nothing), notes=(*done.notes, *notes))
+    missing = MissingMask(lost & moved, nothing)
+    done = fill(lent, missing, inbetweener, settings=settings, densities=densities, terms=terms, rig=rig)
+    infeasible = _note_infeasible_margins(own, posed, borrowed, limbs, free, there)
+    status = done.status.with_notes(carried.notes).with_notes(infeasible, infeasible=bool(infeasible))
+    status = status.with_notes([f"frames {free.start}:{free.stop} of {', '.join(borrowed.limbs)} are new"])
+    return replace(done, missing=MissingMask((lost | new) & moved, nothing), status=status)
 
 
 def _resample_source(source: Motion, borrowed: LimbTransfer, fps: Fraction) -> Motion:

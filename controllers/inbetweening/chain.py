@@ -1,4 +1,4 @@
-"""One long motion through short pieces of many clips, the gaps between them filled in (infilling paper, figure 1)."""
+"""One long motion through short pieces of many clips, the gaps between filled in (Kaufmann et al. 2020, figure 1)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.pipeline import InfillResult, InfillSettings
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.solution import InbetweenSolution
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -16,6 +17,7 @@ from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.terms import Term
 
 _VELOCITY_FRAMES = 5  # frames over which the way on at a piece's end is told
 
@@ -36,18 +38,18 @@ class ChainSettings:
 
 def chain(
     clips: Sequence[Motion],
-    infiller: Inbetweener | None,
+    inbetweener: Inbetweener,
     *,
     generator: torch.Generator,
     settings: ChainSettings | None = None,
     filling: InfillSettings | None = None,
     densities: Sequence[Density] = (),
-    rollout_densities: Sequence[Density] = (),
-) -> InfillResult:
-    """A motion on the first clip's rig at the prior's rate. RequestError for fewer than two clips.
+    terms: Sequence[Term] = (),
+) -> InbetweenSolution:
+    """Chain pieces of clips to a motion on the first clip's rig at PRIOR_FPS. RequestError for fewer than two clips.
 
-    Each piece goes where the one before leads: on along its way for half of the gap, then along the next one's. In gaps
-    that the infiller does not know, one of `rollout_densities` is rolled if it slides less.
+    Each piece goes where the one before leads: on in its direction for half of the gap, then in the next one's. The
+    generator draws the gaps' lengths, then what the in-betweener draws.
     """
     settings = settings or ChainSettings()
     if len(clips) < 2:
@@ -71,9 +73,9 @@ def chain(
         ).join(piece)
     assert whole is not None, "there are clips"
     done = infill(
-        body.on_rig(whole), infiller, masks, settings=filling, densities=densities, rollout_densities=rollout_densities
+        body.on_rig(whole), inbetweener, masks, settings=filling, densities=densities, terms=terms, generator=generator
     )
-    return replace(done, notes=(*done.notes, *notes))
+    return replace(done, status=done.status.with_notes(notes))
 
 
 def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int) -> tuple[Motion, tuple[str, ...]]:

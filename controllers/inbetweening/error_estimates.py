@@ -10,6 +10,8 @@ import numpy as np
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, leg_length
 
+INFILLER = "infiller"
+"""Name of the source whose errors are the measure where another's were never measured."""
 TRAVELLING_SPEED = 0.35
 """Metres a second of the hips, from one end of a gap to the other, of a body with canonical legs, from which it is on
 its way."""
@@ -60,11 +62,13 @@ MEASURED_ERRORS: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float
 centimetres in half and in nine of ten of the clips, and how many these were; by `mapctl bench gaps --data DATA
 --count 25`."""
 
+_MEASURED_SOURCES = {INFILLER: INFILLER, "standing": INFILLER, "rollout": "rollout", "density": "rollout"}
+
 
 def is_travelling(motion: Motion, start: int, stop: int) -> bool:
-    """Whether the body (canonical joints) goes elsewhere in a gap, faster than one shifts one's weight."""
-    way = float((motion.root_position[stop] - motion.root_position[start])[::2].norm())
-    return way * leg_length(CANONICAL) / leg_length(motion.skeleton) > TRAVELLING_SPEED * (stop - start) / float(
+    """Return whether the body (canonical joints) goes elsewhere in a gap, faster than one shifts one's weight."""
+    distance = float((motion.root_position[stop] - motion.root_position[start])[::2].norm())
+    return distance * leg_length(CANONICAL) / leg_length(motion.skeleton) > TRAVELLING_SPEED * (stop - start) / float(
         motion.fps
     )
 
@@ -93,15 +97,18 @@ class ErrorEstimate:
         )
 
 
-def estimate_error(by: str, frames: int, *, going: bool, beside: bool) -> ErrorEstimate:
-    """Of an answer for a gap of so many frames at the prior's rate; `beside` where frames around it are known.
+def estimate_error(by: str, frames: int, *, going: bool, beside: bool) -> ErrorEstimate | None:
+    """Estimate the error of an answer for a gap of so many frames at PRIOR_FPS; `beside` where frames around it are
+    known. None for a source that was never measured.
 
-    Between measured lengths straight lines; longer gaps than measured are at least as unsure as the longest. What was
-    never measured of an answer counts as the infiller's.
+    Between measured lengths straight lines; longer gaps than measured are at least as unsure as the longest. Kinds of
+    gap in which rollouts were never measured count as the infiller's.
     """
-    name = "rollout" if by.split(" ")[0] in ("rollout", "density") else "infiller"
+    name = _MEASURED_SOURCES.get(by.split(" ")[0])
+    if name is None:
+        return None
     what = "going" if going else "in place"
-    rows = MEASURED_ERRORS.get((name, what, beside)) or MEASURED_ERRORS[("infiller", what, beside)]
+    rows = MEASURED_ERRORS.get((name, what, beside)) or MEASURED_ERRORS[(INFILLER, what, beside)]
     lengths, half, most, clips = np.array(rows).T
     nearest = int(clips[np.abs(lengths - frames).argmin()])
     return ErrorEstimate(float(np.interp(frames, lengths, half)), float(np.interp(frames, lengths, most)), nearest)

@@ -8,11 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.error_estimates import TRAINED_GAP_FRAMES, ErrorEstimate, estimate_error, is_travelling
-from controllers.inbetweening.proposers.answers import GapSource
+from controllers.inbetweening.error_estimates import (
+    INFILLER,
+    TRAINED_GAP_FRAMES,
+    ErrorEstimate,
+    estimate_error,
+    is_travelling,
+)
+from controllers.inbetweening.proposers.auto import STANDING_STILL
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening import GapQuery
+from mapctl.inbetweening.query import GapSource
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 
@@ -22,70 +29,76 @@ _MORPH_RATIO, _MIN_MORPH_FRAMES = 1.3, 45
 _STILL_SPEED = 0.12  # m/s of the joints of somebody who hardly moves: there is nothing to miss
 
 
-def compose_gap_notes(gap: CanonicalGap, made: Motion, sources: Sequence[GapSource], *, fps: float) -> tuple[str, ...]:
-    """A line for each gap, in frames of the motion at `fps`; short ones of one proposer share a line."""
-    lines, short = [], {}
+def compose_gap_notes(query: GapQuery, made: Motion, sources: Sequence[GapSource], *, fps: float) -> tuple[str, ...]:
+    """Compose a line for each gap, in frames of the motion at `fps`; those with nothing of their own to say share one
+    by proposer.
+    """
+    lines: list[str] = []
+    plain: dict[str, list[GapSource]] = {}
     for source in sources:
-        sure = _estimate_gap_error(gap, source)
-        text = _describe_gap(gap, made, source, sure)
-        if text is None:
-            short.setdefault(source.by, []).append((source, sure))
-            continue
-        lines.append(f"frames {_format_frames(gap, source, fps)}: {text}")
-    for by, each in short.items():
-        where = ", ".join(_format_frames(gap, source, fps) for source, _ in each)
-        sure = max((sure for _, sure in each), key=lambda one: one.percentile_90_cm)
-        lines.append(f"frames {where}: {by}, {sure.text}")
-    return tuple(lines)
+        words = _describe_gap(query, made, source)
+        if not words and source.by == INFILLER:
+            plain.setdefault(source.by, []).append(source)
+        else:
+            lines.append(_join_words([source], query, words, fps))
+    return (*lines, *(_join_words(each, query, [], fps) for each in plain.values()))
 
 
-def _format_frames(gap: CanonicalGap, source: GapSource, fps: float) -> str:
-    """Of the motion's own rate."""
-    start, stop = (float(gap.seconds[frame]) for frame in (source.start - 1, min(source.stop, len(gap.seconds) - 1)))
+def _join_words(sources: Sequence[GapSource], query: GapQuery, words: Sequence[str], fps: float) -> str:
+    """Join where, who, how sure (of the least sure gap), and what else there is to say."""
+    where = ", ".join(_format_frames(query, source, fps) for source in sources)
+    found = [estimate for source in sources if (estimate := _estimate_gap_error(query, source)) is not None]
+    sure = [max(found, key=lambda one: one.percentile_90_cm).text] if found else []
+    return f"frames {where}: {', '.join([sources[0].by, *sure, *words])}"
+
+
+def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
+    """Format a gap in frames of the motion's own rate."""
+    start, stop = (
+        float(query.seconds[frame]) for frame in (source.start - 1, min(source.stop, len(query.seconds) - 1))
+    )
     return f"{round(start * fps) + 1}:{round(stop * fps)}"
 
 
-def _estimate_gap_error(gap: CanonicalGap, source: GapSource) -> ErrorEstimate:
-    known = ~(gap.turns.any(dim=1) | gap.root)
-    before, after = (
-        known[max(0, source.start - _MIN_CONTEXT_FRAMES) : source.start],
-        known[source.stop : source.stop + _MIN_CONTEXT_FRAMES],
-    )
+def _estimate_gap_error(query: GapQuery, source: GapSource) -> ErrorEstimate | None:
+    known = ~query.missing.frames
+    before = known[max(0, source.start - _MIN_CONTEXT_FRAMES) : source.start]
+    after = known[source.stop : source.stop + _MIN_CONTEXT_FRAMES]
     beside = min(int(before.sum()), int(after.sum())) >= _MIN_CONTEXT_FRAMES
-    going = is_travelling(gap.motion, max(0, source.start - 1), min(source.stop, len(known) - 1))
+    going = is_travelling(query.motion, max(0, source.start - 1), min(source.stop, len(known) - 1))
     return estimate_error(source.by, source.stop - source.start, going=going, beside=beside)
 
 
-def _describe_gap(gap: CanonicalGap, made: Motion, source: GapSource, sure: ErrorEstimate) -> str | None:
-    """What there is to say of one gap; None if it is but who proposed it and how sure that is."""
-    words, seconds = [source.by, sure.text], (source.stop - source.start) / PRIOR_FPS
-    if source.stop - source.start > TRAINED_GAP_FRAMES and source.by == "infiller":
+def _describe_gap(query: GapQuery, made: Motion, source: GapSource) -> list[str]:
+    """List what there is to say of one gap beyond who proposed it and how sure that is."""
+    words, seconds = [source.reason] if source.reason else [], (source.stop - source.start) / PRIOR_FPS
+    if source.stop - source.start > TRAINED_GAP_FRAMES and source.by == INFILLER:
         words.append(f"and {seconds:.1f} s are longer than the {TRAINED_GAP_FRAMES / PRIOR_FPS:.0f} s that it knows")
-    if _is_morph(gap, made, source):
+    if _is_morph(query, made, source):
         words.append("a still morph: it goes hardly further than straight from one pose to the other; tell more keys")
-    return ", ".join(words) if len(words) > 2 or source.by != "infiller" else None
+    return words
 
 
-def _is_morph(gap: CanonicalGap, made: Motion, source: GapSource) -> bool:
-    """Whether nothing happens but one pose becoming the other, for long, where people move."""
-    if source.stop - source.start < _MIN_MORPH_FRAMES or source.by == "standing still":
+def _is_morph(query: GapQuery, made: Motion, source: GapSource) -> bool:
+    """Return whether nothing happens but one pose becoming the other, for long, where people move."""
+    if source.stop - source.start < _MIN_MORPH_FRAMES or source.by == STANDING_STILL:
         return False
     part = slice(max(0, source.start - 1), source.stop + 1)
     way, straight = (
         _compute_path_length(each.joint_positions()[part], heading(each.local_quat_xyzw[part, 0]))
-        for each in (made, gap.motion)
+        for each in (made, query.motion)
     )
-    going = is_travelling(gap.motion, max(0, source.start - 1), min(source.stop, len(gap.root) - 1))
+    going = is_travelling(query.motion, max(0, source.start - 1), min(source.stop, len(query.missing.root) - 1))
     pace, least = (each * PRIOR_FPS / (source.stop - source.start) for each in (way, straight))
-    quiet = least < _STILL_SPEED and _is_still_beside(gap, source)
+    quiet = least < _STILL_SPEED and _is_still_beside(query, source)
     return pace < max(_STILL_SPEED, _MORPH_RATIO * least) and (going or not quiet)
 
 
-def _is_still_beside(gap: CanonicalGap, source: GapSource) -> bool:
-    """Whether known frames beside a gap, if there are any, hardly move."""
-    places = gap.motion.joint_positions()
+def _is_still_beside(query: GapQuery, source: GapSource) -> bool:
+    """Return whether known frames beside a gap, if there are any, hardly move."""
+    places = query.motion.joint_positions()
     for one, other in ((source.start - 2, source.start - 1), (source.stop, source.stop + 1)):
-        if one < 0 or other >= len(places) or bool(gap.root[[one, other]].any()):
+        if one < 0 or other >= len(places) or bool(query.missing.root[[one, other]].any()):
             continue
         if float((places[other] - places[one]).norm(dim=-1).mean()) * PRIOR_FPS > _STILL_SPEED:
             return False
@@ -93,7 +106,7 @@ def _is_still_beside(gap: CanonicalGap, source: GapSource) -> bool:
 
 
 def _compute_path_length(places: Float[Tensor, "frames joints 3"], facing: Float[Tensor, " frames"]) -> float:
-    """Of the joints seen from the hips, mean over joints, metres."""
+    """Compute how far joints move seen from the hips, mean over joints, metres."""
     turn = rotations.about_y(-facing)[:, None].expand(-1, places.shape[1], 4)
     own = rotations.rotate(turn, places - places[:, :1])
     return float(torch.diff(own, dim=0).norm(dim=-1).sum(dim=0).mean())

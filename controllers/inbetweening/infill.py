@@ -1,62 +1,56 @@
-"""Fill the gaps of a motion: frames that are missing, or joints (infilling paper, section 4.2)."""
+"""Fill the gaps of a motion: frames that are missing, or joints (Kaufmann et al. 2020, section 4.2)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
-from jaxtyping import Float
-from torch import Tensor
+import torch
 
-from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.pipeline import InfillMethod, InfillResult, InfillSettings, fill, note_open_ends
-from controllers.inbetweening.proposers.answers import Proposal
-from controllers.inbetweening.proposers.rollout import extrapolate_end
-from controllers.inbetweening.proposers.selection import choose_proposals
+from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.inbetweening.solution import InbetweenSolution
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import Mask, expand_masks, resolve_joint_names
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
+from mapctl.terms import Term
 
-__all__ = ["InfillMethod", "InfillResult", "InfillSettings", "infill"]
+__all__ = ["InbetweenSolution", "InfillSettings", "infill"]
 
 
 def infill(
     motion: Motion,
-    infiller: Inbetweener | None,
+    inbetweener: Inbetweener,
     masks: Sequence[Mask],
     *,
     settings: InfillSettings | None = None,
     densities: Sequence[Density] = (),
+    terms: Sequence[Term] = (),
     rig: Rig | None = None,
     course: Curve | None = None,
-    rollout_densities: Sequence[Density] = (),
-) -> InfillResult:
-    """Fill what the masks say is missing. RequestError for masks that do not fit, or a method without its network.
+    generator: torch.Generator | None = None,
+) -> InbetweenSolution:
+    """Fill what the masks say is missing. RequestError for masks that do not fit.
 
-    What stands in a gap does not matter. A gap at the motion's beginning or end is extended into: at the end by one of
-    `rollout_densities`, if what is known is like their data. On a `course` the hips go along it while they are lost.
+    What stands in a gap does not matter. A gap at the motion's beginning or end is extended into. On a `course` the
+    hips go along it while they are missing; the in-betweener's rough one then proposes, since others leave it. Of
+    `densities` the likeliest joins the MAP stage, and so do `terms`; what is drawn is drawn from the generator.
     """
     masks = resolve_joint_names(motion, masks, rig)
     # What rig it is must not be told from what stands in a gap.
     shown = interpolate_missing(motion, MissingMask(*expand_masks(motion, masks)))
-    lost = MissingMask.of_masks(motion, masks, to_canonical(shown, rig)[1])
-    if course is not None and not lost.root.any():
+    missing = MissingMask.of_masks(motion, masks, to_canonical(shown, rig)[1])
+    if course is not None and not missing.root.any():
         raise RequestError("a curve leads the hips where they are lost, and they never are; leave it out")
-    first = "infiller" if settings is None or settings.method != "linear" else "nearest known frame"
-
-    def another(
-        gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: EffectorTargets | None
-    ) -> Proposal:
-        chosen = Proposal(proposal, odds)
-        if course is None:
-            chosen = choose_proposals(gap, proposal, odds, targets, densities=rollout_densities)
-        end = extrapolate_end(gap, chosen.motion, chosen.odds, densities=rollout_densities)
-        return replace(end, sources=(*chosen.sources, *end.sources))
-
-    done = fill(motion, lost, infiller, settings=settings, densities=densities, rig=rig, course=course, another=another)
-    last = done.sources[-1].by if done.sources and lost.root[-1] else first
-    return replace(done, notes=(*note_open_ends(lost, first, last), *done.notes))
+    return fill(
+        motion,
+        missing,
+        inbetweener if course is None else inbetweener.rough,
+        settings=settings,
+        densities=densities,
+        terms=terms,
+        rig=rig,
+        course=course,
+        generator=generator,
+    )

@@ -1,4 +1,4 @@
-"""The MAP stage of infilling: feet put down about what was proposed, gap by gap."""
+"""The MAP stage of in-betweening: feet are put down about what was proposed, gap by gap."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,17 +8,18 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, refine
-from controllers.inbetweening.canonical_gap import CanonicalGap
+from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import WindowRecord
 from mapctl.protocols import Density
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms import Clearance, FootContact, Jerk
+from mapctl.terms import Clearance, FootContact, Jerk, Term
 
 _CONTEXT_FRAMES = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
 INFILL_REFINEMENT = RefinementSettings(
@@ -37,39 +38,47 @@ the evaluations."""
 
 
 def refine_gaps(
-    proposal: Motion,
-    bits: Tensor,
-    gap: CanonicalGap,
+    proposal: Proposal,
+    query: GapQuery,
+    targets: EffectorTargets | None,
     settings: RefinementSettings,
     densities: Sequence[Density],
-    targets: EffectorTargets | None,
-) -> tuple[Motion, Ledger]:
-    """The proposal with its feet put down, gap by gap; and the ledger of these."""
-    quats, root, ledger = proposal.local_quat_xyzw.clone(), proposal.root_position.clone(), Ledger()
-    for first, last in _find_gap_windows(gap.turns.any(dim=1) | gap.root):
+    terms: Sequence[Term],
+) -> tuple[Motion, Ledger, tuple[WindowRecord, ...]]:
+    """Refine a proposal gap by gap; also returns the ledger and the cost of its windows."""
+    motion, missing = proposal.motion, query.missing
+    quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    ledger, windows = Ledger(), []
+    for first, last in _find_gap_windows(missing.frames):
         if last - first < 2:
             continue
-        part = slice(first, last)
+        part, lost = slice(first, last), missing.slice(first, last)
         capture = Capture.of_motion(
-            proposal.slice(first, last),
-            seen=~gap.turns[part],
-            seen_root=~gap.root[part],
+            motion.slice(first, last),
+            seen=~lost.joints,
+            seen_root=~lost.root,
             sigma=torch.zeros(CANONICAL.num_joints),
             sigma_root=0.0,
         )
-        wanted = None if targets is None else EffectorTargets(targets.places[part], targets.wanted[part])
-        standing = refine(
-            proposal.slice(first, last), bits[part], capture, settings, densities=densities, targets=wanted
+        refined = refine(
+            motion.slice(first, last),
+            proposal.contact_logits[part],
+            capture,
+            settings,
+            densities=densities,
+            targets=None if targets is None else EffectorTargets(targets.places[part], targets.wanted[part]),
+            terms=terms,
+            first_frame=first,
         )
-        quats[part] = torch.where(gap.turns[part, :, None], standing.motion.local_quat_xyzw, quats[part])
-        root[part] = torch.where(gap.root[part, None], standing.motion.root_position, root[part])
-        ledger = ledger.join(standing.ledger)
-    return replace(proposal, root_position=root, local_quat_xyzw=quats), ledger
+        quats[part] = torch.where(lost.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
+        root[part] = torch.where(lost.root[:, None], refined.motion.root_position, root[part])
+        ledger, windows = ledger.join(refined.ledger), [*windows, *refined.windows]
+    return replace(motion, root_position=root, local_quat_xyzw=quats), ledger, tuple(windows)
 
 
-def _find_gap_windows(lost: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
-    """First frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
-    near = lost.clone()
-    for _, start, stop in true_intervals(lost[:, None]):
+def _find_gap_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+    """Find first frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
+    near = missing.clone()
+    for _, start, stop in true_intervals(missing[:, None]):
         near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True
     return [(start, stop) for _, start, stop in true_intervals(near[:, None])]

@@ -1,68 +1,64 @@
-"""In-betweening: a few keys to a whole motion that meets them. What a key tells is no unknown, so it is met to the bit;
-where it only tells the place of a hand or a foot, the limb is bent until it is there.
+"""In-betweening: a few keys to a whole motion that meets them. What a key gives is no unknown, so it is met to the bit;
+where it gives only the position of a hand or a foot, the limb is bent until it is there.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 
 from controllers.inbetweening.feasibility import check_keyframes
 from controllers.inbetweening.keyframes import collect_effector_targets, keyframe_errors, missing_between_keys
-from controllers.inbetweening.pipeline import InfillResult, InfillSettings, fill, note_open_ends
-from controllers.inbetweening.proposers.answers import Proposer
-from controllers.inbetweening.proposers.selection import choose_proposals
+from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.inbetweening.solution import InbetweenSolution
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import RigMap, as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
+from mapctl.terms import Term
 
 
 def tween(
     motion: Motion,
     keys: Keys,
-    infiller: Inbetweener | None,
+    inbetweener: Inbetweener,
     *,
     settings: InfillSettings | None = None,
     densities: Sequence[Density] = (),
+    terms: Sequence[Term] = (),
     rig: Rig | None = None,
-    rollout_densities: Sequence[Density] = (),
-    another: Proposer | None = None,
-) -> InfillResult:
-    """A motion of the same length that goes through the keys of a motion, of which nothing else counts.
+    generator: torch.Generator | None = None,
+) -> InbetweenSolution:
+    """Make a motion of the same length through the keys of a motion, of which nothing else counts.
 
-    Where keys are so far apart that the infiller does not know enough, one of `rollout_densities` proposes if a viewer
-    would see less sliding (see `controllers.inbetweening.proposers.selection`); `another` takes the place of
-    that choice. RequestError for keys that do not fit the motion or its rig; keys that nobody could reach in time get a
-    note.
+    Of `densities` the likeliest joins the MAP stage, and so do `terms`; what is drawn is drawn from the generator.
+    RequestError for keys that do not fit the motion or its rig; keys that no body could meet in time are named in the
+    status, which is then infeasible.
     """
     wanted = keys.checked(motion)
     canonical, rigmap, shown = keyframe_motion(wanted, motion, rig)
-    lost, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
-    hasty = check_keyframes(shown, canonical, rigmap, lost, targets)
-    if another is None and (settings is None or settings.method == "map"):
-        another = partial(choose_proposals, densities=rollout_densities)
+    missing, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
+    infeasible = check_keyframes(shown, canonical, rigmap, missing, targets)
     done = fill(
         motion,
-        lost,
-        infiller,
+        missing,
+        inbetweener,
         settings=settings,
         densities=densities,
+        terms=terms,
         rig=as_rig(rigmap),
         targets=targets,
-        another=another,
+        generator=generator,
     )
-    by = "nearest key" if infiller is None else "infiller"
-    return replace(done, notes=(*hasty, *note_open_ends(lost, by, by), *done.notes))
+    return replace(done, status=done.status.with_notes(infeasible, infeasible=bool(infeasible)))
 
 
 def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
-    """All that counts, the keys and straight lines between them: on canonical joints, and on the rig, which is told
-    from these, too.
+    """Return all that counts, the keys and the interpolation between them: on canonical joints, with the map of the
+    rig, which is recognised from these, and on the rig.
     """
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in wanted if key.shown]] = False
@@ -71,5 +67,5 @@ def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> t
 
 
 def measure_keyframe_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:
-    """By key, how far what it tells is missed (see `controllers.inbetweening.keyframes.keyframe_errors`)."""
+    """Measure by key how far what it gives is missed (see `controllers.inbetweening.keyframes.keyframe_errors`)."""
     return keyframe_errors(made, source, keys, keyframe_motion(keys.checked(source), source, rig)[1])

@@ -1,43 +1,41 @@
 """Several answers to one question: the same keys met by different motions, each with its energy."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from controllers.common.map_refinement import RefinementSettings
 from controllers.common.score import score
-from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.pipeline import InfillResult, InfillSettings
-from controllers.inbetweening.proposers.answers import Proposal
-from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps, select_likeliest_density
-from controllers.inbetweening.tween import tween
+from controllers.inbetweening.proposers.auto import Auto
+from controllers.inbetweening.proposers.rolling import select_likeliest_density
+from controllers.inbetweening.proposers.rollouts import Rollouts
+from controllers.inbetweening.proposers.slerp import Slerp
+from controllers.inbetweening.refine import INFILL_REFINEMENT
+from controllers.inbetweening.solution import InbetweenSolution
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.intent.keyframes import Keys
 from mapctl.metrics.realism import Diversity, measure_diversity
-from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import to_canonical
-from mapctl.retarget.rigs import Rig
 
 MAX_VARIATIONS = 1000
 """Variations at a time."""
-_MIN_FRAMES = 8  # frames at the prior's rate: shorter motions have no energy to speak of
+_MIN_FRAMES = 8  # frames at PRIOR_FPS: shorter motions have no energy to speak of
+
+Tweening = Callable[[Inbetweener, torch.Generator], InbetweenSolution]
+"""Makes one answer, as `tween` with its motion, keys and settings filled in."""
 
 
 @dataclass(frozen=True, eq=False)
 class Variation:
     """One answer."""
 
-    infill_result: InfillResult
-    """The motion, and how it became so."""
+    solution: InbetweenSolution
+    """The motion, and how it came about."""
     ledger: Ledger
-    """Of the finished motion, by term: likelihood, footing, clearance, support and jerk."""
+    """Energy of the finished motion by term: likelihood, footing, clearance, support and jerk."""
 
     @property
     def energy(self) -> float:
@@ -56,108 +54,84 @@ class Variations:
 
 
 def sample_variations(
-    motion: Motion,
-    keys: Keys,
-    infiller: Inbetweener,
+    make: Tweening,
+    first: Inbetweener,
+    rollouts: Rollouts,
     count: int,
     *,
-    rollout_densities: Sequence[Density],
     generator: torch.Generator,
-    settings: InfillSettings | None = None,
-    rolling: RolloutSettings | None = None,
-    densities: Sequence[Density] = (),
-    rig: Rig | None = None,
+    refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> Variations:
-    """So many motions through the same keys. The first answers are the same however many are asked for.
+    """Make so many motions through the same keys. The first answers are the same however many are asked for.
 
-    The first is that of `tween`; in the others one of `rollout_densities` is drawn from and steered from key to key.
-    RequestError for fewer than two, for keys that are too near to each other to leave a choice, and as `tween`.
+    The first is that of one in-betweener; in the others the likeliest density of `rollouts` is drawn from and steered
+    from key to key. RequestError for fewer than two, and for keys that are too near to each other to leave a choice.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
-    settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
-    make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [_make_first(motion, partial(make, rollout_densities=rollout_densities))]
-    density = select_likeliest_density(rollout_densities, to_canonical(found[0].motion, rig)[0])
-    found += _sample_rollouts(make, count - 1, density, generator, rolling, progress)
+    found = [_make_first(make, first, generator)]
+    density = _select_density(rollouts, found[0])
+    found += _sample_rollouts(make, replace(rollouts, densities=[density]), count - 1, generator, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
-        raise RequestError(f"no two keys have {_format_span(rolling)} between them, which leaves nothing to vary")
-    each = tuple(Variation(one, score(one.motion, one.contacts, density, settings.refinement, rig)) for one in found)
+        raise RequestError(f"no two keys have {rollouts.settings.span} between them, which leaves nothing to vary")
+    each = tuple(_score_variation(one, density, refinement) for one in found)
     return Variations(each, measure_diversity([one.motion for one in found]))
 
 
 def lowest_energy(
-    motion: Motion,
-    keys: Keys,
-    infiller: Inbetweener,
+    make: Tweening,
+    rollouts: Rollouts,
     count: int,
     *,
-    rollout_densities: Sequence[Density],
     generator: torch.Generator,
-    settings: InfillSettings | None = None,
-    rolling: RolloutSettings | None = None,
-    densities: Sequence[Density] = (),
-    rig: Rig | None = None,
+    refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
-) -> InfillResult:
-    """The one with the least energy of so many finished answers: from the infiller's proposal, from slerp's, and from
-    rollouts; its notes tell all energies. RequestError for fewer than two, and as `tween`.
+) -> InbetweenSolution:
+    """Make so many answers and keep the one with the least energy: of the rollouts' fallback, of slerp, and of draws;
+    its status tells all energies. RequestError for fewer than two.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"the best is of 2 to {MAX_VARIATIONS}, got {count}")
-    settings, rolling = settings or InfillSettings(), rolling or RolloutSettings()
-    make = partial(tween, motion, keys, infiller, settings=settings, densities=densities, rig=rig)
-    found = [_make_first(motion, make), make(another=_propose_interpolation)]
-    density = select_likeliest_density(rollout_densities, to_canonical(found[0].motion, rig)[0])
-    found += _sample_rollouts(make, count - 2, density, generator, rolling, progress)
-    nats = [Variation(one, score(one.motion, one.contacts, density, settings.refinement, rig)).energy for one in found]
+    found = [_make_first(make, Auto(rollouts.fallback), generator), make(Slerp(), generator)]
+    density = _select_density(rollouts, found[0])
+    found += _sample_rollouts(make, replace(rollouts, densities=[density]), count - 2, generator, progress)
+    nats = [_score_variation(one, density, refinement).energy for one in found]
     names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
-    best, told = (
-        min(range(count), key=nats.__getitem__),
-        ", ".join(f"{name} {one:.1f}" for name, one in zip(names, nats, strict=True)),
-    )
-    note = f"the best of {count} is from the {names[best]}; nats a frame: {told}"
-    seconds = sum(one.seconds for one in found)
-    return replace(found[best], seconds=seconds, notes=(*found[best].notes, note))
+    best = found[index := min(range(count), key=nats.__getitem__)]
+    energies = ", ".join(f"{name} {one:.1f}" for name, one in zip(names, nats, strict=True))
+    note = f"the best of {count} is from the {names[index]}; nats a frame: {energies}"
+    return replace(best, seconds=sum(one.seconds for one in found), status=best.status.with_notes([note]))
 
 
-def _make_first(motion: Motion, make: Callable[..., InfillResult]) -> InfillResult:
-    """The infiller's answer; RequestError for motions too short for an energy."""
-    if motion.num_frames < _MIN_FRAMES * motion.fps / PRIOR_FPS:
-        raise RequestError(f"a motion of {motion.num_frames} frames leaves nothing to vary")
-    return make()
+def _make_first(make: Tweening, first: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
+    """Make the first answer; RequestError for motions too short for an energy."""
+    made = make(first, generator)
+    if made.motion.num_frames < _MIN_FRAMES * made.motion.fps / PRIOR_FPS:
+        raise RequestError(f"a motion of {made.motion.num_frames} frames leaves nothing to vary")
+    return made
+
+
+def _select_density(rollouts: Rollouts, made: InbetweenSolution) -> Density:
+    return select_likeliest_density(rollouts.densities, to_canonical(made.motion, made.rig)[0])
+
+
+def _score_variation(made: InbetweenSolution, density: Density, refinement: RefinementSettings) -> Variation:
+    return Variation(made, score(made.motion, made.contacts, density, refinement, made.rig))
 
 
 def _sample_rollouts(
-    make: Callable[..., InfillResult],
+    make: Tweening,
+    rollouts: Rollouts,
     count: int,
-    density: Density,
     generator: torch.Generator,
-    rolling: RolloutSettings,
     progress: Callable[[int, int], None] | None,
-) -> list[InfillResult]:
-    """Answers of a density, each of a seed of its own."""
+) -> Sequence[InbetweenSolution]:
+    """Make answers of a density, each of a seed of its own: the first ones are the same however many there are."""
     found = []
-    for number, seed in enumerate(_sample_seeds(count, generator)):
+    for number in range(count):
         if progress is not None:
             progress(number, count)
-        draws = torch.Generator().manual_seed(seed)
-        found.append(make(another=partial(roll_through_gaps, densities=[density], generator=draws, settings=rolling)))
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        found.append(make(rollouts, torch.Generator().manual_seed(seed)))
     return found
-
-
-def _propose_interpolation(
-    gap: CanonicalGap, proposal: Motion, odds: Float[Tensor, "frames 2"], targets: EffectorTargets | None
-) -> Proposal:
-    """Slerp's proposal, with the infiller's contacts."""
-    return Proposal(gap.motion, odds)
-
-
-def _sample_seeds(count: int, generator: torch.Generator) -> Iterator[int]:
-    """One for each, the first ones the same however many there are."""
-    return (int(torch.randint(2**62, (1,), generator=generator)) for _ in range(count))
-
-
-def _format_span(rolling: RolloutSettings) -> str:
-    return f"{(rolling.shortest + 1) / PRIOR_FPS:.2g} to {(rolling.longest + 1) / PRIOR_FPS:.2g} s"

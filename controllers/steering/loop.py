@@ -206,7 +206,9 @@ def iterate_steps(
             display.show(new, due)
         yield (
             state,
-            StepRecord(new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, new.note, held),
+            StepRecord(
+                new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, "; ".join(new.notes), held
+            ),
         )
 
 

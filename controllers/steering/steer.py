@@ -19,12 +19,11 @@ from controllers.common.initial_state import start_from_state
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
-from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.problem.context import WindowContext
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
-from mapctl.problem.solution import Outcome
+from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.problem.warm_start import BestOfSamples, SteeringKnots
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
 from mapctl.protocols import Density
@@ -103,28 +102,23 @@ class SteerState:
     """Wanted velocities of the last delivered frames, oldest first, m/s in the prior's size."""
     frames: int = 1
     """Delivered so far, the first pose among them."""
+    terms: tuple[Term, ...] = ()
+    """The caller's own, for the prior's size."""
 
 
-@dataclass(frozen=True, eq=False)
-class SteerFrames:
-    """What a step delivers."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SteerFrames(Solution):
+    """The new frames of a step, at PRIOR_FPS, where they are in the world; the status says why less was searched than
+    the settings allow, if so."""
 
-    motion: Motion
-    """The new frames, at PRIOR_FPS, where they are in the world."""
     contacts: Float[Tensor, "frames 2"]
     """Left and right toe planted, 1 or 0."""
     steering_targets: tuple[SteeringTarget, ...]
     """Of those frames."""
     forecast: Float[Tensor, "ahead joints 3"]
     """World joint positions of the frames that would come next, metres; what the next command changes."""
-    ledger: Ledger
-    """By term, of the new frames."""
     evaluations: int = 0
-    """Spent."""
-    seconds: float = 0.0
-    """Of processor and waiting, by the wall."""
-    note: str = ""
-    """Why less was searched than the settings allow, if so."""
+    """Energy-and-gradient evaluations of the step."""
 
 
 def begin(
@@ -135,13 +129,15 @@ def begin(
     at: tuple[float, float] = (0.0, 0.0),
     settings: SteerSettings | None = None,
     skeleton: Skeleton = CANONICAL,
+    terms: Sequence[Term] = (),
 ) -> tuple[SteerState, SteerFrames]:
-    """A character at x and z (metres) that faces along the command, and its first pose.
+    """Place a character at x and z (metres) that faces along the command, and return its first pose.
 
-    It is one of the prior's starts near the wanted speed and of the labels it is told, drawn by the generator: the
-    data's slowest for a command to stand.
-    On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
-    `settings.footing`; commands, limits and what is delivered are in its metres.
+    It is one of the prior's starts near the wanted speed and of the command's labels, drawn by the generator: the
+    data's slowest for a command to stand. `terms` are the caller's own, the same in every step; they see the character
+    at its own size and the time since the first pose. On another `skeleton` (canonical names) strides are as long as
+    its legs, and the toes' rest height is that of `settings.footing`; commands, limits and what is delivered are in its
+    metres.
     """
     chosen = settings or SteerSettings()
     person = Character(skeleton, chosen.footing.rest_height)
@@ -151,14 +147,20 @@ def begin(
     pick = int(near[torch.randint(len(near), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
     there = torch.tensor(at) if person.scale == 1.0 else torch.tensor(at) / person.scale
-    start = start_from_state(state, GroundPose(there, torch.tensor(command.heading)), person.small)
+    start = start_from_state(state, GroundPose(there, torch.tensor(command.heading)), person.unit_skeleton)
     first = start.committed.features
-    motion = person.motion(decode(first, start.before_first, skeleton=person.small))
+    motion = person.motion(decode(first, start.before_first, skeleton=person.unit_skeleton))
     wish = SteeringTarget(float(ground_speed(first)[0]), command.heading, command.heading)
-    delivered = (_scale_target_to_character(wish, person),)
-    frames = SteerFrames(motion, LAYOUT.pick(first, "contacts"), delivered, start.committed.joints_world[:0], Ledger())
-    settings = chosen.scaled_to(person)
-    return SteerState(prior, settings, person, start.committed, wish, torch.tensor([wish.velocity])), frames
+    frames = SteerFrames(
+        motion,
+        Status(Outcome.DONE),
+        Ledger(),
+        contacts=LAYOUT.pick(first, "contacts"),
+        steering_targets=(_scale_target_to_character(wish, person),),
+        forecast=start.committed.joints_world[:0],
+    )
+    past, own = torch.tensor([wish.velocity]), tuple(person.term(term) for term in terms)
+    return SteerState(prior, chosen.scaled_to(person), person, start.committed, wish, past, terms=own), frames
 
 
 def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
@@ -185,7 +187,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         state = _restart_target(state)
     wishes = state.wish.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     told = replace(state, prior=_condition_prior(state.prior, command.told)) if command.told else state
-    terms = _build_steering_terms(state, wishes, command.step_length)
+    terms = (*_build_steering_terms(state, wishes, command.step_length), *state.terms)
     done, outcome = _solve_step(told, terms, seconds, free=stuck)
     if outcome is not Outcome.DONE:
         unsearched = replace(settings, least_evaluations=0)
@@ -196,22 +198,24 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         )
         done, _ = _solve_step(afresh, terms, 0.0, free=False)  # the prior's own continuation: never nothing
     new = done.features[-settings.commit :]
-    motion = person.motion(decode(new, state.committed.place, skeleton=person.small))
+    motion = person.motion(decode(new, state.committed.place, skeleton=person.unit_skeleton))
     record, own = done.windows[-1], tuple(wishes[: settings.commit])
     short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
-    note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations" if short else ""
+    note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
+    status = Status(Outcome.BUDGET, (note,)) if short else Status(Outcome.DONE)
     forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
     forecast = forecast if person.scale == 1.0 else forecast * person.scale
-    delivered = tuple(_scale_target_to_character(wish, person) for wish in own)
     frames = SteerFrames(
         motion,
-        LAYOUT.pick(new, "contacts"),
-        delivered,
-        forecast,
+        status,
         person.ledger(done.ledger),
-        record.evaluations,
+        done.windows,
+        new,
         time.perf_counter() - began,
-        note,
+        contacts=LAYOUT.pick(new, "contacts"),
+        steering_targets=tuple(_scale_target_to_character(wish, person) for wish in own),
+        forecast=forecast,
+        evaluations=record.evaluations,
     )
     owed = torch.cat([state.past_targets, torch.tensor([wish.velocity for wish in own])])[-_PAST_TARGET_FRAMES:]
     kept = done.discard_history(len(new))
@@ -237,7 +241,7 @@ def _solve_step(
     if free:
         method = _relax_footing_first(state, terms, seconds)
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
-    solver = RecedingHorizonSolver(state.prior, window, state.person.small, method=method)
+    solver = RecedingHorizonSolver(state.prior, window, state.person.unit_skeleton, method=method)
     frames = len(state.committed.features) + settings.commit
     return solver.solve(
         state.committed, lambda first, count: terms, frames, generator=torch.Generator().manual_seed(state.frames)

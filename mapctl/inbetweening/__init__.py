@@ -1,5 +1,6 @@
-"""Gaps in a motion: what is known of it, and an in-betweener's input and proposal."""
+"""Gaps in a motion: what is missing, what is asked of an in-betweener, and what it proposes."""
 
 from mapctl.inbetweening.position_image import PositionImage, ProposedPositions
+from mapctl.inbetweening.query import GapQuery, Proposal
 
-__all__ = ["PositionImage", "ProposedPositions"]
+__all__ = ["GapQuery", "PositionImage", "Proposal", "ProposedPositions"]

@@ -1,5 +1,6 @@
 """The ledger of a solve: energy and physical residual by term and frame."""
 
+import builtins
 from dataclasses import dataclass, replace
 
 import torch
@@ -37,7 +38,11 @@ class Ledger:
 
     def slice(self, frames: int) -> "Ledger":
         """The first frames."""
-        return Ledger(tuple(replace(e, energy=e.energy[:frames], residual=e.residual[:frames]) for e in self.entries))
+        return self.pick(builtins.slice(frames))
+
+    def pick(self, frames: builtins.slice) -> "Ledger":
+        """Return the ledger of some frames."""
+        return Ledger(tuple(replace(e, energy=e.energy[frames], residual=e.residual[frames]) for e in self.entries))
 
     def summary(self) -> dict[str, dict[str, float | str]]:
         """For a report: by term the total energy, and mean, 95th percentile and maximum of the residual."""

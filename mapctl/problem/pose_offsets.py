@@ -77,7 +77,7 @@ class PoseOffsetSolver:
     """
 
     proposal: BodyPose
-    """The whole motion, unbatched."""
+    """The proposed motion, unbatched."""
     contacts: Bool[Tensor, "frames 2"]
     """Left and right toe planted in it."""
     sigma: Float[Tensor, "frames width"]
@@ -90,6 +90,8 @@ class PoseOffsetSolver:
     """L-BFGS of one window."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=20))
     """Budget of one window."""
+    first_frame: int = 0
+    """Frame of the whole motion that the proposal begins at."""
 
     def __call__(
         self,
@@ -101,7 +103,8 @@ class PoseOffsetSolver:
         seconds: float = math.inf,
     ) -> SolvedWindow:
         """Solve one window; it stays as it was proposed where nothing finite was found."""
-        first, stop = context.first_frame, context.first_frame + context.frames
+        first = context.first_frame - self.first_frame
+        stop = first + context.frames
         proposal, contacts = self.proposal.slice(first, stop), self.contacts[first:stop]
         choice = None
         if isinstance(context.density, DensityEnsemble) and context.density.densities:

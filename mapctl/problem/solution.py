@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -19,6 +20,7 @@ class Outcome(Enum):
     BUDGET = "stopped at its budget"
     INTERRUPTED = "interrupted; what was solved until then is kept"
     INFEASIBLE = "the wishes cannot all hold"
+    OUT_OF_DEPTH = "outside what the model knows"
     NOT_FINITE = "stopped where the energy was not finite; the best finite motion is returned"
 
 
@@ -81,3 +83,14 @@ class Solution:
     """Cost of each window."""
     features: Float[Tensor, "frames size"] | None = field(default=None, repr=False)
     """The motion as the prior's features."""
+    seconds: float = 0.0
+    """Compute, wall clock."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know, one sentence each."""
+        return self.status.notes
+
+    def details(self) -> dict[str, Any]:
+        """Return what a report shows of this job beyond motion, status, ledger and timing, in plain numbers."""
+        return {}

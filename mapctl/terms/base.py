@@ -1,5 +1,7 @@
 """What a term is: an energy for every frame of every candidate, and what it measures in physical units."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
@@ -29,3 +31,33 @@ class Term(Protocol):
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """How far the wish is missed, in the term's unit."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class ViewedTerm:
+    """A term that is shown another view of each trial: at another size, or elsewhere."""
+
+    term: Term
+    """The term."""
+    view: Callable[[Trial], Trial]
+    """The view of a trial, differentiable in its features."""
+    residual_scale: float = 1.0
+    """Factor from the residual in that view to the one that the ledger takes."""
+
+    @property
+    def name(self) -> str:
+        """Name of the term."""
+        return self.term.name
+
+    @property
+    def unit(self) -> str:
+        """Unit of the residual."""
+        return self.term.unit
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Compute the term's energies of the view, nats."""
+        return self.term(self.view(trial))
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Compute the term's residual of the view, times `residual_scale`."""
+        return self.residual_scale * self.term.residual(self.view(trial))

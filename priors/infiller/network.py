@@ -10,6 +10,7 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.inbetweening.position_image import mirror_positions
+from mapctl.protocols import PositionInfiller
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
@@ -106,8 +107,8 @@ def _count_frames_since(known: Tensor) -> Float[Tensor, "batch frames"]:
 
 
 @dataclass(frozen=True, eq=False)
-class ConvInfiller:
-    """A trained infiller (see mapctl.protocols.Inbetweener)."""
+class ConvInfiller(PositionInfiller):
+    """A trained infiller."""
 
     name: str
     """Name under which it was loaded."""
@@ -117,7 +118,7 @@ class ConvInfiller:
     """Card of the weights."""
 
     @torch.no_grad()
-    def propose(self, image: PositionImage) -> ProposedPositions:
+    def complete(self, image: PositionImage) -> ProposedPositions:
         """Propose the whole motion, of any length: the mean of the outputs for it and for its mirror image."""
         one, other = self.network(image), self.network(image.mirrored())
         places = (one.places + mirror_positions(other.places)) / 2

@@ -100,7 +100,7 @@ class Keeping:
     def __init__(self):
         self.images = []
 
-    def propose(self, image):
+    def complete(self, image):
         """As it was shown."""
         self.images.append(image)
         return ProposedPositions(image.places, torch.zeros_like(image.contacts))

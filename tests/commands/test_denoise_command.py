@@ -58,7 +58,7 @@ def test_report_mask_and_sigmas(denoise, recording, tmp_path):
     told = json.loads(report.read_text())
     assert told["request"]["command"] == "denoise"
     assert told["request"]["sigma_deg"] == 4
-    assert {"faults", "correction_cm", "contacts", "ledger", "fallback", "measures", "versions", "notes"} <= set(told)
+    assert {"faults", "correction_cm", "contacts", "ledger", "fallback", "measures", "versions", "status"} <= set(told)
     lost = {(f["joint"], f["start"], f["stop"]) for f in told["faults"] if f["kind"] == "dropout"}
     assert {("Hand_L", 10, 14), ("Hand_L", 30, 31), ("Hips", 30, 31)} <= lost
 

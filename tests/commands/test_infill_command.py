@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from captures import on_rig
 from helpers import run
+from methods import words_of
 from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
 
@@ -37,7 +38,7 @@ def recording(tmp_path_factory):
 @pytest.fixture
 def infill(tiny):
     """Runs the command, with the tiny network where the method asks one; returns the exit status."""
-    return lambda *words: run("infill", *words, *([] if "linear" in words else ["--infiller", tiny]))
+    return lambda *words: run("infill", *words, *([] if "slerp" in words else ["--infiller", tiny]))
 
 
 def rows(path):
@@ -63,33 +64,33 @@ def spoilt(source, out, *gaps):
         ("bandai", 120, "infiller"),
         ("canonical", 30, "infiller"),
         ("daz", 120, "infiller"),
-        ("daz", 30, "linear"),
-        ("bandai", 30, "map"),
+        ("daz", 30, "slerp"),
+        ("bandai", 30, "auto"),
     ],
 )
 def test_outside_the_gap_every_channel_is_as_it_was(infill, recording, tmp_path, rig, fps, method):
     """In the text of the file, also where what is filled in turns about."""
     source, out = recording(rig, fps), tmp_path / "out.bvh"
-    assert infill(source, "-o", out, "--gap", f"{fps // 2}:{fps}", "--method", method, "--quiet") == 0
+    assert infill(source, "-o", out, "--gap", f"{fps // 2}:{fps}", *words_of(method), "--quiet") == 0
     before, after = rows(source), rows(out)
     same = [one == other for one, other in zip(before, after, strict=True)]
     assert same == [not fps // 2 <= frame < fps for frame in range(len(before))]
 
 
-@pytest.mark.parametrize(("rig", "method"), [("bandai", "map"), ("bandai", "linear"), ("daz", "infiller")])
+@pytest.mark.parametrize(("rig", "method"), [("bandai", "auto"), ("bandai", "slerp"), ("daz", "infiller")])
 def test_what_stands_in_the_gap_does_not_matter(infill, recording, tmp_path, rig, method):
     found, gaps = set(), ((10, 15), (22, 30))
     wild = spoilt(recording(rig), tmp_path / "wild.bvh", *gaps)
     words = [word for gap in gaps for word in ("--gap", "{}:{}".format(*gap))]
     for source in (recording(rig), wild):
-        assert infill(source, "-o", tmp_path / "out.bvh", *words, "--method", method, "--quiet") == 0
+        assert infill(source, "-o", tmp_path / "out.bvh", *words, *words_of(method), "--quiet") == 0
         found.add((tmp_path / "out.bvh").read_bytes())
     assert len(found) == 1
 
 
 def test_several_gaps_in_frames_and_seconds_are_told(infill, recording, tmp_path, capsys):
     out = tmp_path / "out.npz"
-    assert infill(recording(), "-o", out, "--gap", "1s:1.2s", "--gap", "10:15", "--method", "infiller") == 0
+    assert infill(recording(), "-o", out, "--gap", "1s:1.2s", "--gap", "10:15", *words_of("infiller")) == 0
     told = capsys.readouterr()
     assert f"{out}: 45 frames at 30 a second; filled 10:15 (22 joints), 30:36 (22 joints);" in told.out
     assert told.err == ""
@@ -100,7 +101,7 @@ def test_several_gaps_in_frames_and_seconds_are_told(infill, recording, tmp_path
 @pytest.mark.parametrize("gap", [(), ("--gap", "20:30")])
 def test_lost_joints_with_and_without_gaps(infill, recording, tmp_path, rig, gap):
     source, out, report = recording(rig), tmp_path / "out.bvh", tmp_path / "r.json"
-    words = ["--joints", NAMES[rig], *gap, "--method", "infiller", "--report", report, "--quiet"]
+    words = ["--joints", NAMES[rig], *gap, *words_of("infiller"), "--report", report, "--quiet"]
     assert infill(source, "-o", out, *words) == 0
     (found,) = json.loads(report.read_text())["gaps"]
     assert (found["start"], found["stop"]) == ((20, 30) if gap else (0, 45))
@@ -113,7 +114,7 @@ def test_lost_joints_with_and_without_gaps(infill, recording, tmp_path, rig, gap
 
 
 def test_gaps_at_the_ends_are_said(infill, recording, tmp_path, capsys):
-    words = ["--gap", "0:5", "--gap", "40:45", "--method", "infiller"]
+    words = ["--gap", "0:5", "--gap", "40:45", *words_of("infiller")]
     assert infill(recording(), "-o", tmp_path / "out.bvh", *words) == 0
     told = capsys.readouterr().out
     assert "a gap at the beginning: the motion is extended backwards" in told
@@ -126,9 +127,9 @@ def test_a_report_tells_the_request_and_what_was_done(infill, recording, tmp_pat
     assert infill(recording(), "-o", tmp_path / "out.bvh", *words, "--quiet") == 0
     told = json.loads(report.read_text())
     assert told["request"]["command"] == "infill"
-    assert (told["request"]["gap"], told["request"]["method"]) == (["20:30"], "map")
+    assert (told["request"]["gap"], told["request"]["method"]) == (["20:30"], "auto")
     assert told["gaps"] == [{"start": 20, "stop": 30, "joints": 22, "root": True}]
-    assert {"mapctl", "versions", "frames", "fps", "ledger", "seconds", "frame_ms", "notes", "measures"} <= set(told)
+    assert {"mapctl", "versions", "motion", "ledger", "seconds", "frame_ms", "status", "measures"} <= set(told)
     assert {"footing", "likelihood"} <= set(told["ledger"])
 
 
@@ -136,7 +137,7 @@ def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):
     lines = recording().read_text().splitlines()
     lines[-25:-15] = [lines[-26]] * 10
     (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
-    assert infill(tmp_path / "frozen.bvh", "-o", tmp_path / "out.bvh", "--method", "infiller") == 0
+    assert infill(tmp_path / "frozen.bvh", "-o", tmp_path / "out.bvh", *words_of("infiller")) == 0
     assert "filled 20:30 (22 joints);" in capsys.readouterr().out
 
 
@@ -173,9 +174,15 @@ def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):
         (["in.bvh", "-o", ".", "--gap", "5:9"], "unknown ending"),
         (["in.bvh", "-o", "folder.bvh", "--gap", "5:9"], "it is a folder"),
         (["folder.bvh", "-o", "a.bvh", "--gap", "5:9"], "is a folder, expected a file"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "infiller", "--prior", "general"], "leave --prior out"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear", "--prior", "general"], "leave --prior out"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear", "--curve", "line:4"], "--curve needs"),
+        (
+            ["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "infiller", "--no-finish", "--prior", "general"],
+            "leave --prior out",
+        ),
+        (
+            ["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "slerp", "--no-finish", "--prior", "general"],
+            "leave --prior out",
+        ),
+        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "slerp", "--curve", "line:4"], "--curve needs"),
         (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L", "--curve", "line:4"], "a curve leads the hips where"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -188,7 +195,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, rec
 
 
 def test_a_network_that_the_method_knows_none_of_is_refused(recording, tmp_path, capsys):
-    words = ["infill", recording(), "-o", tmp_path / "a.bvh", "--gap", "5:9", "--method", "linear"]
+    words = ["infill", recording(), "-o", tmp_path / "a.bvh", "--gap", "5:9", "--method", "slerp"]
     assert run(*words, "--infiller", "infiller") == 2
-    assert capsys.readouterr().err == "mapctl: --method linear knows no network; leave --infiller out\n"
+    assert capsys.readouterr().err == "mapctl: --method slerp knows no network; leave --infiller out\n"
     assert not (tmp_path / "a.bvh").exists()

@@ -7,6 +7,7 @@ import pytest
 from captures import on_rig
 from helpers import run
 from lossy_files import archive_without, with_all_channels, without
+from methods import words_of
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
 
@@ -26,8 +27,8 @@ def infilled(tiny, tmp_path):
     """Runs the command, which must do; returns the text of what it writes."""
 
     def made(source, *words, method="infiller"):
-        asked = () if method == "linear" else ("--infiller", tiny)
-        assert run("infill", source, "-o", tmp_path / "out.bvh", *words, "--method", method, *asked, "--quiet") == 0
+        asked = () if method == "slerp" else ("--infiller", tiny)
+        assert run("infill", source, "-o", tmp_path / "out.bvh", *words, *words_of(method), *asked, "--quiet") == 0
         return (tmp_path / "out.bvh").read_text()
 
     return made
@@ -50,11 +51,11 @@ def clip(tmp_path):
 @pytest.mark.parametrize(
     ("rig", "fps", "seed", "method"),
     [
-        ("canonical", 30, None, "linear"),
-        ("bandai", 30, 1, "map"),
+        ("canonical", 30, None, "slerp"),
+        ("bandai", 30, 1, "auto"),
         ("bandai", 120, None, "infiller"),
         ("daz", 30, 2, "infiller"),
-        ("daz", 60, 3, "linear"),
+        ("daz", 60, 3, "slerp"),
     ],
 )
 def test_frames_of_nan_are_gaps(infilled, clip, tmp_path, rig, fps, seed, method):
@@ -109,7 +110,7 @@ def test_where_something_is_nan_nothing_else_is_looked_for(tiny, clip, tmp_path)
     lines[-25:-15] = [lines[-26]] * 10
     (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
     lossy = without(tmp_path / "frozen.bvh", tmp_path / "lossy.bvh", [("", 5, 9)])
-    words = ["--method", "infiller", "--infiller", tiny, "--report", tmp_path / "r.json", "--quiet"]
+    words = [*words_of("infiller"), "--infiller", tiny, "--report", tmp_path / "r.json", "--quiet"]
     assert run("infill", lossy, "-o", tmp_path / "out.bvh", *words) == 0
     (gap,) = json.loads((tmp_path / "r.json").read_text())["gaps"]
     assert (gap["start"], gap["stop"]) == (5, 9)

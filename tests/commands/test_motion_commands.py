@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from captures import on_rig
 from helpers import run, walk
+from methods import words_of
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
@@ -13,7 +14,7 @@ from tiny_prior import save_tiny_prior
 import mapctl
 
 WORDS = {"denoise": [], "infill": ["--gap", "5:9"], "tween": ["--keyframes", "0,5,11"]}
-PLAIN = {"infill": [*WORDS["infill"], "--method", "linear"], "tween": [*WORDS["tween"], "--method", "slerp"]}
+PLAIN = {"infill": [*WORDS["infill"], *words_of("slerp")], "tween": [*WORDS["tween"], *words_of("slerp")]}
 """Without a network."""
 NETWORK = {"denoise": "--denoiser", "infill": "--infiller", "tween": "--infiller"}
 COMMANDS = sorted(WORDS)

@@ -201,7 +201,7 @@ def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
 
 def test_the_canonical_body_is_not_scaled_at_all():
     assert Character().scale == 1.0
-    assert Character().small is CANONICAL
+    assert Character().unit_skeleton is CANONICAL
     curve, command = curves.circle(radius=2.0), Command(1.0, 0.0)
     assert Character().curve(curve) is curve
     assert Character().command(command) is command

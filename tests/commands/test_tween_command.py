@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from captures import on_rig
 from helpers import run
+from methods import words_of
 from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
 
@@ -39,10 +40,10 @@ def away_cm(source, out, frames):
     return 100 * float((first - second).norm(dim=-1).max())
 
 
-@pytest.mark.parametrize("method", ["map", "infiller", "slerp"])
+@pytest.mark.parametrize("method", ["auto", "infiller", "slerp"])
 def test_keys_are_met_in_the_file(tween, source, tmp_path, method):
     out = tmp_path / "out.bvh"
-    assert tween(source, "-o", out, "--keyframes", "0,17,30,44", "--method", method, "--quiet") == 0
+    assert tween(source, "-o", out, "--keyframes", "0,17,30,44", *words_of(method), "--quiet") == 0
     assert mapctl.load(out).num_frames == FRAMES
     assert away_cm(source, out, (0, 17, 30, 44)) < 1e-4
     assert away_cm(source, out, range(FRAMES)) > 1
@@ -51,7 +52,7 @@ def test_keys_are_met_in_the_file(tween, source, tmp_path, method):
 def test_keys_may_be_seconds(tween, source, tmp_path):
     found = set()
     for keys in ("0,15,30,44", "0s,0.5s, 1s ,44", "44,30,0,15"):
-        words = ["--keyframes", keys, "--method", "infiller", "--quiet"]
+        words = ["--keyframes", keys, *words_of("infiller"), "--quiet"]
         assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
         found.add((tmp_path / "out.bvh").read_bytes())
     assert len(found) == 1
@@ -62,7 +63,7 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     (hips,) = motion.moving_offsets
     motion.moving_offsets[hips][21:, 0] += 2.0
     motion.save(tmp_path / "leaping.bvh")
-    words = ["--keyframes", "0,20,21,44", "--method", "infiller"]
+    words = ["--keyframes", "0,20,21,44", *words_of("infiller")]
     assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words) == 0
     told = capsys.readouterr()
     first, note = told.out.splitlines()
@@ -77,7 +78,7 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
 )
 def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_path, words, what):
     report = tmp_path / "r.json"
-    words = [*words, "--keyframes", "0,16,33,44", "--method", "infiller", "--report", report, "--quiet"]
+    words = [*words, "--keyframes", "0,16,33,44", *words_of("infiller"), "--report", report, "--quiet"]
     assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
     told = json.loads(report.read_text())
     assert [(row["frame"], row["what"]) for row in told["keys"]] == [(0, "pose"), (16, what), (33, what), (44, "pose")]
@@ -85,7 +86,7 @@ def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_pa
     assert all(row.get("missed_deg", 0) < 1e-4 for row in told["keys"])
     assert told["request"]["command"] == "tween"
     assert (told["request"]["keyframes"], told["request"]["method"]) == ("0,16,33,44", "infiller")
-    assert {"mapctl", "versions", "frames", "fps", "gaps", "ledger", "seconds", "frame_ms", "notes"} <= set(told)
+    assert {"mapctl", "versions", "motion", "gaps", "ledger", "seconds", "frame_ms", "status"} <= set(told)
     assert "skate_cm_s" in told["measures"]
 
 
@@ -112,9 +113,12 @@ def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_pat
         (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "best"], "--method"),
         (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L"], "--joints is about keys between"),
         (["in.bvh", "-o", "a.bvh", "--keyframes", "9,0,9", "--root-only"], "--root-only is about keys between"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--prior", "x"], "leave --prior out"),
         (
-            ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--prior", "general"],
+            ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--no-finish", "--prior", "x"],
+            "leave --prior out",
+        ),
+        (
+            ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--no-finish", "--prior", "general"],
             "leave --prior out",
         ),
         (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from captures import on_rig
 from helpers import run, walk
+from methods import words_of
 from tiny_infiller import save_tiny_infiller
 
 import mapctl
@@ -81,9 +82,9 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
 
 def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     keys = folder / "keys" / "keys.toml"
-    assert run("tween", keys, "-o", "plain.bvh", "--method", "slerp") == 0
+    assert run("tween", keys, "-o", "plain.bvh", *words_of("slerp")) == 0
     capsys.readouterr()
-    words = ["--method", "slerp", "--suggest-timing", "--report", "r.json"]
+    words = [*words_of("slerp"), "--suggest-timing", "--report", "r.json"]
     assert run("tween", keys, "-o", "out.bvh", *words) == 0
     assert Path("out.bvh").read_bytes() == Path("plain.bvh").read_bytes()
     (row,) = json.loads(Path("r.json").read_text())["timing"]
@@ -95,7 +96,7 @@ def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
 
 
 def test_timing_is_suggested_for_frames_of_a_clip_too(folder, capsys):
-    words = ["-o", "out.bvh", "--keyframes", "0,3,44", "--method", "slerp", "--suggest-timing"]
+    words = ["-o", "out.bvh", "--keyframes", "0,3,44", *words_of("slerp"), "--suggest-timing"]
     assert run("tween", folder / "keys" / "walk.bvh", *words) == 0
     assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()[-3:] if line.strip()] == [
         ["0", "3", "3"],

@@ -6,11 +6,11 @@ from fractions import Fraction
 import pytest
 import torch
 from helpers import run, walk
+from methods import UNFINISHED
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening import blend as blending
 from controllers.inbetweening.blend import LimbTransfer, blend
-from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.metrics import worst_frame
@@ -57,7 +57,7 @@ def test_frames_are_the_other_clips_own(own, other, asked):
     start, stop = round(0.5 * other), round(1.0 * other)
     still = replace(waving(own), local_quat_xyzw=waving(own).local_quat_xyzw[:1].expand(4 * own, -1, -1))
     with pytest.raises(Asked):
-        blend(still, waving(other), LimbTransfer(("lefthand",), start, stop, 2 * own), None)
+        blend(still, waving(other), LimbTransfer(("lefthand",), start, stop, 2 * own), tiny_infiller())
     assert asked["frames"].tolist() == list(range(2 * own, 2 * own + round(0.5 * own)))
     wanted = 0.5 + torch.arange(len(asked["frames"]), dtype=torch.float64) / own
     torch.testing.assert_close(asked["seconds"], wanted, atol=1e-3, rtol=0)
@@ -109,7 +109,7 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
         source,
         LimbTransfer(("leftHand",), 8, 28, 70 * fps // 30, margin=margin),
         tiny_infiller(),
-        settings=InfillSettings(method="infiller"),
+        settings=UNFINISHED,
     )
     own, theirs, made = peaks_of(motion), peaks_of(source), peaks_of(done.motion)
     assert made.step < max(1.3 * max(own.step, theirs.step), 0.17)
@@ -120,11 +120,7 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
 def test_a_limb_that_is_hurried_is_named_with_numbers_and_bends_as_it_did():
     motion, source = walk(120), waving(30)
     done = blend(
-        motion,
-        source,
-        LimbTransfer(("leftHand",), 8, 28, 70, margin=0.1),
-        tiny_infiller(),
-        settings=InfillSettings(method="infiller"),
+        motion, source, LimbTransfer(("leftHand",), 8, 28, 70, margin=0.1), tiny_infiller(), settings=UNFINISHED
     )
     assert any(
         "leftHand goes " in note and "80 is the most that is common: a margin of " in note for note in done.notes

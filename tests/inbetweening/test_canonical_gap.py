@@ -1,4 +1,4 @@
-"""What a motion lacks at the prior's rate: every key is shown with its own pose at its own time, or another one is."""
+"""The query of a clip with gaps at 30 fps: every key is shown with its own pose at its own time, or another one is."""
 
 from dataclasses import replace
 
@@ -7,14 +7,13 @@ import torch
 from captures import apart_deg, on_rig
 from helpers import walk
 
-from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.common.canonical_clip import CanonicalClip
 from mapctl import retarget
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL
 
 RATES = (10, 24, 25, 30, 50, 60, 120)
-EVERY = tuple(range(CANONICAL.num_joints))
 
 
 def keyed(motion, keys, *, hips=()):
@@ -28,12 +27,14 @@ def keyed(motion, keys, *, hips=()):
 
 
 def gap_of(motion, lost):
-    return CanonicalGap.of(motion, lost, EVERY)
+    """A canonical motion is shown as it is, whatever stands where it is lost."""
+    clip = CanonicalClip.of(motion, lost)
+    return replace(clip, canonical=motion).query()
 
 
 def known(gap):
     """Moments of which nothing is lost."""
-    return (~(gap.root | gap.turns.any(dim=1))).nonzero()[:, 0].tolist()
+    return (~gap.missing.frames).nonzero()[:, 0].tolist()
 
 
 @pytest.mark.parametrize("fps", RATES)
@@ -42,7 +43,7 @@ def test_times_rise_and_reach_the_end(fps, spare):
     motion = walk(fps + spare, fps=fps)
     gap = gap_of(motion, keyed(motion, (0, motion.num_frames - 1)))
     steps = torch.diff(gap.seconds)
-    assert len(gap.seconds) == gap.motion.num_frames == len(gap.turns) == len(gap.root)
+    assert len(gap.seconds) == gap.motion.num_frames == len(gap.missing.joints) == len(gap.missing.root)
     assert 0.4 / 30 < steps.min() <= steps.max() < 1.6 / 30
     assert gap.seconds[0] == 0
     assert gap.seconds[-1] * fps == pytest.approx(motion.num_frames - 1)
@@ -59,8 +60,8 @@ def test_a_key_at_any_frame_is_one_moment_with_its_own_pose_and_time(fps):
         assert gap.seconds[moment] * fps == pytest.approx(key)
         assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
         assert apart_deg(gap.motion.local_quat_xyzw[moment], motion.local_quat_xyzw[key]).max() < 1e-5
-        assert not gap.root[moment]
-        assert gap.compute_known_positions()[moment].all()
+        assert not gap.missing.root[moment]
+        assert gap.known_positions[moment].all()
 
 
 @pytest.mark.parametrize("fps", [24, 30, 120])
@@ -80,9 +81,9 @@ def test_a_frame_that_tells_the_hips_alone_is_shown_too(key):
     motion = walk(120, fps=120)
     gap = gap_of(motion, keyed(motion, (0, 119), hips=(key,)))
     (moment,) = ((gap.seconds * 120 - key).abs() < 1e-9).nonzero()[:, 0].tolist()
-    assert not gap.root[moment]
-    assert not gap.turns[moment, 0]
-    assert gap.turns[moment, 1:].all()
+    assert not gap.missing.root[moment]
+    assert not gap.missing.joints[moment, 0]
+    assert gap.missing.joints[moment, 1:].all()
     assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
 
 
@@ -107,16 +108,16 @@ def test_where_nothing_is_lost_it_is_the_motion_at_the_priors_rate(fps):
 @pytest.mark.parametrize("rig", ["canonical", "daz"])
 def test_joints_that_are_lost_throughout_are_lost_in_every_moment(rig, fps):
     motion = on_rig(rig, fps, fps=fps)
-    canonical, rigmap = retarget.to_canonical(motion)
+    _, rigmap = retarget.to_canonical(motion)
     hand = {"canonical": "leftHand", "daz": "lHand"}[rig]
     lost = MissingMask.of_masks(motion, [Mask(hand, 0, fps)], rigmap)
-    gap = CanonicalGap.of(canonical, lost, rigmap.joint_of)
+    gap = CanonicalClip.of(motion, lost).query()
     assert known(gap) == []
-    taken = {CANONICAL.names[joint] for joint in gap.turns.all(dim=0).nonzero()[:, 0].tolist()}
+    taken = {CANONICAL.names[joint] for joint in gap.missing.joints.all(dim=0).nonzero()[:, 0].tolist()}
     assert taken == {"leftHand", "leftLowerArm"}
-    assert gap.turns.any(dim=0).sum() == 2
-    assert not gap.root.any()
-    places = gap.compute_known_positions()
+    assert gap.missing.joints.any(dim=0).sum() == 2
+    assert not gap.missing.root.any()
+    places = gap.known_positions
     assert not places[:, CANONICAL.index("leftHand")].any()
     assert places[:, CANONICAL.index("rightHand")].all()
 
@@ -128,7 +129,7 @@ def test_the_edges_of_a_gap_are_shown_while_a_joint_is_lost_throughout():
     gap = gap_of(motion, lost)
     at = gap.seconds * 120
     inside = (at > 49.5) & (at < 69.5)
-    assert (gap.root == inside).all()
+    assert (gap.missing.root == inside).all()
     assert at[~inside].round().tolist()[12:14] == [48, 70]
 
 
@@ -136,10 +137,10 @@ def test_a_place_is_known_only_with_all_that_carries_it():
     motion = walk(30)
     _, rigmap = retarget.to_canonical(motion)
     gap = gap_of(motion, MissingMask.of_masks(motion, [Mask(ROOT, 5, 9)], rigmap))
-    assert not gap.compute_known_positions()[5:9].any()
-    assert gap.compute_known_positions()[9:].all()
+    assert not gap.known_positions[5:9].any()
+    assert gap.known_positions[9:].all()
     gap = gap_of(motion, MissingMask.of_masks(motion, [Mask("chest", 5, 9)], rigmap))
-    unknown = {CANONICAL.names[joint] for joint in (~gap.compute_known_positions()[6]).nonzero()[:, 0].tolist()}
+    unknown = {CANONICAL.names[joint] for joint in (~gap.known_positions[6]).nonzero()[:, 0].tolist()}
     assert {"head", "leftHand", "neck"} <= unknown
     assert not unknown & {"hips", "leftFoot", "rightToes"}
 

@@ -6,14 +6,16 @@ import pytest
 import torch
 from captures import error_cm, on_rig
 from helpers import random_motion, tiny_density
+from methods import UNFINISHED, by_method
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.infill import InfillSettings, infill
+from controllers.inbetweening.infill import infill
+from controllers.inbetweening.proposers import Slerp
 from mapctl import retarget
-from mapctl.errors import RequestError
 from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
 from mapctl.motion import Motion
+from mapctl.protocols import PositionInfiller
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, leg_length
 
@@ -23,7 +25,8 @@ CASES = [*((rig, 30) for rig in RIGS), ("daz", 120)]
 
 def filled(motion, *masks, method="infiller", drawn=0.2, infiller=None, **options):
     network = infiller if infiller is not None else tiny_infiller(drawn=drawn)
-    return infill(motion, network, masks, settings=InfillSettings(method=method), **options)
+    inbetweener, settings = by_method(method, network)
+    return infill(motion, inbetweener, masks, settings=settings, **options)
 
 
 def seconds(motion, *edges):
@@ -52,7 +55,7 @@ def same(first, second):
 
 
 @pytest.mark.parametrize(("rig", "fps"), CASES)
-@pytest.mark.parametrize("method", ["infiller", "linear"])
+@pytest.mark.parametrize("method", ["infiller", "slerp"])
 def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, fps, method):
     motion = on_rig(rig, 2 * fps, fps=fps)
     mask = seconds(motion, 0.7, 1.2)
@@ -66,12 +69,12 @@ def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, 
 def test_the_map_stage_keeps_what_is_known_too(rig):
     motion = on_rig(rig, 50)
     mask = Mask(ALL, 20, 32)
-    done = filled(motion, mask, method="map")
+    done = filled(motion, mask, method="auto")
     assert_known_stays(motion, done.motion, [mask])
     assert "footing" in done.ledger.summary()
 
 
-@pytest.mark.parametrize(("rig", "method"), [*((rig, "infiller") for rig in RIGS), ("daz", "map"), ("daz", "linear")])
+@pytest.mark.parametrize(("rig", "method"), [*((rig, "infiller") for rig in RIGS), ("daz", "auto"), ("daz", "slerp")])
 def test_what_stands_in_the_gap_does_not_matter(rig, method):
     motion = on_rig(rig, 45)
     masks = [Mask(ALL, 15, 25), Mask(motion.skeleton.names[8], 30, 40)]
@@ -85,23 +88,17 @@ def test_what_stands_in_the_gap_does_not_matter(rig, method):
 def test_linear_is_straight_lines_and_needs_no_network():
     motion = on_rig("bandai", 45)
     mask = Mask(ALL, 15, 25)
-    made = infill(motion, None, [mask], settings=InfillSettings(method="linear")).motion
+    made = infill(motion, Slerp(), [mask], settings=UNFINISHED).motion
     assert same(made, interpolate_missing(motion, lost_of(motion, [mask])))
 
 
-@pytest.mark.parametrize("method", ["infiller", "map"])
-def test_other_methods_need_one(method):
-    with pytest.raises(RequestError, match=f"method {method} needs an infiller"):
-        infill(on_rig("canonical", 30), None, [Mask(ALL, 5, 9)], settings=InfillSettings(method=method))
-
-
 @dataclass(frozen=True)
-class Oracle:
+class Oracle(PositionInfiller):
     """Knows the motion."""
 
     truth: Motion
 
-    def propose(self, image: PositionImage) -> ProposedPositions:
+    def complete(self, image: PositionImage) -> ProposedPositions:
         """The true places; where there is a moment more than at 30 a second it is that of the very end."""
         own = retarget.to_canonical(self.truth)[0]
         canonical = own.resample(30)
@@ -119,7 +116,7 @@ def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
     motion = on_rig(rig, 3 * fps, fps=fps)
     masks = [seconds(motion, 0.8, 1.4), seconds(motion, 2.0, 2.03 + 1 / fps)]
     made, lines = (
-        filled(motion, *masks, method=method, infiller=Oracle(motion)).motion for method in ("infiller", "linear")
+        filled(motion, *masks, method=method, infiller=Oracle(motion)).motion for method in ("infiller", "slerp")
     )
     # Places do not tell how a collarbone or a shin is turned about itself, and a rig's joints beside them show it.
     assert error_cm(made, motion) < 0.2 * error_cm(lines, motion)
@@ -165,11 +162,11 @@ def test_the_place_of_the_body_can_be_lost_alone():
     motion = on_rig("bandai", 45)
     made = filled(motion, Mask(ROOT, 15, 25))
     assert_known_stays(motion, made.motion, [Mask(ROOT, 15, 25)])
-    (gap,) = made.summary()["gaps"]
+    (gap,) = made.list_gaps()
     assert gap == {"start": 15, "stop": 25, "joints": 0, "root": True}
 
 
-@pytest.mark.parametrize("method", ["infiller", "map"])
+@pytest.mark.parametrize("method", ["infiller", "auto"])
 def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
     motion = on_rig("bandai", 50)
     masks = [Mask(ALL, 0, 8), Mask(ALL, 42, 50)]
@@ -187,7 +184,7 @@ def test_gaps_of_a_few_frames_anywhere_break_nothing(fps, gap):
     assert_known_stays(motion, filled(motion, mask, drawn=0.0).motion, [mask])
 
 
-@pytest.mark.parametrize(("frames", "method"), [(2, "infiller"), (3, "infiller"), (5, "linear"), (3, "map")])
+@pytest.mark.parametrize(("frames", "method"), [(2, "infiller"), (3, "infiller"), (5, "slerp"), (3, "auto")])
 def test_motions_of_a_few_frames_break_nothing(frames, method):
     motion = on_rig("canonical", frames)
     for mask in (Mask(ALL, 0, 1), Mask(ALL, frames - 1, frames), Mask(ALL, 1, frames)):
@@ -206,18 +203,18 @@ def test_seams_do_not_leap(fps):
 
 def test_a_density_joins_the_map_stage():
     motion = on_rig("canonical", 45)
-    done = filled(motion, Mask(ALL, 15, 25), method="map", densities=[tiny_density()])
+    done = filled(motion, Mask(ALL, 15, 25), method="auto", densities=[tiny_density()])
     assert "likelihood" in done.ledger.summary()
 
 
 def test_the_summary_tells_gaps_and_cost():
     motion = on_rig("canonical", 45)
-    done = filled(motion, Mask(ALL, 15, 25), Mask("leftHand", 30, 33), method="linear")
-    told = done.summary()
+    done = filled(motion, Mask(ALL, 15, 25), Mask("leftHand", 30, 33), method="slerp")
+    told = done.details()
     assert told["gaps"] == [
         {"start": 15, "stop": 25, "joints": 21, "root": True},
         {"start": 30, "stop": 33, "joints": 2, "root": False},
     ]
-    assert (told["frames"], told["fps"], told["notes"]) == (45, 30.0, [])
-    assert told["seconds"] == done.seconds > 0
+    assert done.status.text == "done"
+    assert done.seconds > 0
     assert told["frame_ms"] == pytest.approx(1000 * done.seconds / 13)

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import apart_deg, on_rig
+from methods import UNFINISHED
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 import mapctl
 from controllers.inbetweening.keyframe_poses import build_keyframe_clip
-from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -44,9 +44,7 @@ def canonical_of(found):
 
 def made_of(request):
     found = build_keyframe_clip(request)
-    done = tween(
-        found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig, settings=InfillSettings(method="infiller")
-    )
+    done = tween(found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig, settings=UNFINISHED)
     return found, done
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from captures import on_rig
 from helpers import walk
+from methods import by_method
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.tween import tween
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.metrics import worst_frame
@@ -27,7 +27,8 @@ def peaks_of(motion):
 
 
 def asked(motion, keys, *, method="infiller", drawn=0.0):
-    return tween(motion, Keys(keys), tiny_infiller(drawn=drawn), settings=InfillSettings(method=method))
+    inbetweener, settings = by_method(method, tiny_infiller(drawn=drawn))
+    return tween(motion, Keys(keys), inbetweener, settings=settings)
 
 
 @pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 30), ("daz", 120), ("canonical", 24)])

@@ -5,8 +5,8 @@ import torch
 from captures import apart_deg, swaying, vectors
 from helpers import generator, quat_xyzw
 
-from controllers.inbetweening.geometry.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl import rotations
+from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 
 FRAMES = 120
 GAPS = [(40, 70), (50, 51), (0, 20), (100, 120), (1, 3), (117, 119)]

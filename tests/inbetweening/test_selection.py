@@ -7,21 +7,18 @@ import torch
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.error_estimates import estimate_error
 from controllers.inbetweening.geometry.footholds import hold_planted
-from controllers.inbetweening.proposers.rollout import RolloutSettings
-from controllers.inbetweening.proposers.selection import (
-    STANDING_STILL,
-    ChoiceSettings,
-    choose_proposals,
-    compute_artefact_cost,
-)
+from controllers.inbetweening.proposers.auto import STANDING_STILL, Auto, ChoiceSettings, compute_artefact_cost
+from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.tween import tween
 from mapctl import contacts
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening import Proposal
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
 from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -39,18 +36,19 @@ QUICK = ChoiceSettings(
 )
 
 
-def gap_of(motion, start, stop):
-    free = torch.zeros(motion.num_frames, dtype=torch.bool)
-    free[start:stop] = True
-    lost = MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
-    shown = interpolate_missing(motion, lost)
-    return CanonicalGap.of(shown, lost, range(CANONICAL.num_joints)), shown
+class Lines(Inbetweener):
+    """Stands for the infiller: straight lines."""
+
+    def propose(self, query, *, generator=None):
+        return Proposal(query.motion, torch.zeros(query.motion.num_frames, 2), "infiller")
 
 
 def chosen(motion, start, stop, *, densities=(), settings=QUICK):
-    gap, shown = gap_of(motion, start, stop)
-    odds = torch.zeros(len(gap.root), 2)
-    return gap, choose_proposals(gap, shown, odds, densities=densities, settings=settings)
+    """The query of a motion that lacks frames, and what is proposed for it."""
+    free = torch.zeros(motion.num_frames, dtype=torch.bool)
+    free[start:stop] = True
+    query = CanonicalClip.of(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)).query()
+    return query, Auto(Lines(), densities, settings).propose(query)
 
 
 def still(frames):
@@ -62,8 +60,8 @@ def still(frames):
 @pytest.mark.parametrize(("start", "stop", "asked"), [(1, 31, False), (1, 33, True), (20, 78, False), (20, 82, True)])
 def test_the_infiller_is_asked_alone_for_what_it_knows(start, stop, asked):
     """Up to a second between bare poses, two between known motion."""
-    _, answer = chosen(walk(stop + (20 if start > 1 else 1)), start, stop, densities=[tiny_density()])
-    (source,) = answer.sources
+    query, answer = chosen(walk(stop + (20 if start > 1 else 1)), start, stop, densities=[tiny_density()])
+    (source,) = answer.attribute(query)
     assert (source.start, source.stop) == (start, stop)
     assert (source.by == "infiller") or asked
 
@@ -72,7 +70,7 @@ def test_the_infiller_is_asked_alone_for_what_it_knows(start, stop, asked):
 def test_somebody_who_stands_stays_where_he_is(seconds):
     motion = still(30 * seconds + 1)
     wandering = tiny_infiller(drawn=0.05)
-    done = tween(motion, Keys((0, 30 * seconds)), wandering, rollout_densities=[tiny_density()])
+    done = tween(motion, Keys((0, 30 * seconds)), Auto(wandering, [tiny_density()]))
     assert [source.by for source in done.sources] == [STANDING_STILL]
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)
     assert away.max() < 0.02
@@ -85,8 +83,8 @@ def test_somebody_who_is_on_the_move_beside_a_gap_does_not_just_stand():
     period = 30
     motion = replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]).double())
     start, stop = 20, 20 + 3 * period - 1
-    _, answer = chosen(motion, start, stop)
-    assert answer.sources[0].by == "infiller"
+    query, answer = chosen(motion, start, stop)
+    assert answer.attribute(query)[0].by == "infiller"
 
 
 def test_a_slide_costs_what_a_viewer_sees_and_a_walk_does_not():
@@ -102,12 +100,10 @@ def test_a_slide_costs_what_a_viewer_sees_and_a_walk_does_not():
 
 def test_of_several_answers_the_one_that_costs_least_is_taken():
     motion = walk(45)
-    gap, shown = gap_of(motion, 1, 44)
-    odds = torch.zeros(len(gap.root), 2)
     costs = {}
     for name, settings in (("rolled", QUICK), ("alone", replace(QUICK, acceptable_cost=1e9))):
-        answer = choose_proposals(gap, shown, odds, densities=[tiny_density()], settings=settings)
-        costs[name] = compute_artefact_cost(answer.motion, answer.odds, (1, 44), QUICK)
+        _, answer = chosen(motion, 1, 44, densities=[tiny_density()], settings=settings)
+        costs[name] = compute_artefact_cost(answer.motion, answer.contact_logits, (1, 44), QUICK)
     assert costs["rolled"] <= costs["alone"] + 1e-9
 
 
@@ -138,10 +134,14 @@ def test_planted_toes_are_held_and_what_is_known_stays():
 
 def test_a_long_morph_of_somebody_who_moves_is_called_one():
     motion = walk(100)
-    done = tween(motion, Keys((0, 99)), tiny_infiller())  # straight lines
+    done = tween(motion, Keys((0, 99)), Auto(tiny_infiller()))  # straight lines
     (note,) = done.gap_notes
     assert "a still morph" in note
     assert "longer than the" in note
+
+
+def test_what_was_never_measured_is_not_called_sure():
+    assert estimate_error("slerp", 30, going=True, beside=True) is None
 
 
 @pytest.mark.parametrize("by", ["infiller", "rollout of locomotion", "density general", STANDING_STILL])

@@ -6,10 +6,11 @@ import pytest
 import torch
 from captures import apart_deg, on_rig
 from helpers import random_motion, walk
+from methods import UNFINISHED, by_method
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.proposers import Slerp
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -23,9 +24,8 @@ HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
 def made_of(motion, frames, *, method="infiller", drawn=0.02, **told):
-    return tween(
-        motion, Keys.of(tuple(frames), **told), tiny_infiller(drawn=drawn), settings=InfillSettings(method=method)
-    )
+    inbetweener, settings = by_method(method, tiny_infiller(drawn=drawn))
+    return tween(motion, Keys.of(tuple(frames), **told), inbetweener, settings=settings)
 
 
 def frames_of(fps):
@@ -76,14 +76,14 @@ def test_poses_that_are_keys_are_met_to_the_bit(rig, fps):
     assert (apart > 1e-4).sum() > motion.num_frames // 2
 
 
-@pytest.mark.parametrize(("rig", "method"), [*((rig, "map") for rig in RIGS), ("daz", "linear")])
+@pytest.mark.parametrize(("rig", "method"), [*((rig, "auto") for rig in RIGS), ("daz", "slerp")])
 def test_by_every_method(rig, method):
     motion = on_rig(rig, 45)
     assert_met(made_of(motion, frames_of(30), method=method).motion, motion, frames_of(30))
 
 
 @pytest.mark.parametrize("told", [{}, {"limbs": True}, {"root_only": True}])
-@pytest.mark.parametrize(("rig", "method"), [("canonical", "infiller"), ("bandai", "map"), ("daz", "linear")])
+@pytest.mark.parametrize(("rig", "method"), [("canonical", "infiller"), ("bandai", "auto"), ("daz", "slerp")])
 def test_other_frames_change_nothing(rig, method, told):
     motion, frames = on_rig(rig, 45), frames_of(30)
     told = {"limbs": LIMBS[rig]} if "limbs" in told else told
@@ -92,7 +92,7 @@ def test_other_frames_change_nothing(rig, method, told):
     assert same(*(made_of(each, frames, method=method, **told).motion for each in (motion, other)))
 
 
-@pytest.mark.parametrize("method", ["infiller", "linear"])
+@pytest.mark.parametrize("method", ["infiller", "slerp"])
 def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either(method):
     """Its T-pose is found from the keys; joints that only it has carry hands elsewhere, and these are met all the
     same.
@@ -106,7 +106,7 @@ def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either(method
     assert first.notes == ()
 
 
-@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "map")])
+@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "auto")])
 def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
     motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
     done = made_of(motion, frames, method=method, limbs=LIMBS[rig])
@@ -119,7 +119,7 @@ def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
 
 def test_slerp_meets_hands_too():
     motion = on_rig("bandai", 45)
-    done = made_of(motion, frames_of(30), method="linear", limbs=("Hand_L",))
+    done = made_of(motion, frames_of(30), method="slerp", limbs=("Hand_L",))
     assert max(missed_cm(done.motion, motion, frame, ("Hand_L",)) for frame in frames_of(30)) < 0.1
     plain = interpolate_missing(motion, keyed(motion, (0, 44)))
     arm = [motion.skeleton.index(name) for name in ("UpperArm_L", "LowerArm_L")]
@@ -137,7 +137,7 @@ def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
     assert note.endswith(" cm from its place, out of reach")
 
 
-@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "map")])
+@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "auto")])
 def test_the_place_and_rotation_of_the_hips_are_met_to_the_bit(rig, fps, method):
     motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
     made = made_of(motion, frames, method=method, root_only=True).motion
@@ -186,7 +186,7 @@ def test_keys_come_in_any_order_and_may_be_repeated():
 
 def test_the_same_comes_twice():
     motion = on_rig("daz", 45)
-    first, second = (made_of(motion, frames_of(30), method="map", limbs=LIMBS["daz"]).motion for _ in range(2))
+    first, second = (made_of(motion, frames_of(30), method="auto", limbs=LIMBS["daz"]).motion for _ in range(2))
     assert same(first, second)
 
 
@@ -231,7 +231,7 @@ def test_keys_of_several_kinds_are_met_each_in_its_own():
     motion = on_rig("bandai", 45)
     place = (0.4, 1.1, 0.5)
     keys = Keys((44, Key(30, root_only=True), Key(12, limbs=("Foot_R",), places={"Hand_L": place}), 20, 0, 20))
-    made = tween(motion, keys, tiny_infiller(drawn=0.02), settings=InfillSettings(method="infiller")).motion
+    made = tween(motion, keys, tiny_infiller(drawn=0.02), settings=UNFINISHED).motion
     assert_met(made, motion, (0, 20, 44))
     hips = motion.skeleton.index("Hips")
     assert torch.equal(made.joint_positions()[30, hips], motion.joint_positions()[30, hips])
@@ -241,11 +241,9 @@ def test_keys_of_several_kinds_are_met_each_in_its_own():
     assert missed_cm(made, motion, 30, motion.skeleton.names) > 1
 
 
-def test_a_network_is_needed_but_for_slerp():
+def test_slerp_is_the_interpolation_on_the_rig_itself():
     motion = on_rig("canonical", 30)
-    with pytest.raises(RequestError, match="method map needs an infiller"):
-        tween(motion, Keys((0, 29)), None)
-    made = tween(motion, Keys((0, 29)), None, settings=InfillSettings(method="linear")).motion
+    made = tween(motion, Keys((0, 29)), Slerp(), settings=UNFINISHED).motion
     assert same(made, interpolate_missing(motion, keyed(motion, (0, 29))))
 
 

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -14,10 +13,11 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 import priors
-from controllers.inbetweening.canonical_gap import CanonicalGap
+from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps
+from controllers.inbetweening.proposers import Auto, Rollouts, Slerp
+from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
@@ -27,7 +27,6 @@ from mapctl.intent.keyframes import Keys
 from mapctl.problem.warm_start import SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.recording.masks import Mask
-from mapctl.retarget import to_canonical
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
@@ -68,17 +67,19 @@ def command(tmp_path_factory, prior_file):
     return lambda *words: run("tween", *words, "--infiller", infiller, "--prior", prior_file)
 
 
+INFILLER = tiny_infiller(drawn=0.02)
+
+
+def making(motion, keys):
+    """Tweens of one motion by whoever is asked."""
+    return lambda inbetweener, draws: tween(motion, keys, inbetweener, settings=FEW, generator=draws)
+
+
 def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
-    return sample_variations(
-        motion,
-        Keys.of(keys, **told),
-        tiny_infiller(drawn=0.02),
-        count,
-        rollout_densities=[prior],
-        generator=generator(seed),
-        settings=FEW,
-        rolling=QUICK,
-    )
+    make, rollouts = making(motion, Keys.of(keys, **told)), Rollouts([prior], INFILLER, QUICK)
+    first = Auto(INFILLER, [prior])
+    refinement = FEW.refinement
+    return sample_variations(make, first, rollouts, count, generator=generator(seed), refinement=refinement)
 
 
 @pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("daz", 60)])
@@ -86,9 +87,9 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
     motion = on_rig(rig, FRAMES * fps // 30, fps=fps)
     keys = [key * fps // 30 for key in KEYS]
     found = asked(motion, prior, keys=tuple(keys))
-    places = [one.infill_result.motion.joint_positions() for one in found.each]
+    places = [one.solution.motion.joint_positions() for one in found.each]
     for one in found.each:
-        made = one.infill_result.motion
+        made = one.solution.motion
         assert torch.equal(made.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
         assert torch.equal(made.root_position[keys], motion.root_position[keys])
     apart = [float((places[i] - places[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
@@ -99,23 +100,21 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
 
 def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prior):
     motion = on_rig("canonical", FRAMES)
-    alone = tween(motion, Keys(KEYS), tiny_infiller(drawn=0.02), settings=FEW).motion
+    alone = tween(motion, Keys(KEYS), Auto(INFILLER), settings=FEW).motion
     two, three = (asked(motion, prior, count=count).each for count in (2, 3))
-    assert torch.equal(two[0].infill_result.motion.local_quat_xyzw, alone.local_quat_xyzw)
+    assert torch.equal(two[0].solution.motion.local_quat_xyzw, alone.local_quat_xyzw)
     for one, other in zip(two, three[:2], strict=True):
-        assert torch.equal(one.infill_result.motion.local_quat_xyzw, other.infill_result.motion.local_quat_xyzw)
+        assert torch.equal(one.solution.motion.local_quat_xyzw, other.solution.motion.local_quat_xyzw)
         assert one.energy == other.energy
     reseeded = asked(motion, prior, count=2, seed=1).each
-    assert not torch.equal(
-        two[1].infill_result.motion.local_quat_xyzw, reseeded[1].infill_result.motion.local_quat_xyzw
-    )
+    assert not torch.equal(two[1].solution.motion.local_quat_xyzw, reseeded[1].solution.motion.local_quat_xyzw)
 
 
 def test_limbs_are_still_where_they_are_wanted(prior):
     motion = on_rig("bandai", FRAMES)
     hand = motion.skeleton.index("Hand_L")
     for one in asked(motion, prior, limbs=("Hand_L",)).each:
-        away = (one.infill_result.motion.joint_positions() - motion.joint_positions())[list(KEYS), hand].norm(dim=-1)
+        away = (one.solution.motion.joint_positions() - motion.joint_positions())[list(KEYS), hand].norm(dim=-1)
         assert float(away.max()) < 1e-3
 
 
@@ -123,30 +122,27 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     motion = on_rig("canonical", FRAMES)
     free = torch.zeros(FRAMES, dtype=torch.bool)
     free[:5] = free[20:30] = free[40:] = True
-    canonical, rigmap = to_canonical(motion)
-    gap = CanonicalGap.of(
-        canonical, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free), rigmap.joint_of
-    )
-    odds = torch.full((FRAMES, 2), -1.0)
-    answer = roll_through_gaps(
-        gap, gap.motion, odds, densities=[tiny_density()], generator=generator(0), settings=QUICK
-    )
-    made, bits = answer.motion, answer.odds
-    assert [(source.start, source.stop) for source in answer.sources] == [(20, 30)]
+    missing = MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
+    gap = CanonicalClip.of(motion, missing).query()
+    logits = Slerp().propose(gap).contact_logits
+    answer = Rollouts([tiny_density()], Slerp(), QUICK).propose(gap, generator=generator(0))
+    made, bits = answer.motion, answer.contact_logits
+    assert [(source.start, source.stop) for source in answer.attribute(gap)] == [(20, 30)]
     same = torch.ones(FRAMES, dtype=torch.bool)
     same[20:30] = False
     torch.testing.assert_close(made.root_position[same], gap.motion.root_position[same])
     torch.testing.assert_close(made.local_quat_xyzw[same], gap.motion.local_quat_xyzw[same])
-    assert torch.equal(bits[same], odds[same])
+    assert torch.equal(bits[same], logits[same])
     assert float((made.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
 
 
 @pytest.mark.parametrize("frames", [(30, 45), (8, 45)])
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
-    fill = partial(infill, motion, tiny_infiller(drawn=0.02), masks)
-    plain, made = fill(), fill(rollout_densities=[prior])
-    known = ~made.lost.frames
+    plain, made, again = (
+        infill(motion, inbetweener, masks) for inbetweener in (INFILLER, *[Auto(INFILLER, [prior])] * 2)
+    )
+    known = ~made.missing.frames
     for one in (plain, made):
         assert torch.equal(one.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
         assert bool(one.motion.joint_positions().isfinite().all())
@@ -154,11 +150,10 @@ def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     assert float(apart[:2].max()) < 1e-3
     assert float(apart[frames[0] + 3 :].min()) > 1e-4
     assert [note.split(",")[0].rpartition("extended ")[2] for note in made.notes] == [
-        "backwards by the infiller",
-        f"by the density {prior.name}",
+        "backwards by infiller",
+        f"by density {prior.name}",
     ]
-    assert plain.notes[1].split(",")[0].endswith("extended by the infiller")
-    again = fill(rollout_densities=[prior])
+    assert plain.notes[1].split(",")[0].endswith("extended by infiller")
     assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
 
 
@@ -174,8 +169,8 @@ def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(
         def with_observation_noise(self, sigma):
             return self
 
-    done = infill(on_rig("canonical", FRAMES), tiny_infiller(), [Mask("*", 30, 45)], rollout_densities=[Stern()])
-    assert done.notes == ("a gap at the end: the motion is extended by the infiller, with nothing after it to meet",)
+    done = infill(on_rig("canonical", FRAMES), Auto(tiny_infiller(), [Stern()]), [Mask("*", 30, 45)])
+    assert done.notes == ("a gap at the end: the motion is extended by infiller, with nothing after it to meet",)
 
 
 def test_what_leaves_nothing_to_vary_is_refused(prior):
@@ -192,38 +187,28 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
 @pytest.mark.parametrize("keys", [KEYS, (0, 44)])
 def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     motion = on_rig("canonical", FRAMES)
-    made = lowest_energy(
-        motion,
-        Keys(keys),
-        tiny_infiller(drawn=0.02),
-        4,
-        rollout_densities=[prior],
-        generator=generator(0),
-        settings=FEW,
-        rolling=QUICK,
-    )
+    rollouts = Rollouts([prior], INFILLER, QUICK)
+    make = making(motion, Keys(keys))
+    made = lowest_energy(make, rollouts, 4, generator=generator(0), refinement=FEW.refinement)
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
-    told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
+    told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.status.notes[-1].split(": ", 1)[1]))
     assert list(told) == ["infiller", "slerp", "rollout 1", "rollout 2"]
     winner = min(told, key=lambda name: float(told[name]))
-    assert made.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
+    assert made.status.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
     # Its own energy, found anew, is that told; the answers that variations have as well have the same.
     others = asked(motion, prior, keys=keys).each
     for name, one in zip(("infiller", "rollout 1", "rollout 2"), others, strict=True):
         assert float(told[name]) == pytest.approx(one.energy, abs=0.06)
         if name == winner:
-            assert torch.equal(made.motion.local_quat_xyzw, one.infill_result.motion.local_quat_xyzw)
+            assert torch.equal(made.motion.local_quat_xyzw, one.solution.motion.local_quat_xyzw)
 
 
 def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
-    motion, take = (
-        on_rig("canonical", FRAMES),
-        partial(lowest_energy, rollout_densities=[prior], generator=generator(0)),
-    )
+    motion, rollouts = on_rig("canonical", FRAMES), Rollouts([prior], INFILLER)
     with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):
-        take(motion, Keys(KEYS), tiny_infiller(), 1)
+        lowest_energy(making(motion, Keys(KEYS)), rollouts, 1, generator=generator(0))
     with pytest.raises(RequestError, match="leaves nothing to vary"):
-        take(motion.slice(0, 6), Keys((0, 5)), tiny_infiller(), 2)
+        lowest_energy(making(motion.slice(0, 6), Keys((0, 5))), rollouts, 2, generator=generator(0))
 
 
 def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys):
@@ -234,12 +219,12 @@ def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys)
         found.add((tmp_path / "out.bvh").read_bytes())
     assert len(found) == 1
     assert "the best of 2 is from the " in capsys.readouterr().out
-    assert "the best of 2 is from the " in " ".join(json.loads((tmp_path / "r.json").read_text())["notes"])
+    assert "the best of 2 is from the " in " ".join(json.loads((tmp_path / "r.json").read_text())["status"]["notes"])
 
 
 def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, source, tmp_path, capsys):
     found = set()
-    words = ["--keyframes", "0,20,44", "--method", "infiller", "--variations", 2, "--seed", 4]
+    words = ["--keyframes", "0,20,44", "--method", "infiller", "--no-finish", "--variations", 2, "--seed", 4]
     for _ in range(2):
         assert command(source, "-o", tmp_path / "out.bvh", *words, "--report", tmp_path / "r.json") == 0
         found.add(tuple((tmp_path / f"out_00{number}.bvh").read_bytes() for number in range(2)))

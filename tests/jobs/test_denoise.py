@@ -105,10 +105,14 @@ def test_what_densities_made_of_windows_is_told_in_frames_of_the_capture():
     from helpers import tiny_density
 
     done = cleaned(noisy(on_rig("daz", 361, fps=120)), densities=[tiny_density()])
-    assert (done.stretches[0].start, done.stretches[-1].stop) == (0, 361)
+    assert (done.density_intervals[0].start, done.density_intervals[-1].stop) == (0, 361)
     first, second = done.slice(0, 100), done.slice(100, 361)
-    assert (first.stretches[-1].stop, second.stretches[0].start, second.stretches[-1].stop) == (100, 0, 261)
-    parts = join_segments([(first, 0), (second, 100)]).stretches
+    assert (first.density_intervals[-1].stop, second.density_intervals[0].start, second.density_intervals[-1].stop) == (
+        100,
+        0,
+        261,
+    )
+    parts = join_segments([(first, 0), (second, 100)]).density_intervals
     assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
     assert (parts[0].start, parts[-1].stop) == (0, 361)
     json.dumps(done.summary(), allow_nan=False)

@@ -78,7 +78,7 @@ def test_the_same_seed_gives_the_same_bytes_and_other_seeds_other_walks(tmp_path
 
 
 def test_a_further_term_enters_the_ledger():
-    solution = follow(curves.circle(radius=2), seconds=0.4, settings=replace(QUICK, extra=(Likelihood(),)))
+    solution = follow(curves.circle(radius=2), seconds=0.4, terms=[Likelihood()])
     assert {entry.name for entry in solution.ledger.entries} == {"noise", "path", "footing", "likelihood"}
 
 

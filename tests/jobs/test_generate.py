@@ -14,7 +14,6 @@ from controllers.generation.generate import (
     initialise_generation,
     sample_stratified_starts,
     stream,
-    stream_features,
 )
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -34,7 +33,7 @@ def short_pieces(monkeypatch):
 
 
 def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):
-    return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **wishes)
+    return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **wishes).motion
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(1.0, 30), (0.5, 15), (0.001, 2), (1.51, 45)])
@@ -62,7 +61,7 @@ def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
     whole = made(2.0, seed=5)
     monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 13)
     pieces = list(stream(DENSITY, seconds=2.0, generator=generator(5), settings=RAW))
-    assert [piece.num_frames for piece in pieces] == [13, 13, 13, 13, 8]
+    assert [piece.motion.num_frames for piece in pieces] == [13, 13, 13, 13, 8]
     joined = made(2.0, seed=5)
     torch.testing.assert_close(joined.joint_positions(), whole.joint_positions(), atol=1e-6, rtol=0)
     assert turn_between(joined.local_quat_xyzw, whole.local_quat_xyzw) < 1e-6
@@ -82,7 +81,7 @@ def test_it_is_what_the_prior_samples_from_the_chosen_start():
 def test_temperature_spreads_the_draws():
     one = tiny_density(components=1)
     calm, wild = (
-        generate(one, seconds=2.0, generator=generator(), settings=replace(RAW, temperature=t, start=0))
+        generate(one, seconds=2.0, generator=generator(), settings=replace(RAW, temperature=t, start=0)).motion
         for t in (0.0, 2.0)
     )
     jerks = [encode(m)[0][:, 6:66].diff(n=3, dim=0).square().mean().sqrt() for m in (calm, wild)]
@@ -153,7 +152,7 @@ def test_a_refiner_comes_before_the_motion_is_decoded():
 
 def test_features_are_the_motion_and_its_contact_labels():
     motion = made(seed=2)
-    features = torch.cat(list(stream_features(DENSITY, seconds=1.0, generator=generator(2), settings=RAW)))
+    features = generate(DENSITY, seconds=1.0, generator=generator(2), settings=RAW).features
     rebuilt = decode(features, GroundPose.origin(torch.float64))
     torch.testing.assert_close(rebuilt.joint_positions(), motion.joint_positions(), atol=1e-6, rtol=0)
     assert set(LAYOUT.pick(features, "contacts").unique().tolist()) <= {0.0, 1.0}

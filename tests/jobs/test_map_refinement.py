@@ -133,11 +133,11 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
     found = {}
     for density in (deep, shallow):
         stood = refine(motion, odds(motion), told(motion), settings, densities=[density])
-        assert [(part.start, part.stop) for part in stood.stretches] == [(0, 20), (20, 50)]
+        assert [(part.start, part.stop) for part in stood.density_intervals] == [(0, 20), (20, 50)]
         (entry,) = (entry for entry in stood.ledger.entries if entry.name == "likelihood")
-        scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in stood.stretches])
+        scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in stood.density_intervals])
         assert torch.allclose(entry.energy * settings.temperature, entry.residual * scale, rtol=1e-4)
-        found[density] = {part.weight for part in stood.stretches}
+        found[density] = {part.weight for part in stood.density_intervals}
     assert found[deep] == {1.0}
     assert max(found[shallow]) < 1e-3
 
@@ -149,7 +149,7 @@ def test_of_several_densities_the_likelier_counts_in_each_window():
         near, name="far", reference=near.reference.with_observation_noise(100 * density_selection.proposal_sigma())
     )
     stood = refine(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10), densities=[far, near])
-    for part in stood.stretches:
+    for part in stood.density_intervals:
         assert part.prior == max(part.nats, key=lambda name: part.nats[name])
         assert set(part.nats) == {"tiny", "far"}
 

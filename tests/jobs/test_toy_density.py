@@ -1,7 +1,5 @@
 """A density that is written from mapctl.protocols alone goes through every job that takes one."""
 
-from functools import partial
-
 import pytest
 import torch
 from captures import noisy, on_rig
@@ -17,7 +15,8 @@ from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers.rollout import RolloutSettings, roll_through_gaps
+from controllers.inbetweening.proposers import Auto, Rollouts
+from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.tween import tween
 from controllers.steering import steer
 from mapctl import curves
@@ -52,13 +51,15 @@ def test_it_follows_a_curve():
 
 def test_it_generates_from_its_own_states_and_from_a_clip():
     plain = GenerateSettings(foot_cleanup=None)
-    made, again, other = (generate(TOY, seconds=2, settings=plain, generator=generator(seed)) for seed in (1, 1, 2))
+    made, again, other = (
+        generate(TOY, seconds=2, settings=plain, generator=generator(seed)).motion for seed in (1, 1, 2)
+    )
     check(made, 60)
     assert torch.equal(again.root_position, made.root_position)
     assert not torch.equal(other.root_position, made.root_position)
     cleaning = GenerateSettings(foot_cleanup=FootCleanupSettings(window=WINDOW))
     walker = on_rig("bandai", 30)
-    check(generate(TOY, seconds=0.4, settings=cleaning, generator=generator(), start_clip=walker), 12)
+    check(generate(TOY, seconds=0.4, settings=cleaning, generator=generator(), start_clip=walker).motion, 12)
 
 
 def test_it_is_steered():
@@ -84,20 +85,22 @@ def test_it_is_a_prior_of_denoising():
 
 @pytest.mark.parametrize("gap", [(12, 22), (30, 40)])
 def test_it_is_a_prior_of_infilling_and_extends_an_end(gap):
-    fill = partial(infill, on_rig("bandai", 40), tiny_infiller(drawn=0.02), [Mask("*", *gap)], settings=FILLING)
-    done = fill(densities=[TOY], rollout_densities=[TOY])
+    motion, masks, infiller = on_rig("bandai", 40), [Mask("*", *gap)], tiny_infiller(drawn=0.02)
+    done = infill(motion, Auto(infiller, [TOY]), masks, settings=FILLING, densities=[TOY])
     check(done.motion, 40)
     assert "likelihood" in [entry.name for entry in done.ledger.entries]
-    assert not torch.equal(done.motion.local_quat_xyzw, fill().motion.local_quat_xyzw)
+    assert not torch.equal(
+        done.motion.local_quat_xyzw, infill(motion, infiller, masks, settings=FILLING).motion.local_quat_xyzw
+    )
 
 
 def test_it_is_a_prior_of_tweening_and_proposes_rollouts():
     motion, keys = on_rig("bandai", 40), Keys((0, 20, 39))
-    make = partial(tween, motion, keys, tiny_infiller(drawn=0.02), settings=FILLING, densities=[TOY])
+    infiller = tiny_infiller(drawn=0.02)
     quick = LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=6), budget=Budget(evaluations=20))
     rolling = RolloutSettings(ahead=4, method=quick)
-    roll = partial(roll_through_gaps, densities=[TOY], generator=generator(), settings=rolling)
-    for done in (make(rollout_densities=[TOY]), make(another=roll)):
+    for inbetweener in (Auto(infiller, [TOY]), Rollouts([TOY], infiller, rolling)):
+        done = tween(motion, keys, inbetweener, settings=FILLING, densities=[TOY])
         check(done.motion, 40)
         torch.testing.assert_close(done.motion.local_quat_xyzw[[0, 20, 39]], motion.local_quat_xyzw[[0, 20, 39]])
     assert {source.by for source in done.sources} == {"rollout of toy"}

@@ -109,14 +109,14 @@ def test_joints_that_are_never_known_begin_at_their_mean():
 def test_as_a_controller_takes_it_it_is_an_inbetweener_without_gradients():
     infiller = tiny_infiller(drawn=DRAWN)
     assert isinstance(infiller, Inbetweener)
-    proposed = infiller.propose(holed())
+    proposed = infiller.complete(holed())
     assert not proposed.places.requires_grad
 
 
 def test_what_it_proposes_for_the_mirror_image_is_the_mirror_image():
     """Its network alone does not: a left step is not a right one to it."""
     infiller, image = tiny_infiller(drawn=DRAWN), holed()
-    there, here = infiller.propose(image.mirrored()), infiller.propose(image)
+    there, here = infiller.complete(image.mirrored()), infiller.complete(image)
     assert torch.allclose(there.places, mirror_positions(here.places), atol=1e-5)
     assert torch.allclose(there.contacts, here.contacts.flip(-1), atol=1e-5)
     alone = infiller.network(image.mirrored()).places
@@ -136,11 +136,11 @@ def test_a_mirror_image_is_that_of_the_mirrored_motion():
 
 def test_a_saved_infiller_loads_as_it_was(tmp_path):
     path = save_tiny_infiller(tmp_path / "run" / "model.safetensors", drawn=DRAWN)
-    wanted = tiny_infiller(drawn=DRAWN).propose(holed())
+    wanted = tiny_infiller(drawn=DRAWN).complete(holed())
     for name in (path, path.parent):
         loaded = priors.load_infiller(str(name))
         assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "infiller")
-        assert torch.allclose(loaded.propose(holed()).places, wanted.places, atol=1e-3)  # float16 in the file
+        assert torch.allclose(loaded.complete(holed()).places, wanted.places, atol=1e-3)  # float16 in the file
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)

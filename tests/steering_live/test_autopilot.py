@@ -13,6 +13,7 @@ from mapctl import curves
 from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import Outcome, Status
 
 LINE = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 5.0]]))
 
@@ -21,7 +22,17 @@ def at_place(pilot: Autopilot, x: float, z: float) -> None:
     """The character was shown there."""
     pose = walk(2).slice(0, 1)
     moved = Motion(pose.skeleton, pose.fps, torch.tensor([[x, 0.9, z]], dtype=torch.float64), pose.local_quat_xyzw)
-    pilot.show(SteerFrames(moved, torch.zeros(1, 2), (), torch.zeros(0, 21, 3), Ledger()), 0.0)
+    pilot.show(
+        SteerFrames(
+            moved,
+            Status(Outcome.DONE),
+            Ledger(),
+            contacts=torch.zeros(1, 2),
+            steering_targets=(),
+            forecast=torch.zeros(0, 21, 3),
+        ),
+        0.0,
+    )
 
 
 def test_the_last_command_holds():

@@ -76,7 +76,7 @@ def test_without_time_it_still_delivers_searches_the_least_and_says_so(least, ma
     _, piece = steer.step(state, AHEAD, seconds=0.0)
     assert piece.motion.num_frames == 3
     assert piece.evaluations == made
-    assert piece.note == (f"the deadline came after {made} of 4 evaluations" if made < 4 else "")
+    assert piece.notes == ((f"the deadline came after {made} of 4 evaluations",) if made < 4 else ())
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
 
 

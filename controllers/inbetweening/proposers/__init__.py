@@ -1,0 +1,40 @@
+"""Who proposes what a gap lacks: the in-betweeners behind --method."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from controllers.inbetweening.proposers.auto import Auto
+from controllers.inbetweening.proposers.rollouts import Rollouts
+from controllers.inbetweening.proposers.slerp import Slerp
+from mapctl.errors import RequestError
+from mapctl.protocols import Density, Inbetweener
+
+__all__ = ["METHODS", "Auto", "ModelLoaders", "Rollouts", "Slerp", "build_inbetweener"]
+
+
+@dataclass(frozen=True)
+class ModelLoaders:
+    """Loads the models that an in-betweener needs, when it needs them."""
+
+    infiller: Callable[[], Inbetweener]
+    """Loads the infiller."""
+    densities: Callable[[], Sequence[Density]]
+    """Loads the densities that are rolled."""
+
+
+METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
+    "auto": lambda models: Auto(models.infiller(), models.densities()),
+    "infiller": lambda models: models.infiller(),
+    "rollouts": lambda models: Rollouts(models.densities(), models.infiller()),
+    "slerp": lambda models: Slerp(),
+}
+"""In-betweeners by the name of the method that chooses them."""
+_RENAMED = {"map": "--method auto", "linear": "--method slerp --no-finish"}
+
+
+def build_inbetweener(method: str, models: ModelLoaders) -> Inbetweener:
+    """Build the in-betweener of a method; RequestError for one that there is not."""
+    if method not in METHODS:
+        known = f"{method} is now {_RENAMED[method]}" if method in _RENAMED else f"there are {', '.join(METHODS)}"
+        raise RequestError(f"no method {method!r}; {known}")
+    return METHODS[method](models)

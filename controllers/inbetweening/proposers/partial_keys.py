@@ -1,10 +1,9 @@
-"""A proposal through keys that tell a part of a pose: the place of a hand or a foot, or of the hips.
+"""Propose through keys that give only a part of a pose: positions of hands, feet or hips.
 
-A network that is told the place of one hand in one frame keeps it there in that frame, and goes on beside it as if
-nothing had been told. So it is not told. It is asked twice: first for what there is without the part, which shows how
-the trajectory must lead for the part to come about; then along that trajectory. What is left to do in the frame of the
-key takes as little of the whole body as it can (see `mapctl.kinematics.whole_body`), and the body goes there and comes
-back in as long as it takes to go so far without haste.
+An in-betweener that sees the position of one hand in one frame keeps it there in that frame and goes on beside it as if
+it had seen nothing. So it does not see it. It is asked twice: first without the part, which shows how the trajectory
+must lead for the part to come about; then along that trajectory. What is left at the key's frame is done by as little
+of the whole body as possible (see `mapctl.kinematics.whole_body`), which goes there and back at a usual acceleration.
 """
 
 import math
@@ -15,11 +14,10 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from controllers.inbetweening.canonical_gap import CanonicalGap
-from controllers.inbetweening.proposers.answers import Proposal, Proposer
-from controllers.inbetweening.proposers.positions import propose_motion
 from mapctl import rotations
+from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics import heading
 from mapctl.kinematics.whole_body import bend_limbs, reach_targets
 from mapctl.motion import Motion
@@ -47,102 +45,90 @@ _ARMS = tuple(
 _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
-def propose_through(
-    gap: CanonicalGap,
-    infiller: Inbetweener,
-    targets: EffectorTargets | None,
-    *,
-    held: bool,
-    another: Proposer | None = None,
+def propose_through_keys(
+    query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator
 ) -> tuple[Proposal, EffectorTargets | None]:
-    """What an infiller, or `another` that starts from its proposal, makes of a gap (see
-    `controllers.inbetweening.proposers.positions`), with hands and feet at their places and the hips at theirs where
-    single frames tell no more; and the places, brought in reach where they are not.
+    """Propose a motion with hands and feet at their targets, and the hips at theirs where single frames tell no more;
+    and the targets, brought in reach where they are not.
     """
-    hips = _find_root_only_keys(gap)
+    hips, targets = _find_root_only_keys(query), query.effector_targets
     wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
-    blind = replace(gap, turns=gap.turns.index_put((hips, torch.tensor(0)), torch.tensor(True)), root=gap.root | hips)
-    first, bits = propose_motion(blind, infiller, None, held=held)
     if not bool((hips | wanted).any()):
-        return _apply_proposer(another, gap, Proposal(first, bits), targets, hips), targets
-    led, second = blind, first
-    if bool(gap.root.any()):
-        led = _interpolate_trajectory(gap, blind, first, targets, hips)
-        second, bits = propose_motion(led, infiller, None, held=True)
-    answer = _apply_proposer(another, led, Proposal(second, bits), targets, hips)
-    second = answer.motion
-    posed = _set_hips(second, gap.motion, hips)
+        return inbetweener.propose(query, generator=generator), targets
+    joints = query.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
+    blind = replace(query, missing=MissingMask(joints, query.missing.root | hips), effector_targets=None)
+    led = blind
+    if bool(query.missing.root.any()):
+        first = inbetweener.rough.propose(blind, generator=generator).motion
+        led = _interpolate_trajectory(query, blind, first, targets, hips)
+    answer = inbetweener.propose(replace(led, effector_targets=_add_root_targets(query, hips)), generator=generator)
+    made = answer.motion
+    posed = _set_hips(made, query.motion, hips)
     if targets is None:
-        return replace(answer, motion=_blend_key_poses(second, posed, hips, blind)), None
-    posed = reach_targets(
-        posed, targets, turning=gap.turns, moving=gap.root, stray=torch.full(hips.shape, _MIN_ROOT_UNCERTAINTY)
-    )[0]
+        return replace(answer, motion=_blend_key_poses(made, posed, hips, blind)), None
+    turning, moving = query.missing.joints, query.missing.root
+    stray = torch.full(hips.shape, _MIN_ROOT_UNCERTAINTY)
+    posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
-    there = replace(answer, motion=_blend_key_poses(second, posed, hips | wanted, blind))
+    there = replace(answer, motion=_blend_key_poses(made, posed, hips | wanted, blind))
     return there, EffectorTargets(reached, targets.wanted)
 
 
-def _apply_proposer(
-    another: Proposer | None,
-    gap: CanonicalGap,
-    answer: Proposal,
-    targets: EffectorTargets | None,
-    hips: Bool[Tensor, " frames"],
-) -> Proposal:
-    """What another makes of an answer, told where hands, feet and hips are wanted on the way."""
-    if another is None:
-        return answer
-    if bool(hips.any()):
-        places = gap.motion.joint_positions()
-        wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
-        wanted[hips, 0] = True
-        if targets is not None:
-            places = torch.where(targets.wanted[..., None], targets.places, places)
-            wanted = wanted | targets.wanted
-        targets = EffectorTargets(places, wanted)
-    return another(gap, answer.motion, answer.odds, targets)
+def _add_root_targets(query: GapQuery, hips: Bool[Tensor, " frames"]) -> EffectorTargets | None:
+    """Join the effector targets and the positions of hips that are known alone."""
+    targets = query.effector_targets
+    if not bool(hips.any()):
+        return targets
+    positions = query.motion.joint_positions()
+    wanted = torch.zeros(positions.shape[:2], dtype=torch.bool)
+    wanted[hips, 0] = True
+    if targets is None:
+        return EffectorTargets(positions, wanted)
+    positions = torch.where(targets.wanted[..., None], targets.places, positions)
+    return EffectorTargets(positions, wanted | targets.wanted)
 
 
-def _find_root_only_keys(gap: CanonicalGap) -> Bool[Tensor, " frames"]:
-    """Single frames, or a few, of which nothing is known but where the hips are and how they are turned."""
-    alone = ~gap.root & ~gap.turns[:, 0] & gap.turns[:, 1:].all(dim=1)
+def _find_root_only_keys(query: GapQuery) -> Bool[Tensor, " frames"]:
+    """Find single frames, or a few, of which nothing is known but the hips' position and rotation."""
+    turns, root = query.missing.joints, query.missing.root
+    alone = ~root & ~turns[:, 0] & turns[:, 1:].all(dim=1)
     for _, start, stop in true_intervals(alone[:, None].clone()):
         alone[start:stop] = stop - start <= _MAX_ROOT_KEY_FRAMES
     return alone
 
 
 def _interpolate_trajectory(
-    gap: CanonicalGap, blind: CanonicalGap, body: Motion, targets: EffectorTargets | None, hips: Bool[Tensor, " frames"]
-) -> CanonicalGap:
-    """The gap with its hips guessed along a trajectory through all that keys tell of it, facing as it leads."""
+    query: GapQuery, blind: GapQuery, body: Motion, targets: EffectorTargets | None, hips: Bool[Tensor, " frames"]
+) -> GapQuery:
+    """Return the query with its hips along a trajectory through all that keys tell of it, facing as it leads."""
     root, facing = body.root_position.clone(), rotations.unwrap_angle(heading(body.local_quat_xyzw[:, 0]))
-    knots = ~blind.root | hips
-    root[knots] = gap.motion.root_position[knots]
-    own = heading(gap.motion.local_quat_xyzw[:, 0])
+    knots = ~blind.missing.root | hips
+    root[knots] = query.motion.root_position[knots]
+    own = heading(query.motion.local_quat_xyzw[:, 0])
     facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
     if targets is not None:
-        wanted = targets.wanted.any(dim=1) & blind.root & ~hips
+        wanted = targets.wanted.any(dim=1) & blind.missing.root & ~hips
         root = (
             root
             + reach_targets(
                 body,
                 targets,
-                turning=blind.turns,
-                moving=blind.root,
-                stray=_estimate_root_uncertainty(body, blind.root),
+                turning=blind.missing.joints,
+                moving=blind.missing.root,
+                stray=_estimate_root_uncertainty(body, blind.missing.root),
             )[1]
         )
-        places = _interpolate_knots(root, knots | wanted, gap.seconds)
+        places = _interpolate_knots(root, knots | wanted, query.seconds)
         facing = facing + torch.where(knots, 0.0, _compute_heading_change(body.root_position, places, float(body.fps)))
         knots = knots | wanted
-    places = _interpolate_knots(root, knots, gap.seconds)
-    turned = _interpolate_knots(facing[:, None], knots, gap.seconds)[:, 0]
-    shown = gap.motion
+    places = _interpolate_knots(root, knots, query.seconds)
+    turned = _interpolate_knots(facing[:, None], knots, query.seconds)[:, 0]
+    shown = query.motion
     quats = shown.local_quat_xyzw.clone()
-    turn = torch.where(blind.root, turned - heading(quats[:, 0]), 0.0)
+    turn = torch.where(blind.missing.root, turned - heading(quats[:, 0]), 0.0)
     quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
-    led = torch.where(blind.root[:, None], places, shown.root_position)
-    return replace(blind, motion=replace(shown, root_position=led, local_quat_xyzw=quats))
+    led = torch.where(blind.missing.root[:, None], places, shown.root_position)
+    return replace(blind, motion=replace(shown, root_position=led, local_quat_xyzw=quats), keep_trajectory=True)
 
 
 def _estimate_root_uncertainty(body: Motion, lost: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
@@ -204,7 +190,7 @@ def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> M
     return replace(body, local_quat_xyzw=quats, root_position=root)
 
 
-def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], gap: CanonicalGap) -> Motion:
+def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], query: GapQuery) -> Motion:
     """`body` that goes to the poses `posed` in the frames of keys and comes back, feet staying on their own tracks."""
     fps = float(body.fps)
     turn = rotations.to_rotation_vector(
@@ -214,23 +200,23 @@ def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"],
     away = torch.where(keys[:, None], (goals - places).norm(dim=-1), 0.0)
     limb = _compute_duration(away[:, [limb.end for limb in LIMBS.values()]], _MIN_LIMB_SECONDS, _LIMB_ACCELERATION)
     trunk = _compute_duration(away[:, :1], _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION)
-    known = ~gap.turns | keys[:, None]
+    known = ~query.missing.joints | keys[:, None]
     quats = body.local_quat_xyzw.clone()
     for joint in range(body.num_joints):
         seconds = limb if joint in _ARMS else trunk
         turned = interpolate_offsets(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
         quats[:, joint] = rotations.multiply(quats[:, joint], rotations.from_rotation_vector(turned))
     moved = interpolate_offsets(
-        (posed.root_position - body.root_position) * keys[:, None], ~gap.root | keys, seconds=trunk, fps=fps
+        (posed.root_position - body.root_position) * keys[:, None], ~query.missing.root | keys, seconds=trunk, fps=fps
     )
     made = replace(body, root_position=body.root_position + moved, local_quat_xyzw=quats)
     ends, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
     for foot in _FEET:
-        firm = keys | ~gap.turns[:, CANONICAL.parents[foot]]
+        firm = keys | ~query.missing.joints[:, CANONICAL.parents[foot]]
         ends[:, foot] = places[:, foot] + interpolate_offsets(
             (goals - places)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
         )
-    return bend_limbs(made, body, ends, wanted, gap.turns)
+    return bend_limbs(made, body, ends, wanted, query.missing.joints)
 
 
 def _compute_duration(away: Float[Tensor, "frames parts"], least: float, calm: float) -> float:

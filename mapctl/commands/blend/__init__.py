@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import arg
 
@@ -29,13 +29,15 @@ class Blend(Command):
     margin: options.MaybeNumber = None
     """Seconds before and after in which the limb goes there and back; as long as the distance asks for, if not
     given."""
-    method: Annotated[Literal["infiller", "map"], arg(metavar="infiller|map")] = "map"
-    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones."""
+    no_finish: bool = False
+    """Leave the infiller's proposal as it is, on rigid bones: no MAP stage puts the feet down."""
     infiller: options.Name = "infiller"
     """The bundled infiller, or the file or run folder of a trained one."""
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     video: options.MaybeFile = None
     """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
+    strict: bool = False
+    """Exit with status 3 where not all that was asked holds: a limb that has to go far in little time."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -17,10 +17,10 @@ def run(command: Blend) -> int:
     start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
     names = tuple(name.strip() for name in command.joints.split(","))
     borrowed = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
-    settings = InfillSettings(method=command.method)
+    settings = InfillSettings(finish=not command.no_finish)
     done = blend(motion, other, borrowed, priors.load_infiller(command.infiller), settings=settings, rig=rig)
     formats.save(done.motion, command.out)
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:
         print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))
-    return 0
+    return results.conclude(done.status, strict=command.strict)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from tyro.conf import arg
@@ -25,8 +25,10 @@ class Chain(Command):
     """Frames between two pieces: drawn from A to B."""
     seed: options.Count = 0
     """Of the gaps' lengths."""
-    method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
-    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
+    method: options.Method = "auto"
+    """Who proposes, as in `mapctl infill`."""
+    no_finish: bool = False
+    """Leave the proposal as it is, on rigid bones: no MAP stage puts the feet down."""
     infiller: options.MaybeName = None
     """The file or run folder of a trained infiller; the bundled one if not given."""
     video: options.MaybeFile = None

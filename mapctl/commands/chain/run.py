@@ -2,9 +2,9 @@
 
 import torch
 
-import priors
 from controllers.inbetweening.chain import ChainSettings, chain
 from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import formats
 from mapctl.commands.chain import Chain
 from mapctl.commands.shared import inputs, options, results
@@ -17,16 +17,14 @@ from scenes.film import film
 def run(command: Chain) -> int:
     """Check everything, chain, write, tell."""
     options.check_seed(command.seed)
-    results.check_method(command.method, infiller=command.infiller)
+    results.check_method(command.method, finish=not command.no_finish, infiller=command.infiller)
     results.check_destinations(command.out, command.video, given=command.clips)
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
-    infiller = None if command.method == "linear" else priors.load_infiller(command.infiller or "infiller")
     done = chain(
         [inputs.read_motion(path, None) for path in command.clips],
-        infiller,
+        build_inbetweener(command.method, results.load_models(command.infiller, None)),
         settings=settings,
-        filling=InfillSettings(method=command.method),
-        rollout_densities=priors.load_choice("auto") if command.method == "map" else (),
+        filling=InfillSettings(finish=not command.no_finish),
         generator=torch.Generator().manual_seed(command.seed),
     )
     formats.save(done.motion, command.out)
@@ -34,12 +32,12 @@ def run(command: Chain) -> int:
         with show_progress("filming", quiet=command.quiet) as progress:
             film([(to_canonical(done.motion)[0], None)], command.video, progress=progress)
     if not command.quiet:
-        filled = int(done.lost.frames.sum())
+        filled = int(done.missing.frames.sum())
         print(
             f"{command.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(command.clips)}"
-            f" clips; {1000 * done.seconds / max(1, filled):.1f} ms a filled frame"
+            f" clips; {done.frame_ms:.1f} ms a filled frame"
         )
-        for note in (*done.notes, *done.gap_notes):
+        for note in done.notes:
             print(note)
     return 0
 

@@ -52,6 +52,7 @@ class Denoise(Command):
     again: bool = False
     """Of a folder: do files again whose result is there already."""
     strict: bool = False
-    """Exit with status 3 where the network was out of its depth for more than half of the frames."""
+    """Exit with status 3 where not all that was asked holds: the network was out of its depth for more than half of the
+    frames."""
     quiet: bool = False
     """No summary and no progress bar."""

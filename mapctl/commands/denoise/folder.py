@@ -7,7 +7,7 @@ from pathlib import Path
 import priors
 from controllers.denoising.batch import FileDenoiser, FileJob, FileResult, run_over_cluster, run_over_processes
 from controllers.denoising.denoise import DenoiseSettings
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.denoise import Denoise
 from mapctl.commands.shared import exit_status, inputs, outputs, results
@@ -91,8 +91,8 @@ class ReportWriter:
     folder: Path
     """Where reports go, by the names of the results."""
 
-    def __call__(self, job: FileJob, done: DenoiseResult) -> None:
+    def __call__(self, job: FileJob, done: DenoiseSolution) -> None:
         """One report."""
         place = (self.folder / job.out.relative_to(self.given.out)).with_suffix(".json")
         place.parent.mkdir(parents=True, exist_ok=True)
-        report.write_report(results.build_report("denoise", self.given, done.motion, done.summary()), place)
+        report.write_report(results.build_report("denoise", self.given, done), place)

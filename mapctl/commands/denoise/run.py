@@ -3,10 +3,10 @@
 import priors
 from controllers.denoising.causal import denoise_causal
 from controllers.denoising.denoise import DenoiseSettings, denoise
-from controllers.denoising.result import DenoiseResult
+from controllers.denoising.result import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.denoise import Denoise, folder
-from mapctl.commands.shared import exit_status, inputs, outputs, results
+from mapctl.commands.shared import inputs, outputs, results
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.recording.masks import load_masks
@@ -25,13 +25,11 @@ def run(command: Denoise) -> int:
     done = _run_denoising(command)
     formats.save(done.motion, command.out)
     if command.report is not None:
-        found = results.build_report("denoise", command, done.motion, done.summary())
-        report.write_report(found, command.report)
+        report.write_report(results.build_report("denoise", command, done), command.report)
     _draw_pictures(command, done)
     if not command.quiet:
         _tell(command, done)
-    lost = float(done.proposal_share.mean()) < 0.5 and done.noise.max() > 0
-    return exit_status.NOT_SATISFIED if command.strict and lost else 0
+    return results.conclude(done.status, strict=command.strict)
 
 
 def _check(command: Denoise) -> None:
@@ -42,7 +40,7 @@ def _check(command: Denoise) -> None:
     outputs.check_plot(command.plot)
 
 
-def _run_denoising(command: Denoise) -> DenoiseResult:
+def _run_denoising(command: Denoise) -> DenoiseSolution:
     settings, rig = read_settings(command), inputs.read_rig(command.rig)
     told = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
@@ -69,18 +67,17 @@ def read_settings(command: Denoise) -> DenoiseSettings:
     return DenoiseSettings(sigma_deg=command.sigma_deg, sigma_cm=command.sigma_cm, anchor=command.anchor)
 
 
-def _draw_pictures(command: Denoise, done: DenoiseResult) -> None:
+def _draw_pictures(command: Denoise, done: DenoiseSolution) -> None:
     if command.plot is not None:
         plot(done.capture, done.motion, command.plot, rig=done.rig)
     results.film_comparison(done.capture, done.motion, command.video, rig=done.rig, quiet=command.quiet)
 
 
-def _tell(command: Denoise, done: DenoiseResult) -> None:
-    summary = done.summary()
-    moved = sum(summary["correction_cm"].values()) / len(summary["correction_cm"])
+def _tell(command: Denoise, done: DenoiseSolution) -> None:
+    moved = float(done.correction()[0].mean())
     print(
         f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
-        f" {moved:.1f} cm on average; {summary['frame_ms']:.1f} ms a frame"
+        f" {moved:.1f} cm on average; {done.frame_ms:.1f} ms a frame"
     )
     for line in format_faults(done):
         print(line)
@@ -88,7 +85,7 @@ def _tell(command: Denoise, done: DenoiseResult) -> None:
         print(note)
 
 
-def format_faults(done: DenoiseResult) -> list[str]:
+def format_faults(done: DenoiseSolution) -> list[str]:
     """The faults in a few lines, a line a kind."""
     kinds: dict[str, dict[str, list]] = {}
     for fault in done.faults:
@@ -107,20 +104,20 @@ def format_faults(done: DenoiseResult) -> list[str]:
     return lines
 
 
-def format_densities(done: DenoiseResult) -> list[str]:
+def format_densities(done: DenoiseSolution) -> list[str]:
     """Which densities counted, how likely the motion is under each, and where they were out of their depth."""
-    if not done.stretches:
+    if not done.density_intervals:
         return []
-    frames = {name: 0 for name in done.stretches[0].nats}
+    frames = {name: 0 for name in done.density_intervals[0].nats}
     totals = dict.fromkeys(frames, 0.0)
-    for part in done.stretches:
+    for part in done.density_intervals:
         frames[part.prior] += part.stop - part.start
         for name, nats in part.nats.items():
             totals[name] += nats * (part.stop - part.start)
     whole = sum(frames.values())
     told = ", ".join(f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames)
     lines = [f"prior: {told} of {whole} frames"]
-    doubted = [part for part in done.stretches if part.weight < _LOW_WEIGHT]
+    doubted = [part for part in done.density_intervals if part.weight < _LOW_WEIGHT]
     if doubted:
         places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MAX_NAMED])
         rest = len(doubted) - _MAX_NAMED

@@ -5,7 +5,7 @@ from pathlib import Path
 import priors
 from mapctl import formats, report
 from mapctl.commands.follow import FollowCurve
-from mapctl.commands.shared import exit_status, inputs, options, outputs
+from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
@@ -28,9 +28,7 @@ def run(command: FollowCurve) -> int:
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))
         print("\n".join([*done.summary(), f"wrote     {files}"]))
-    if done.interrupted:
-        return exit_status.INTERRUPTED
-    return exit_status.NOT_SATISFIED if command.strict and not done.solution.status.ok else 0
+    return results.conclude(done.solution.status, strict=command.strict)
 
 
 def _check(command: FollowCurve) -> None:

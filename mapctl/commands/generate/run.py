@@ -43,7 +43,8 @@ def run(command: Generate) -> int:
         for number, seed in enumerate(_sample_seeds(command)):
             own = settings if settings.start is not None else replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
-            _write(command, map(person.on_rig, pieces), folder / f"generated_{number:03d}.bvh", frames)
+            motions = (person.on_rig(piece.motion) for piece in pieces)
+            _write(command, motions, folder / f"generated_{number:03d}.bvh", frames)
             finished(number + 1)
     return 0
 

@@ -1,7 +1,7 @@
 """`mapctl infill`: gaps and lost joints of a motion are filled in."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
@@ -23,8 +23,12 @@ class Infill(Command):
     leaping frames are looked for."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are lost, canonical names or the rig's own: in the gaps, or throughout if there are none."""
-    method: Annotated[Literal["infiller", "map", "linear"], arg(metavar="infiller|map|linear")] = "map"
-    """map: the infiller proposes, the MAP stage finishes. infiller: its proposal on rigid bones. linear: none of it."""
+    method: options.Method = "auto"
+    """Who proposes. auto: the infiller, or a density that is rolled through gaps so long that the infiller would slide,
+    or nobody where the body stands still; a note tells for every gap who. rollouts: a density, wherever nothing is
+    known. slerp: interpolation."""
+    no_finish: bool = False
+    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage puts the feet down."""
     curve: options.MaybeCurve = None
     """Where the hips go in the gaps: a CSV or SVG file, or a shape, that passes within 1 m of where each begins and
     ends."""
@@ -40,5 +44,9 @@ class Infill(Command):
     """JSON with the gaps, contacts, ledger, measures and compute."""
     video: options.MaybeFile = None
     """Film of the given motion and the whole one side by side: .mp4, .gif or .png."""
+    seed: options.Count = 0
+    """Seed of what rollouts draw."""
+    strict: bool = False
+    """Exit with status 3 where not all that was asked holds."""
     quiet: bool = False
     """No summary and no progress bar."""

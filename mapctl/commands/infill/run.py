@@ -2,8 +2,11 @@
 
 from collections.abc import Sequence
 
+import torch
+
 import priors
-from controllers.inbetweening.infill import InfillResult, InfillSettings, infill
+from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill
+from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import formats, report
 from mapctl.commands.infill import Infill
 from mapctl.commands.shared import inputs, results
@@ -24,18 +27,17 @@ def run(command: Infill) -> int:
     done = _run_infilling(command, motion, masks, rig)
     formats.save(done.motion, command.out)
     if command.report is not None:
-        found = results.build_report("infill", command, done.motion, done.summary())
-        report.write_report(found, command.report)
+        report.write_report(results.build_report("infill", command, done), command.report)
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:
         _tell(command, done)
-    return 0
+    return results.conclude(done.status, strict=command.strict)
 
 
 def _check(command: Infill) -> None:
-    if command.curve is not None and command.method == "linear":
-        raise RequestError("--curve needs a network's steps; leave --method linear out")
-    results.check_method(command.method, prior=command.prior, infiller=command.infiller)
+    if command.curve is not None and command.method == "slerp":
+        raise RequestError("--curve needs a network's steps; leave --method slerp out")
+    results.check_method(command.method, finish=not command.no_finish, prior=command.prior, infiller=command.infiller)
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
 
 
@@ -48,30 +50,24 @@ def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
     return [Mask(name, start, stop) for start, stop in gaps for name in names]
 
 
-def _run_infilling(command: Infill, motion: Motion, masks: Sequence[Mask], rig: Rig | None) -> InfillResult:
-    infiller = None if command.method == "linear" else priors.load_infiller(command.infiller or "infiller")
-    densities = priors.load_choice(command.prior)
-    rollout_densities = () if command.method != "map" else priors.load_choice(command.prior or "auto")
-    settings = InfillSettings(method=command.method)
-    course = None if command.curve is None else inputs.read_curve(command.curve, None)
+def _run_infilling(command: Infill, motion: Motion, masks: Sequence[Mask], rig: Rig | None) -> InbetweenSolution:
     return infill(
         motion,
-        infiller,
+        build_inbetweener(command.method, results.load_models(command.infiller, command.prior)),
         masks,
-        settings=settings,
-        densities=densities,
+        settings=InfillSettings(finish=not command.no_finish),
+        densities=priors.load_choice(command.prior),
         rig=rig,
-        course=course,
-        rollout_densities=rollout_densities,
+        course=None if command.curve is None else inputs.read_curve(command.curve, None),
+        generator=torch.Generator().manual_seed(command.seed),
     )
 
 
-def _tell(command: Infill, done: InfillResult) -> None:
-    summary = done.summary()
-    gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in summary["gaps"])
+def _tell(command: Infill, done: InbetweenSolution) -> None:
+    gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in done.list_gaps())
     print(
         f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
-        f" {summary['frame_ms']:.1f} ms a filled frame"
+        f" {done.frame_ms:.1f} ms a filled frame"
     )
-    for note in (*done.notes, *done.gap_notes):
+    for note in done.notes:
         print(note)

@@ -7,10 +7,11 @@ from typing import Any
 
 import priors
 import scenes
+from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.run import RunScene
 from mapctl.commands.shared import exit_status, options, outputs
-from mapctl.commands.shared.character import OutputCharacter, read_character
+from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.intent.path import PathRequest
@@ -43,7 +44,7 @@ def _walk(
     scene: SceneDescription,
     requests: Sequence[PathRequest],
     prior: LstmGmmDensity,
-    person: OutputCharacter,
+    person: Character,
 ) -> tuple[list[Walk], bool]:
     """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
     walks: list[Walk] = []

@@ -1,6 +1,5 @@
 """One walk along a curve with its measures and cost: what follow, run and demo have in common."""
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,9 +7,9 @@ from typing import Any
 
 import torch
 
+from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, follow
 from mapctl import report
-from mapctl.commands.shared.character import OutputCharacter
 from mapctl.curves.curve import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import PathRequest, SpeedProfile
@@ -34,9 +33,7 @@ class Walk:
     """Of everything random."""
     solution: Solution
     """What came out."""
-    seconds: float
-    """Wall clock of the solve."""
-    person: OutputCharacter | None = None
+    person: Character | None = None
     """Who walks, where that is not the canonical body."""
 
     @property
@@ -61,14 +58,12 @@ class Walk:
         """The report of this walk; `request` is what the user wrote."""
         card = self.prior.card
         prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
-        return report.build_report(
-            self.solution, request=request, seed=self.seed, measures=self.measures, seconds=self.seconds, prior=prior
-        )
+        return report.build_report(self.solution, request=request, measures=self.measures, seed=self.seed, prior=prior)
 
     def summary(self) -> list[str]:
         """A few lines for people."""
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
-        cost = report.summarise_timing(self.solution.windows, seconds=self.seconds)
+        cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
         motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
@@ -87,13 +82,12 @@ def walk(
     *,
     seed: int,
     progress: Progress | None = None,
-    person: OutputCharacter | None = None,
+    person: Character | None = None,
 ) -> Walk:
     """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
     prior.warm_up()
     bones = CANONICAL if person is None else person.skeleton
     settings = None if person is None else FollowSettings(footing=FootContact(rest_height=person.toe_rest_height))
-    began = time.perf_counter()
     solution = follow(
         prior,
         request.curve,
@@ -104,7 +98,7 @@ def walk(
         skeleton=bones,
         settings=settings,
     )
-    return Walk(request, prior, seed, solution, time.perf_counter() - began, person)
+    return Walk(request, prior, seed, solution, person)
 
 
 def parse_follow(curve: Curve, speed: str | float | None, seconds: float | None) -> PathRequest:

@@ -1,16 +1,20 @@
-"""What commands that give a motion back share: checks of where it goes, and a film of it beside the given one."""
+"""What commands that give a motion back share: checks, models, report, exit status, and a film beside the given one."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mapctl import __version__, formats, metrics
+import priors
+from controllers.inbetweening.proposers import ModelLoaders
+from mapctl import formats, metrics
 from mapctl import report as reports
-from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.shared import exit_status, inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
+from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.retarget.rigs import Rig
 from scenes.plots.denoising import film_side_by_side
 
@@ -27,12 +31,26 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
         outputs.check_film(video, _SIZE)
 
 
-def check_method(method: str, *, prior: str | None = None, infiller: str | None) -> None:
+def check_method(method: str, *, finish: bool, prior: str | None = None, infiller: str | None) -> None:
     """RequestError for a density or a network that is asked for by a method that has no use for it."""
-    if prior is not None and method != "map":
-        raise RequestError(f"--method {method} has no MAP stage for a density; leave --prior out")
-    if infiller is not None and method in ("linear", "slerp"):
-        raise RequestError(f"--method {method} knows no network; leave --infiller out")
+    if prior is not None and not finish and method not in ("auto", "rollouts"):
+        raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
+    if infiller is not None and method == "slerp":
+        raise RequestError("--method slerp knows no network; leave --infiller out")
+
+
+def load_models(infiller: str | None, prior: str | None) -> ModelLoaders:
+    """What in-betweeners load when they need it: the named models, or the bundled ones."""
+    return ModelLoaders(
+        partial(priors.load_infiller, infiller or "infiller"), partial(priors.load_choice, prior or "auto")
+    )
+
+
+def conclude(status: Status, *, strict: bool) -> int:
+    """Return the exit status of a command whose solve ended so; strict ones fail where not all that was asked holds."""
+    if status.outcome is Outcome.INTERRUPTED:
+        return exit_status.INTERRUPTED
+    return exit_status.NOT_SATISFIED if strict and not status.ok else 0
 
 
 def film_comparison(before: Motion, after: Motion, video: Path | None, *, rig: Rig | None, quiet: bool) -> None:
@@ -43,13 +61,8 @@ def film_comparison(before: Motion, after: Motion, video: Path | None, *, rig: R
         film_side_by_side(before, after, video, rig=rig, progress=progress)
 
 
-def build_report(name: str, command: Any, motion: Motion, found: dict[str, Any]) -> dict[str, Any]:
-    """The request, versions, what was found, and the motion's measures, as `mapctl measure` takes them."""
+def build_report(name: str, command: Any, solution: Solution) -> dict[str, Any]:
+    """Build the report on a job whose motion is measured as `mapctl measure` takes it, without a curve."""
     request = {key: value for key, value in options.describe_request(name, command).items() if value is not None}
-    return {
-        "mapctl": __version__,
-        "request": request,
-        "versions": reports.package_versions(),
-        **found,
-        "measures": metrics.measure(make_comparable(motion, inputs.read_rig(command.rig))[0]),
-    }
+    comparable = make_comparable(solution.motion, inputs.read_rig(command.rig))[0]
+    return reports.build_report(solution, request=request, measures=metrics.measure(comparable))

@@ -45,6 +45,7 @@ class Steer(Command):
     plot: options.MaybeFile = None
     """PNG of wanted and got speed and direction over time."""
     strict: bool = False
-    """Exit with status 3 where a speed was lowered to what the prior can do, or a frame was late."""
+    """Exit with status 3 where not all that was asked holds: a speed was lowered to what the prior can do, or a frame
+    was late."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -9,11 +9,12 @@ from typing import Any
 import torch
 
 import priors
+from controllers.common.character import Character
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
 from mapctl import formats, metrics, report
-from mapctl.commands.shared import exit_status, inputs, options, outputs
-from mapctl.commands.shared.character import OutputCharacter, read_character
+from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.steer import Steer
 from mapctl.features import PRIOR_FPS
@@ -21,6 +22,7 @@ from mapctl.intent.steering import CommandTrack, SteeringLimits
 from mapctl.intent.steering_csv import read_commands
 from mapctl.metrics.travel import measure_commands
 from mapctl.motion import Motion
+from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.plots.steering import plot
@@ -39,16 +41,17 @@ def run(command: Steer) -> int:
     recorder, records, frames = _run_steering(command, prior, track, person)
     motion = recorder.motion(frames)
     person.on_rig(motion).save(command.out)
-    found = _build_report(command, motion, recorder, records, track, lowered, prior)
+    arrivals = [time for time in track.times[1:] if time < motion.seconds]
+    timing = summarise_step_timing(records, arrivals) | {"peak_memory_mb": report.peak_memory_mb()}
+    done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
+    found = _build_report(command, done, track, prior, timing)
     if command.report is not None:
         report.write_report(found, command.report)
     if command.plot is not None:
         plot(motion, track, command.plot)
     if not command.quiet:
         print("\n".join(_format_summary(found, options.collect_paths(command.out, command.report, command.plot))))
-    if motion.num_frames < frames:
-        return exit_status.INTERRUPTED
-    return exit_status.NOT_SATISFIED if command.strict and (lowered or found["timing"]["late_frames"]) else 0
+    return results.conclude(done.status, strict=command.strict)
 
 
 def _check(command: Steer) -> None:
@@ -64,7 +67,7 @@ def _limits(command: Steer) -> SteeringLimits:
 
 
 def _run_steering(
-    command: Steer, prior: LstmGmmDensity, track: CommandTrack, person: OutputCharacter
+    command: Steer, prior: LstmGmmDensity, track: CommandTrack, person: Character
 ) -> tuple[Recorder, list[StepRecord], int]:
     first, recorder = track.commands[0], Recorder()
     frames = inputs.count_frames(track.times[-1] + (_LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0))
@@ -82,29 +85,29 @@ def _run_steering(
     return recorder, records, frames
 
 
+def _conclude_steering(
+    motion: Motion, recorder: Recorder, lowered: Sequence[str], timing: Mapping[str, Any], *, interrupted: bool
+) -> Solution:
+    """Sum up all steps: commands that the prior cannot do and frames that came late did not hold."""
+    late = timing["late_frames"]
+    notes = [*lowered, *([f"{late} frames came after they were due"] if late else [])]
+    status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
+    return Solution(motion, status, recorder.ledger)
+
+
 def _build_report(
-    command: Steer,
-    motion: Motion,
-    recorder: Recorder,
-    records: Sequence[StepRecord],
-    track: CommandTrack,
-    lowered: Sequence[str],
-    prior: LstmGmmDensity,
+    command: Steer, done: Solution, track: CommandTrack, prior: LstmGmmDensity, timing: Mapping[str, Any]
 ) -> dict[str, Any]:
-    cost = summarise_step_timing(records, [time for time in track.times[1:] if time < motion.seconds])
-    return {
-        "request": options.describe_request("steer", command),
-        "seed": command.seed,
-        "versions": report.package_versions(),
-        "prior": {"name": prior.name, "licence": prior.card.licence},
-        "motion": report.summarise_motion(motion),
-        "status": {"text": "; ".join(lowered) or "done", "ok": not lowered, "notes": list(lowered)},
-        "commands": measure_commands(motion, track),
-        "ledger": recorder.ledger.summary(),
-        "measures": metrics.measure(motion),
-        "mocap": report.reference_measures(prior.card.quality),
-        "timing": cost | {"peak_memory_mb": report.peak_memory_mb()},
-    }
+    card = prior.card
+    found = report.build_report(
+        done,
+        request=options.describe_request("steer", command),
+        measures=metrics.measure(done.motion),
+        seed=command.seed,
+        prior={"name": prior.name, "licence": card.licence, "quality": card.quality},
+        timing=timing,
+    )
+    return found | {"commands": measure_commands(done.motion, track)}
 
 
 @dataclass(frozen=True)

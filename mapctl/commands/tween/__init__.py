@@ -1,7 +1,7 @@
 """`mapctl tween`: a few keys to a whole motion."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import arg
 
@@ -31,10 +31,12 @@ class Tween(Command):
     keeps the given timing."""
     timing: options.MaybeName = None
     """The file or run folder of a trained keyframe timing for --suggest-timing; the bundled one if not given."""
-    method: Annotated[Literal["map", "infiller", "slerp"], arg(metavar="map|infiller|slerp")] = "map"
-    """map: the infiller proposes, or a density is rolled between keys so far apart that the infiller would slide, and
-    the MAP stage finishes; a note tells for every gap who proposed. infiller: its proposal on rigid bones. slerp: none
-    of it."""
+    method: options.Method = "auto"
+    """Who proposes. auto: the infiller, or a density that is rolled through gaps so long that the infiller would slide,
+    or nobody where the body stands still; a note tells for every gap who. rollouts: a density, wherever nothing is
+    known. slerp: interpolation."""
+    no_finish: bool = False
+    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage puts the feet down."""
     rig: options.MaybeRig = None
     """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
     infiller: options.MaybeName = None
@@ -54,5 +56,8 @@ class Tween(Command):
     """JSON with the keys, what is missed at them, contacts, ledger, measures, compute and suggested timing."""
     video: options.MaybeFile = None
     """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
+    strict: bool = False
+    """Exit with status 3 where not all that was asked holds: keys that nobody could meet in time, limbs out of
+    reach."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -2,21 +2,28 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import torch
 
 import priors
 from controllers.inbetweening.keyframe_poses import KeyframeClip, build_keyframe_clip
 from controllers.inbetweening.keyframe_timing import KeyInterval, suggest_intervals
 from controllers.inbetweening.keyframes import check_effectors
-from controllers.inbetweening.pipeline import InfillResult, InfillSettings
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.proposers import build_inbetweener
+from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
+from controllers.inbetweening.variations import Tweening
 from mapctl import formats, report
-from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared import exit_status, inputs, results
 from mapctl.commands.shared.frame_syntax import parse_frame
 from mapctl.commands.shared.tables import print_table
 from mapctl.commands.tween import Tween, variations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.keyframe_toml import KeyRequest, read_keys
 from mapctl.intent.keyframes import Keys
+from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
 
 
@@ -25,24 +32,28 @@ def run(command: Tween) -> int:
     request = _read_key_request(command)
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     asked = _read_keyframe_clip(command, request)
+    models, make = results.load_models(command.infiller, command.prior), _prepare_tweening(command, asked)
     if command.variations > 1:
-        variations.run_variations(command, asked)
-        return 0
+        ok = variations.run_variations(command, asked, make, models)
+        return exit_status.NOT_SATISFIED if command.strict and not ok else 0
     intervals = _suggest_timing(command, asked)
-    done = _run_tweening(command, asked)
+    if command.best_of > 1:
+        done = variations.tween_lowest_energy(command, make, models)
+    else:
+        done = make(build_inbetweener(command.method, models), torch.Generator().manual_seed(command.seed))
     formats.save(done.motion, command.out)
     if command.report is not None:
         report.write_report(_build_report(command, done, asked, intervals), command.report)
     results.film_comparison(asked.motion, done.motion, command.video, rig=asked.rig, quiet=command.quiet)
     if not command.quiet:
         _tell(command, done, asked, intervals)
-    return 0
+    return results.conclude(done.status, strict=command.strict)
 
 
-def _tell(command: Tween, done: InfillResult, asked: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:
+def _tell(command: Tween, done: InbetweenSolution, asked: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:
     ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
     print(f"{command.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
-    for note in (*done.notes, *done.gap_notes):
+    for note in done.notes:
         print(note)
     if intervals:
         rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
@@ -87,7 +98,7 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
     variations.check_answers(command, given)
     # Variations are rolled by a density whatever the method.
     prior = command.prior if command.variations == command.best_of == 1 else None
-    results.check_method(command.method, prior=prior, infiller=command.infiller)
+    results.check_method(command.method, finish=not command.no_finish, prior=prior, infiller=command.infiller)
 
 
 def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:
@@ -113,28 +124,28 @@ def _load_key_file(command: Tween, request: KeyRequest, rig: Rig | None) -> Keyf
         raise FileFormatError(command.source, str(error)) from error
 
 
-def _run_tweening(command: Tween, asked: KeyframeClip) -> InfillResult:
-    method = "linear" if command.method == "slerp" else command.method
-    infiller = None if method == "linear" else priors.load_infiller(command.infiller or "infiller")
+def _prepare_tweening(command: Tween, asked: KeyframeClip) -> Tweening:
+    """Prepare everything but who proposes."""
     densities = priors.load_choice(command.prior)
-    settings = InfillSettings(method=method)
-    if command.best_of > 1 and infiller is not None:
-        return variations.tween_lowest_energy(command, asked, infiller, settings)
-    rollout_densities = () if method != "map" else priors.load_choice(command.prior or "auto")
-    return tween(
-        asked.motion,
-        asked.keys,
-        infiller,
-        settings=settings,
-        densities=densities,
-        rig=asked.rig,
-        rollout_densities=rollout_densities,
-    )
+    settings = InfillSettings(finish=not command.no_finish)
+
+    def make(inbetweener: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
+        return tween(
+            asked.motion,
+            asked.keys,
+            inbetweener,
+            settings=settings,
+            densities=densities,
+            rig=asked.rig,
+            generator=generator,
+        )
+
+    return make
 
 
 def _build_report(
-    command: Tween, done: InfillResult, asked: KeyframeClip, intervals: Sequence[KeyInterval]
-) -> dict[str, object]:
-    missed = measure_keyframe_errors(done.motion, asked.motion, asked.keys, asked.rig)
-    timing = {"timing": [interval.summary() for interval in intervals]} if command.suggest_timing else {}
-    return results.build_report("tween", command, done.motion, {"keys": missed, **timing, **done.summary()})
+    command: Tween, done: InbetweenSolution, asked: KeyframeClip, intervals: Sequence[KeyInterval]
+) -> dict[str, Any]:
+    errors = measure_keyframe_errors(done.motion, asked.motion, asked.keys, asked.rig)
+    timing = {"key_timing": [interval.summary() for interval in intervals]} if command.suggest_timing else {}
+    return results.build_report("tween", command, done) | {"keys": errors, **timing}

@@ -4,21 +4,19 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
-import priors
 from controllers.inbetweening.keyframe_poses import KeyframeClip
-from controllers.inbetweening.pipeline import InfillResult, InfillSettings
+from controllers.inbetweening.proposers import ModelLoaders, Rollouts, build_inbetweener
+from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors
-from controllers.inbetweening.variations import Variations, lowest_energy, sample_variations
+from controllers.inbetweening.variations import Tweening, Variations, lowest_energy, sample_variations
 from mapctl import formats, report
 from mapctl.commands.shared import options, results
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.tween import Tween
 from mapctl.errors import RequestError
-from mapctl.protocols import Inbetweener
 
 _MAX_ANSWERS = 1000
 _FIRST_SAMPLED = 3  # answers before it are the infiller's and slerp's
@@ -40,8 +38,10 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
     if command.variations > 1 and command.best_of > 1:
         raise RequestError("--variations keeps all answers and --best-of one; choose one")
     if command.variations == 1:
-        if command.seed and command.best_of < _FIRST_SAMPLED:
-            raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --best-of 3")
+        if command.seed and command.best_of < _FIRST_SAMPLED and command.method != "rollouts":
+            raise RequestError(
+                "--seed is of what is drawn, and nothing is; ask for --variations, --best-of 3 or --method rollouts"
+            )
         results.check_destinations(command.out, command.video, command.report, given=given)
         return
     if command.suggest_timing:
@@ -52,85 +52,53 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
     results.check_destinations(first, None, *others, command.report, given=given)
 
 
-def tween_lowest_energy(
-    command: Tween, asked: KeyframeClip, infiller: Inbetweener, settings: InfillSettings
-) -> InfillResult:
-    """The likeliest of several answers."""
+def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) -> InbetweenSolution:
+    """Keep the likeliest of several answers."""
+    generator = torch.Generator().manual_seed(command.seed)
     with show_progress("answers", quiet=command.quiet) as progress:
-        return lowest_energy(
-            asked.motion,
-            asked.keys,
-            infiller,
-            command.best_of,
-            settings=settings,
-            **_load_rollout_arguments(command, asked),
-            progress=progress,
-        )
+        rollouts = Rollouts(models.densities(), models.infiller())
+        return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
 
 
-def run_variations(command: Tween, asked: KeyframeClip) -> None:
-    """Make, write, tell; the report names every file with its energy."""
-    found = _make_variations(command, asked)
+def run_variations(command: Tween, asked: KeyframeClip, make: Tweening, models: ModelLoaders) -> bool:
+    """Make, write, tell; the report names every file with its energy. Return whether all that was asked holds."""
+    generator = torch.Generator().manual_seed(command.seed)
+    with show_progress("variations", quiet=command.quiet) as progress:
+        first, rollouts = build_inbetweener(command.method, models), Rollouts(models.densities(), models.infiller())
+        found = sample_variations(make, first, rollouts, command.variations, generator=generator, progress=progress)
     files = number_paths(command.out, command.variations)
     for one, file in zip(found.each, files, strict=True):
-        formats.save(one.infill_result.motion, file)
+        formats.save(one.solution.motion, file)
     if command.report is not None:
         report.write_report(_report_variations(command, asked, found, files), command.report)
     if not command.quiet:
-        for one, file in zip(found.each, files, strict=True):
-            frames = one.infill_result.motion.num_frames
-            ms = 1000 * one.infill_result.seconds / frames
-            print(
-                f"{file}: {frames} frames through {len(asked.keys.frames)} keys; energy {one.energy:.1f} nats a"
-                f" frame; {ms:.1f} ms a frame"
-            )
+        _tell(found, files, len(asked.keys.frames))
+    return all(one.solution.status.ok for one in found.each)
+
+
+def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:
+    for one, file in zip(found.each, files, strict=True):
+        frames = one.solution.motion.num_frames
         print(
-            f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
-            f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips"
+            f"{file}: {frames} frames through {keys} keys; energy {one.energy:.1f} nats a frame;"
+            f" {1000 * one.solution.seconds / frames:.1f} ms a frame"
         )
-        first = found.each[0].infill_result
-        for note in (*first.notes, *first.gap_notes):
-            print(note)
+    print(
+        f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
+        f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips"
+    )
+    print("\n".join(found.each[0].solution.notes))
 
 
-def _make_variations(command: Tween, asked: KeyframeClip) -> Variations:
-    settings = InfillSettings(method="infiller" if command.method == "infiller" else "map")
-    infiller = priors.load_infiller(command.infiller or "infiller")
-    with show_progress("variations", quiet=command.quiet) as progress:
-        return sample_variations(
-            asked.motion,
-            asked.keys,
-            infiller,
-            command.variations,
-            settings=settings,
-            **_load_rollout_arguments(command, asked),
-            progress=progress,
-        )
-
-
-def _load_rollout_arguments(command: Tween, asked: KeyframeClip) -> dict[str, Any]:
-    """What rollouts are made by, and the rig."""
-    return {
-        "rollout_densities": priors.load_choice(command.prior or "auto"),
-        "densities": priors.load_choice(command.prior),
-        "generator": torch.Generator().manual_seed(command.seed),
-        "rig": asked.rig,
-    }
-
-
-def _report_variations(command: Tween, asked: KeyframeClip, found: Variations, files: list[Path]) -> dict[str, Any]:
+def _report_variations(
+    command: Tween, asked: KeyframeClip, found: Variations, files: Sequence[Path]
+) -> dict[str, object]:
     rows = []
     for one, file in zip(found.each, files, strict=True):
-        made = one.infill_result
-        told = {"keys": measure_keyframe_errors(made.motion, asked.motion, asked.keys, asked.rig), **made.summary()}
-        rows.append(
-            {
-                "file": str(file),
-                "energy_nats": one.energy,
-                "energy": one.ledger.summary(),
-                **results.build_report("tween", command, made.motion, told),
-            }
-        )
+        made = one.solution
+        errors = measure_keyframe_errors(made.motion, asked.motion, asked.keys, asked.rig)
+        own = {"file": str(file), "energy_nats": one.energy, "energy": one.ledger.summary(), "keys": errors}
+        rows.append(own | results.build_report("tween", command, made))
     shared = ("mapctl", "request", "versions")
-    own = [{key: value for key, value in row.items() if key not in shared} for row in rows]
-    return {**{key: rows[0][key] for key in shared}, "diversity": found.diversity._asdict(), "variations": own}
+    each = [{key: value for key, value in row.items() if key not in shared} for row in rows]
+    return {**{key: rows[0][key] for key in shared}, "diversity": found.diversity._asdict(), "variations": each}

@@ -1,0 +1,102 @@
+"""What rolling a density through a gap and beyond the end of a motion share: what comes before, and putting it in."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.motion import Motion
+from mapctl.pose import decode
+from mapctl.problem import density_selection
+from mapctl.problem.receding_horizon import CommittedFrames, replay
+from mapctl.problem.window_solvers import SolvedWindow
+from mapctl.protocols import Density, DensityState
+from mapctl.skeleton import CANONICAL
+
+_ROLLOUT_CONTACT_LOGIT = 4.0
+_PAST_FRAMES = 3  # frames before a gap that terms look back on
+
+
+def select_likeliest_density(densities: Sequence[Density], motion: Motion) -> Density:
+    """Select the density under which a canonical motion, seen with a proposal's errors, is likeliest."""
+    if len(densities) == 1:
+        return densities[0]
+    blurred = [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
+    return densities[blurred.index(density_selection.select_density_for_motion(blurred, motion).density)]
+
+
+def commit_before(
+    body: Motion,
+    contact_logits: Float[Tensor, "frames 2"],
+    start: int,
+    density: Density,
+    state: DensityState | None = None,
+    *,
+    since: int = 0,
+) -> CommittedFrames:
+    """Commit a motion's frames before a gap, with their contacts, single precision; the density sees those that its
+    state, if there is one, has not: from frame `since` on.
+    """
+    features, before = encode(body.slice(0, max(2, start)))
+    ground, heading = integrate_root(features, before)
+    features[:, LAYOUT.slices["contacts"]] = (contact_logits[: len(features)] > 0).to(features)
+    features = features[:start].float()
+    place = GroundPose(ground[start - 1].float(), heading[start - 1].float())
+    past = body.slice(max(0, start - _PAST_FRAMES), start).joint_positions().float()
+    seen = state if state is not None and since >= start else replay(density, features, state, since=since)
+    return CommittedFrames(seen, place, features, past)
+
+
+def insert_rollout(
+    body: Motion,
+    contact_logits: Float[Tensor, "frames 2"],
+    window: SolvedWindow,
+    place: GroundPose,
+    gap: tuple[int, int],
+    *,
+    tempo: float = 1.0,
+) -> tuple[Motion, Float[Tensor, "frames 2"], float]:
+    """Insert a rollout in its gap, moved so that it arrives at the frame after it, if there is one; also returns the
+    contact logits, and by how much it had missed that frame, mean distance of the joints, metres.
+    """
+    start, stop = gap
+    made = decode(window.trial.features[0], GroundPose(place.position_xz.double(), place.heading.double()))
+    count, missed = stop - start, 0.0
+    made, planted = _warp_time(made, window.trial.contacts[0], max(1, round(count * tempo)), count)
+    share = torch.sin(0.5 * torch.pi * torch.arange(1, count + 1) / (count + 1)).square()[:, None].double()
+    root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), contact_logits.clone()
+    root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
+    if count < len(made.root_position):
+        there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
+        missed = float((there.joint_positions() - here.joint_positions()).norm(dim=-1).mean())
+        root[start:stop] += share * (root[stop] - made.root_position[count])
+        turn = rotations.multiply(rotations.inverse(made.local_quat_xyzw[count]), quats[stop])
+        turned = rotations.from_rotation_vector(share[..., None] * rotations.to_rotation_vector(turn))
+        quats[start:stop] = rotations.multiply(quats[start:stop], turned)
+    put = torch.zeros(len(root), dtype=torch.bool)
+    put[start:stop] = True
+    root = blend_seams_in_positions(root, put, fps=PRIOR_FPS)
+    quats = blend_seams_in_rotations(quats, put[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
+    logits[start:stop] = _ROLLOUT_CONTACT_LOGIT * (2 * planted[:count].to(logits) - 1)
+    return replace(body, root_position=root, local_quat_xyzw=quats), logits, missed
+
+
+def _warp_time(
+    made: Motion, planted: Bool[Tensor, "rolled 2"], own: int, count: int
+) -> tuple[Motion, Bool[Tensor, "frames 2"]]:
+    """Resample what took `own` frames, from the frame before to the one after them, to `count`, and drop the rest."""
+    if own == count:
+        return made, planted
+    last = min(len(made.root_position) - 1, own)
+    at = (torch.arange(count + 1, dtype=torch.float64) + 1) * (own + 1) / (count + 1) - 1
+    at = at.clamp(0, last)
+    low, high = at.floor().long(), at.ceil().long()
+    share = (at - low)[:, None]
+    quats = rotations.slerp(made.local_quat_xyzw[low], made.local_quat_xyzw[high], share.expand(-1, made.num_joints))
+    root = torch.lerp(made.root_position[low], made.root_position[high], share)
+    return replace(made, root_position=root, local_quat_xyzw=quats), planted[at.round().long()]

@@ -1,0 +1,62 @@
+"""What in-betweening returns: a whole motion, who proposed what of it, and what of it is new."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.query import GapSource
+from mapctl.numerics.intervals import true_intervals
+from mapctl.problem.solution import Solution
+from mapctl.retarget.rigs import Rig
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InbetweenSolution(Solution):
+    """A whole motion on the given rig, at its rate, with all of its frames."""
+
+    missing: MissingMask
+    """What was filled in, by joint of the rig."""
+    rig: Rig
+    """The rig as it was identified."""
+    contacts: Bool[Tensor, "frames 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.bool))
+    """Left and right toe planted, at PRIOR_FPS."""
+    sources: tuple[GapSource, ...] = ()
+    """Who proposed the motion in each gap in which nothing was known."""
+    gap_notes: tuple[str, ...] = ()
+    """A line on each of these: who, how sure, and what nobody knows."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All that the user should know: the status's sentences, then those on the gaps."""
+        return (*self.status.notes, *self.gap_notes)
+
+    @property
+    def frame_ms(self) -> float:
+        """Compute of each filled frame, milliseconds."""
+        return 1000 * self.seconds / max(1, int(self.missing.frames.sum()))
+
+    def list_gaps(self) -> list[dict[str, Any]]:
+        """List what was filled in: frames, how many joints of the rig, and whether the body's position was missing."""
+        joints, root = self.missing.joints, self.missing.root
+        return [
+            {
+                "start": start,
+                "stop": stop,
+                "joints": int(joints[start:stop].any(dim=0).sum()),
+                "root": bool(root[start:stop].any()),
+            }
+            for _, start, stop in true_intervals(self.missing.frames[:, None])
+        ]
+
+    def details(self) -> dict[str, Any]:
+        """Return gaps, who filled them, contacts at PRIOR_FPS, and compute of each filled frame."""
+        return {
+            "gaps": self.list_gaps(),
+            "gap_notes": list(self.gap_notes),
+            "contacts": self.contacts.tolist(),
+            "frame_ms": self.frame_ms,
+        }

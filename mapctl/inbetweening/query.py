@@ -1,0 +1,106 @@
+"""What an in-betweener is asked, a motion with gaps, and what it answers, a motion without them."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import contacts
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
+
+_CERTAIN_LOGIT = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class GapQuery:
+    """A motion with gaps on canonical joints at PRIOR_FPS, and what is wanted in them."""
+
+    motion: Motion
+    """Motion on the character's own bones, interpolated where values are missing."""
+    missing: MissingMask
+    """Rotations of canonical joints and root positions that are missing."""
+    seconds: Float[Tensor, " frames"]
+    """Time of each frame, seconds. A key between two frames is taken for one of them and stays at its own time."""
+    effector_targets: EffectorTargets | None = None
+    """World positions wanted of joints in frames in which they are missing."""
+    keep_trajectory: bool = False
+    """Whether the root of `motion` shows the wanted trajectory where it is missing; it may sway about that."""
+
+    @property
+    def known_positions(self) -> Bool[Tensor, "frames joints"]:
+        """Joints whose world position is known: the root and all rotations that carry them are."""
+        known = [~self.missing.root]
+        for parent in CANONICAL.parents[1:]:
+            known.append(known[parent] & ~self.missing.joints[:, parent])
+        known[0] = ~(self.missing.root | self.missing.joints[:, 0])
+        return torch.stack(known, dim=1)
+
+    @property
+    def nothing_known(self) -> Bool[Tensor, " frames"]:
+        """Frames of which nothing is known."""
+        return self.missing.joints.all(dim=1) & self.missing.root
+
+    @property
+    def enclosed_gaps(self) -> list[tuple[int, int]]:
+        """First frames and one past the last of gaps in which nothing is known, with known frames on both sides."""
+        gaps = true_intervals(self.nothing_known[:, None])
+        return [(start, stop) for _, start, stop in gaps if start > 0 and stop < self.motion.num_frames]
+
+    @property
+    def scale(self) -> float:
+        """Ratio of the character's leg length to the canonical one."""
+        return leg_length(self.motion.skeleton) / leg_length(CANONICAL)
+
+    def to_unit_size(self, motion: Motion) -> Motion:
+        """Return a motion of the character on the canonical skeleton, whose size models know."""
+        return replace(motion, skeleton=CANONICAL, root_position=motion.root_position / self.scale)
+
+    def to_character(self, motion: Motion) -> Motion:
+        """Return a motion of unit size on the character's bones."""
+        return replace(motion, skeleton=self.motion.skeleton, root_position=motion.root_position * self.scale)
+
+
+@dataclass(frozen=True)
+class GapSource:
+    """Who proposed the motion in one gap."""
+
+    start: int
+    """First frame of the gap, at PRIOR_FPS."""
+    stop: int
+    """One past the last frame of the gap."""
+    by: str
+    """Name of the in-betweener, as in `infiller` or `rollout of locomotion`."""
+    reason: str = ""
+    """Why another one that was asked first did not propose; empty where it was not so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A motion proposed for all gaps of a query."""
+
+    motion: Motion
+    """Motion of the query's frames on the character's bones; what is known may have moved."""
+    contact_logits: Float[Tensor, "frames 2"]
+    """Contact logits of the left and the right toe."""
+    source: str
+    """Name of the in-betweener that proposed what `others` did not."""
+    others: tuple[GapSource, ...] = ()
+    """Gaps that others proposed, or that were left to `source` for a reason."""
+
+    def attribute(self, query: GapQuery) -> tuple[GapSource, ...]:
+        """Name who proposed each gap with known frames on both sides, and the others' gaps, in the order of time."""
+        named = {start: GapSource(start, stop, self.source) for start, stop in query.enclosed_gaps}
+        named |= {other.start: other for other in self.others}
+        return tuple(named[start] for start in sorted(named))
+
+
+def estimate_contact_logits(motion: Motion) -> Float[Tensor, "frames 2"]:
+    """Estimate contact logits of a canonical motion from how low and slow its toes are."""
+    planted = contacts.detect_contacts(motion.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS)
+    return _CERTAIN_LOGIT * (2 * planted.float() - 1)

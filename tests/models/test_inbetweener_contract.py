@@ -1,0 +1,84 @@
+"""What every in-betweener keeps to, whoever wrote it."""
+
+import inspect
+
+import linear_inbetweener
+import pytest
+import torch
+from captures import on_rig
+from catalogue import INBETWEENERS
+
+from controllers.common.canonical_clip import CanonicalClip
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.protocols import Inbetweener
+from mapctl.recording.masks import ALL, Mask
+from mapctl.retarget import to_canonical
+
+FRAMES = 50
+MASKS = {
+    "a gap": [Mask(ALL, 15, 25)],
+    "two gaps": [Mask(ALL, 10, 20), Mask(ALL, 30, 33)],
+    "an arm": [Mask("leftLowerArm", 0, FRAMES), Mask("leftHand", 0, FRAMES)],
+    "both ends": [Mask(ALL, 0, 6), Mask(ALL, 44, FRAMES)],
+}
+
+
+def query_of(masks, rig="canonical"):
+    motion = on_rig(rig, FRAMES)
+    return CanonicalClip.of(motion, MissingMask.of_masks(motion, masks, to_canonical(motion)[1])).query()
+
+
+def test_the_one_of_the_tests_is_short():
+    """20 lines from protocols.py alone are all that a newcomer has to write."""
+    assert len(inspect.getsource(linear_inbetweener.LinearInbetweener).splitlines()) <= 20
+
+
+@pytest.mark.parametrize("what", MASKS)
+@pytest.mark.parametrize("kind", INBETWEENERS)
+def test_a_proposal_is_a_whole_motion_of_the_query_s_body(kind, what):
+    inbetweener, query = INBETWEENERS[kind], query_of(MASKS[what])
+    assert isinstance(inbetweener, Inbetweener)
+    answer = inbetweener.propose(query)
+    assert (answer.motion.num_frames, answer.motion.fps) == (query.motion.num_frames, query.motion.fps)
+    assert answer.motion.skeleton is query.motion.skeleton
+    assert bool(answer.motion.joint_positions().isfinite().all())
+    assert answer.contact_logits.shape == (query.motion.num_frames, 2)
+    torch.testing.assert_close(answer.motion.local_quat_xyzw.norm(dim=-1), torch.ones(()).double().expand(FRAMES, 21))
+
+
+@pytest.mark.parametrize("kind", INBETWEENERS)
+def test_what_is_known_hardly_moves_and_the_query_not_at_all(kind):
+    query = query_of(MASKS["two gaps"])
+    before = query.motion.local_quat_xyzw.clone()
+    answer, known = INBETWEENERS[kind].propose(query), ~query.missing.frames
+    apart = (answer.motion.joint_positions() - query.motion.joint_positions()).norm(dim=-1)
+    assert float(apart[known].max()) < 1e-3
+    assert torch.equal(query.motion.local_quat_xyzw, before)
+
+
+@pytest.mark.parametrize("kind", INBETWEENERS)
+def test_every_gap_is_somebody_s_and_the_same_generator_gives_the_same(kind):
+    query = query_of(MASKS["two gaps"])
+    one, other = (INBETWEENERS[kind].propose(query, generator=torch.Generator().manual_seed(3)) for _ in range(2))
+    sources = one.attribute(query)
+    assert [(source.start, source.stop) for source in sources] == [(10, 20), (30, 33)]
+    assert all(source.by for source in sources)
+    assert sources == other.attribute(query)
+    assert torch.equal(one.motion.local_quat_xyzw, other.motion.local_quat_xyzw)
+
+
+@pytest.mark.parametrize("kind", INBETWEENERS)
+def test_a_larger_body_moves_alike(kind):
+    """What is asked is asked at the size that models know, whatever the performer's."""
+    query = query_of(MASKS["a gap"], "daz")
+    answer = INBETWEENERS[kind].propose(query)
+    assert answer.motion.skeleton is query.motion.skeleton
+    heights = answer.motion.root_position[:, 1]
+    assert 0.8 < float(heights.min() / query.motion.root_position[:, 1].min()) < 1.25
+
+
+def test_a_gap_that_rollouts_do_not_take_is_left_to_their_fallback_and_said():
+    query = query_of([Mask(ALL, 10, 11), Mask(ALL, 20, 30)])
+    short, rolled = INBETWEENERS["rollouts"].propose(query).attribute(query)
+    assert (short.by, rolled.by) == ("slerp", "rollout of tiny")
+    assert short.reason.startswith("rollouts take 0.1 to ")
