@@ -9,7 +9,7 @@ from tiny_infiller import tiny_infiller
 from tiny_refiner import refiner_of
 from toy_density import toy_density
 
-from controllers.inbetweening.proposers import Auto, Rollouts, Slerp
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from mapctl import curves
 from mapctl.curves import Curve
@@ -144,9 +144,9 @@ _QUICK = RolloutSettings(
 )
 INBETWEENERS: dict[str, Inbetweener] = {
     "infiller": tiny_infiller(drawn=0.02),
-    "slerp": Slerp(),
-    "rollouts": Rollouts([tiny_density()], Slerp(), _QUICK),
-    "auto": Auto(tiny_infiller(drawn=0.02), [tiny_density()]),
+    "slerp": SlerpInbetweener(),
+    "rollouts": RolloutInbetweener([tiny_density()], SlerpInbetweener(), _QUICK),
+    "auto": AutoInbetweener(tiny_infiller(drawn=0.02), [tiny_density()]),
     "linear": LinearInbetweener(),
 }
 """One of each method, and one that knows only `mapctl.protocols`."""

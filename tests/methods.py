@@ -1,7 +1,7 @@
 """How tests fill gaps: `auto` is finished by the MAP stage, `infiller` and `slerp` stay as they are proposed."""
 
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import Auto, Slerp
+from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from mapctl.protocols import Inbetweener
 
 UNFINISHED = InfillSettings(finish=False)
@@ -9,9 +9,9 @@ UNFINISHED = InfillSettings(finish=False)
 
 def by_method(method: str, infiller: Inbetweener) -> tuple[Inbetweener, InfillSettings]:
     """Who proposes, and how it is finished."""
-    return {"auto": Auto, "infiller": lambda it: it, "slerp": lambda it: Slerp()}[method](infiller), InfillSettings(
-        finish=method == "auto"
-    )
+    return {"auto": AutoInbetweener, "infiller": lambda it: it, "slerp": lambda it: SlerpInbetweener()}[method](
+        infiller
+    ), InfillSettings(finish=method == "auto")
 
 
 def words_of(method: str) -> list[str]:

@@ -7,7 +7,7 @@ import torch
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.error_estimates import is_travelling
 from controllers.inbetweening.pipeline import fill
-from controllers.inbetweening.proposers import Auto
+from controllers.inbetweening.proposers import AutoInbetweener
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import worst_frame
@@ -59,7 +59,7 @@ def _evaluate_gap(
     free = torch.zeros(part.num_frames, dtype=torch.bool)
     free[beside : beside + length] = True
     lost = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
-    done = fill(part, lost, Auto(infiller, densities))
+    done = fill(part, lost, AutoInbetweener(infiller, densities))
     off = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = CANONICAL.indices(TOES)
     slid, mocap = (

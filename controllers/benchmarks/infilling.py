@@ -12,7 +12,7 @@ from torch import Tensor
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import Auto, Slerp
+from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import PositionImage
@@ -106,7 +106,7 @@ def benchmark_infilling_by_kind(kinds: Mapping[str, Sequence[Motion]], infiller:
             pairs = [
                 [
                     float(_evaluate_infill(clip, masks, by, settings).errors.mean())
-                    for by, settings in ((Slerp(), _UNFINISHED), (Auto(infiller), None))
+                    for by, settings in ((SlerpInbetweener(), _UNFINISHED), (AutoInbetweener(infiller), None))
                 ]
                 for clip in shown
             ]
@@ -140,8 +140,8 @@ def _evaluate_task(
         masks = [Mask(ALL, (task.frames - task.gap) // 2, (task.frames + task.gap) // 2)]
         methods = (
             (f"{ours}, on rigid bones", networks[ours], _UNFINISHED),
-            (f"{ours}, and MAP", Auto(networks[ours]), None),
-            ("interpolation", Slerp(), _UNFINISHED),
+            (f"{ours}, and MAP", AutoInbetweener(networks[ours]), None),
+            ("interpolation", SlerpInbetweener(), _UNFINISHED),
         )
         for name, inbetweener, settings in methods:
             done = [_evaluate_infill(clip, masks, inbetweener, settings) for clip in clips]

@@ -10,7 +10,7 @@ from torch import Tensor
 from controllers.benchmarks.infilling import WINDOW_FRAMES, scale_to_canonical_bones, slice_middle
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.proposers import Auto
+from controllers.inbetweening.proposers import AutoInbetweener
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import Mask
@@ -36,7 +36,9 @@ def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], infiller: In
         for name, joints in MISSING_LIMBS.items():
             found = []
             for clip in clips:
-                made = infill(clip, Auto(infiller), [Mask(joint, 0, clip.num_frames) for joint in joints]).motion
+                made = infill(
+                    clip, AutoInbetweener(infiller), [Mask(joint, 0, clip.num_frames) for joint in joints]
+                ).motion
                 tried = [
                     *(replace_joint_rotations(clip, joints, pose) for pose in (usual_pose, mean_rotations([clip]))),
                     made,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.proposers import Auto, Rollouts
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener
 from controllers.inbetweening.proposers.rolling import select_likeliest_density
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import tween
@@ -56,7 +56,7 @@ def benchmark_tweening(
         ]
         shown = [clip.slice(0, _END_SOURCE_FRAMES) for clip in clips if clip.num_frames >= _END_SOURCE_FRAMES]
         for count in _END_LENGTHS:
-            for by, inbetweener in (("infiller", infiller), ("density", Auto(infiller, densities))):
+            for by, inbetweener in (("infiller", infiller), ("density", AutoInbetweener(infiller, densities))):
                 each = [_evaluate_end(clip, count, inbetweener) for clip in shown]
                 if each:
                     told_end = {"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each)}
@@ -74,10 +74,10 @@ def _tween_all_ways(
     def make(inbetweener: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
         return tween(clip, keys, inbetweener, generator=generator)
 
-    yield make(Auto(infiller, densities), draws)
+    yield make(AutoInbetweener(infiller, densities), draws)
     density = select_likeliest_density(densities, to_canonical(clip)[0])
-    yield make(Rollouts([density], infiller), draws)
-    yield lowest_energy(make, Rollouts(densities, infiller), _NUM_ALTERNATIVES, generator=draws)
+    yield make(RolloutInbetweener([density], infiller), draws)
+    yield lowest_energy(make, RolloutInbetweener(densities, infiller), _NUM_ALTERNATIVES, generator=draws)
 
 
 def _evaluate_tween(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:

@@ -7,10 +7,10 @@ import torch
 
 from controllers.common.map_refinement import RefinementSettings
 from controllers.common.score import score
-from controllers.inbetweening.proposers.auto import Auto
+from controllers.inbetweening.proposers.auto import AutoInbetweener
 from controllers.inbetweening.proposers.rolling import select_likeliest_density
-from controllers.inbetweening.proposers.rollouts import Rollouts
-from controllers.inbetweening.proposers.slerp import Slerp
+from controllers.inbetweening.proposers.rollouts import RolloutInbetweener
+from controllers.inbetweening.proposers.slerp import SlerpInbetweener
 from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.solution import InbetweenSolution
 from mapctl.errors import RequestError
@@ -56,7 +56,7 @@ class Variations:
 def sample_variations(
     make: Tweening,
     first: Inbetweener,
-    rollouts: Rollouts,
+    rollouts: RolloutInbetweener,
     count: int,
     *,
     generator: torch.Generator,
@@ -81,7 +81,7 @@ def sample_variations(
 
 def lowest_energy(
     make: Tweening,
-    rollouts: Rollouts,
+    rollouts: RolloutInbetweener,
     count: int,
     *,
     generator: torch.Generator,
@@ -93,7 +93,7 @@ def lowest_energy(
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"the best is of 2 to {MAX_VARIATIONS}, got {count}")
-    found = [_make_first(make, Auto(rollouts.fallback), generator), make(Slerp(), generator)]
+    found = [_make_first(make, AutoInbetweener(rollouts.fallback), generator), make(SlerpInbetweener(), generator)]
     density = _select_density(rollouts, found[0])
     found += _sample_rollouts(make, replace(rollouts, densities=[density]), count - 2, generator, progress)
     nats = [_score_variation(one, density, refinement).energy for one in found]
@@ -112,7 +112,7 @@ def _make_first(make: Tweening, first: Inbetweener, generator: torch.Generator) 
     return made
 
 
-def _select_density(rollouts: Rollouts, made: InbetweenSolution) -> Density:
+def _select_density(rollouts: RolloutInbetweener, made: InbetweenSolution) -> Density:
     return select_likeliest_density(rollouts.densities, to_canonical(made.motion, made.rig)[0])
 
 
@@ -122,7 +122,7 @@ def _score_variation(made: InbetweenSolution, density: Density, refinement: Refi
 
 def _sample_rollouts(
     make: Tweening,
-    rollouts: Rollouts,
+    rollouts: RolloutInbetweener,
     count: int,
     generator: torch.Generator,
     progress: Callable[[int, int], None] | None,

@@ -10,7 +10,7 @@ from rig_maker import Make, make, names_of
 
 from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.chain import ChainSettings, chain
-from controllers.inbetweening.proposers import Slerp
+from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
 from mapctl.motion import Motion
 from mapctl.skeleton import TOE_REST_HEIGHT
@@ -37,7 +37,9 @@ def foot_of(motion: Motion) -> str:
 
 def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
     settings = ChainSettings(piece=40, gap=(10, 10))
-    done = chain([own_walk(), others_walk()], Slerp(), settings=settings, filling=UNFINISHED, generator=generator())
+    done = chain(
+        [own_walk(), others_walk()], SlerpInbetweener(), settings=settings, filling=UNFINISHED, generator=generator()
+    )
     toes = retarget.to_canonical(done.motion)[0].joint_positions()[:, TOES, 1]
     for piece in (slice(0, 40), slice(50, 90)):
         torch.testing.assert_close(toes[piece].amin(0), torch.full((2,), TOE_REST_HEIGHT).double(), atol=0.01, rtol=0)
@@ -48,7 +50,7 @@ def test_a_borrowed_foot_is_as_high_as_it_was():
     motion, source = own_walk(), others_walk()
     name = foot_of(motion)
     borrowed = LimbTransfer((name,), start=40, stop=60, at=40)
-    done = blend(motion, source, borrowed, Slerp(), settings=UNFINISHED)
+    done = blend(motion, source, borrowed, SlerpInbetweener(), settings=UNFINISHED)
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
     torch.testing.assert_close(after, before, atol=0.015, rtol=0)
 
@@ -57,6 +59,8 @@ def test_a_clip_of_the_same_rig_is_blended_as_it_is():
     motion = own_walk()
     name = foot_of(motion)
     lifted = replace(motion, root_position=motion.root_position + 0.2)
-    done = blend(motion, lifted, LimbTransfer((name,), start=40, stop=60, at=40), Slerp(), settings=UNFINISHED)
+    done = blend(
+        motion, lifted, LimbTransfer((name,), start=40, stop=60, at=40), SlerpInbetweener(), settings=UNFINISHED
+    )
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
     torch.testing.assert_close(after, before, atol=1e-4, rtol=0)

@@ -10,7 +10,7 @@ from methods import UNFINISHED, by_method
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.proposers import Slerp
+from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
 from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
@@ -88,7 +88,7 @@ def test_what_stands_in_the_gap_does_not_matter(rig, method):
 def test_linear_is_straight_lines_and_needs_no_network():
     motion = on_rig("bandai", 45)
     mask = Mask(ALL, 15, 25)
-    made = infill(motion, Slerp(), [mask], settings=UNFINISHED).motion
+    made = infill(motion, SlerpInbetweener(), [mask], settings=UNFINISHED).motion
     assert same(made, interpolate_missing(motion, lost_of(motion, [mask])))
 
 

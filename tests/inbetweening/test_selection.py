@@ -10,7 +10,12 @@ from tiny_infiller import tiny_infiller
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.error_estimates import estimate_error
 from controllers.inbetweening.geometry.footholds import hold_planted
-from controllers.inbetweening.proposers.auto import STANDING_STILL, Auto, ChoiceSettings, compute_artefact_cost
+from controllers.inbetweening.proposers.auto import (
+    STANDING_STILL,
+    AutoInbetweener,
+    ChoiceSettings,
+    compute_artefact_cost,
+)
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.tween import tween
 from mapctl import contacts
@@ -48,7 +53,7 @@ def chosen(motion, start, stop, *, densities=(), settings=QUICK):
     free = torch.zeros(motion.num_frames, dtype=torch.bool)
     free[start:stop] = True
     query = CanonicalClip.of(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)).query()
-    return query, Auto(Lines(), densities, settings).propose(query)
+    return query, AutoInbetweener(Lines(), densities, settings).propose(query)
 
 
 def still(frames):
@@ -70,7 +75,7 @@ def test_the_infiller_is_asked_alone_for_what_it_knows(start, stop, asked):
 def test_somebody_who_stands_stays_where_he_is(seconds):
     motion = still(30 * seconds + 1)
     wandering = tiny_infiller(drawn=0.05)
-    done = tween(motion, Keys((0, 30 * seconds)), Auto(wandering, [tiny_density()]))
+    done = tween(motion, Keys((0, 30 * seconds)), AutoInbetweener(wandering, [tiny_density()]))
     assert [source.by for source in done.sources] == [STANDING_STILL]
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)
     assert away.max() < 0.02
@@ -134,7 +139,7 @@ def test_planted_toes_are_held_and_what_is_known_stays():
 
 def test_a_long_morph_of_somebody_who_moves_is_called_one():
     motion = walk(100)
-    done = tween(motion, Keys((0, 99)), Auto(tiny_infiller()))  # straight lines
+    done = tween(motion, Keys((0, 99)), AutoInbetweener(tiny_infiller()))  # straight lines
     (note,) = done.gap_notes
     assert "a still morph" in note
     assert "longer than the" in note

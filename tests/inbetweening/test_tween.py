@@ -10,7 +10,7 @@ from methods import UNFINISHED, by_method
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.proposers import Slerp
+from controllers.inbetweening.proposers import SlerpInbetweener
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -243,7 +243,7 @@ def test_keys_of_several_kinds_are_met_each_in_its_own():
 
 def test_slerp_is_the_interpolation_on_the_rig_itself():
     motion = on_rig("canonical", 30)
-    made = tween(motion, Keys((0, 29)), Slerp(), settings=UNFINISHED).motion
+    made = tween(motion, Keys((0, 29)), SlerpInbetweener(), settings=UNFINISHED).motion
     assert same(made, interpolate_missing(motion, keyed(motion, (0, 29))))
 
 

@@ -16,7 +16,7 @@ import priors
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import Auto, Rollouts, Slerp
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.tween import tween
@@ -76,8 +76,8 @@ def making(motion, keys):
 
 
 def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
-    make, rollouts = making(motion, Keys.of(keys, **told)), Rollouts([prior], INFILLER, QUICK)
-    first = Auto(INFILLER, [prior])
+    make, rollouts = making(motion, Keys.of(keys, **told)), RolloutInbetweener([prior], INFILLER, QUICK)
+    first = AutoInbetweener(INFILLER, [prior])
     refinement = FEW.refinement
     return sample_variations(make, first, rollouts, count, generator=generator(seed), refinement=refinement)
 
@@ -100,7 +100,7 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
 
 def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prior):
     motion = on_rig("canonical", FRAMES)
-    alone = tween(motion, Keys(KEYS), Auto(INFILLER), settings=FEW).motion
+    alone = tween(motion, Keys(KEYS), AutoInbetweener(INFILLER), settings=FEW).motion
     two, three = (asked(motion, prior, count=count).each for count in (2, 3))
     assert torch.equal(two[0].solution.motion.local_quat_xyzw, alone.local_quat_xyzw)
     for one, other in zip(two, three[:2], strict=True):
@@ -124,8 +124,8 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     free[:5] = free[20:30] = free[40:] = True
     missing = MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
     gap = CanonicalClip.of(motion, missing).query()
-    logits = Slerp().propose(gap).contact_logits
-    answer = Rollouts([tiny_density()], Slerp(), QUICK).propose(gap, generator=generator(0))
+    logits = SlerpInbetweener().propose(gap).contact_logits
+    answer = RolloutInbetweener([tiny_density()], SlerpInbetweener(), QUICK).propose(gap, generator=generator(0))
     made, bits = answer.motion, answer.contact_logits
     assert [(source.start, source.stop) for source in answer.attribute(gap)] == [(20, 30)]
     same = torch.ones(FRAMES, dtype=torch.bool)
@@ -140,7 +140,7 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
     plain, made, again = (
-        infill(motion, inbetweener, masks) for inbetweener in (INFILLER, *[Auto(INFILLER, [prior])] * 2)
+        infill(motion, inbetweener, masks) for inbetweener in (INFILLER, *[AutoInbetweener(INFILLER, [prior])] * 2)
     )
     known = ~made.missing.frames
     for one in (plain, made):
@@ -169,7 +169,7 @@ def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(
         def with_observation_noise(self, sigma):
             return self
 
-    done = infill(on_rig("canonical", FRAMES), Auto(tiny_infiller(), [Stern()]), [Mask("*", 30, 45)])
+    done = infill(on_rig("canonical", FRAMES), AutoInbetweener(tiny_infiller(), [Stern()]), [Mask("*", 30, 45)])
     assert done.notes == ("a gap at the end: the motion is extended by infiller, with nothing after it to meet",)
 
 
@@ -187,7 +187,7 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
 @pytest.mark.parametrize("keys", [KEYS, (0, 44)])
 def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     motion = on_rig("canonical", FRAMES)
-    rollouts = Rollouts([prior], INFILLER, QUICK)
+    rollouts = RolloutInbetweener([prior], INFILLER, QUICK)
     make = making(motion, Keys(keys))
     made = lowest_energy(make, rollouts, 4, generator=generator(0), refinement=FEW.refinement)
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
@@ -204,7 +204,7 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
 
 
 def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
-    motion, rollouts = on_rig("canonical", FRAMES), Rollouts([prior], INFILLER)
+    motion, rollouts = on_rig("canonical", FRAMES), RolloutInbetweener([prior], INFILLER)
     with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):
         lowest_energy(making(motion, Keys(KEYS)), rollouts, 1, generator=generator(0))
     with pytest.raises(RequestError, match="leaves nothing to vary"):

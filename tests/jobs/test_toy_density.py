@@ -15,7 +15,7 @@ from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import Auto, Rollouts
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.tween import tween
 from controllers.steering import steer
@@ -86,7 +86,7 @@ def test_it_is_a_prior_of_denoising():
 @pytest.mark.parametrize("gap", [(12, 22), (30, 40)])
 def test_it_is_a_prior_of_infilling_and_extends_an_end(gap):
     motion, masks, infiller = on_rig("bandai", 40), [Mask("*", *gap)], tiny_infiller(drawn=0.02)
-    done = infill(motion, Auto(infiller, [TOY]), masks, settings=FILLING, densities=[TOY])
+    done = infill(motion, AutoInbetweener(infiller, [TOY]), masks, settings=FILLING, densities=[TOY])
     check(done.motion, 40)
     assert "likelihood" in [entry.name for entry in done.ledger.entries]
     assert not torch.equal(
@@ -99,7 +99,7 @@ def test_it_is_a_prior_of_tweening_and_proposes_rollouts():
     infiller = tiny_infiller(drawn=0.02)
     quick = LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=6), budget=Budget(evaluations=20))
     rolling = RolloutSettings(ahead=4, method=quick)
-    for inbetweener in (Auto(infiller, [TOY]), Rollouts([TOY], infiller, rolling)):
+    for inbetweener in (AutoInbetweener(infiller, [TOY]), RolloutInbetweener([TOY], infiller, rolling)):
         done = tween(motion, keys, inbetweener, settings=FILLING, densities=[TOY])
         check(done.motion, 40)
         torch.testing.assert_close(done.motion.local_quat_xyzw[[0, 20, 39]], motion.local_quat_xyzw[[0, 20, 39]])

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from controllers.inbetweening.proposers.auto import Auto
-from controllers.inbetweening.proposers.rollouts import Rollouts
-from controllers.inbetweening.proposers.slerp import Slerp
+from controllers.inbetweening.proposers.auto import AutoInbetweener
+from controllers.inbetweening.proposers.rollouts import RolloutInbetweener
+from controllers.inbetweening.proposers.slerp import SlerpInbetweener
 from mapctl.errors import RequestError
 from mapctl.protocols import Density, Inbetweener
 
-__all__ = ["METHODS", "Auto", "ModelLoaders", "Rollouts", "Slerp", "build_inbetweener"]
+__all__ = ["METHODS", "AutoInbetweener", "ModelLoaders", "RolloutInbetweener", "SlerpInbetweener", "build_inbetweener"]
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class ModelLoaders:
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
-    "auto": lambda models: Auto(models.infiller(), models.densities()),
+    "auto": lambda models: AutoInbetweener(models.infiller(), models.densities()),
     "infiller": lambda models: models.infiller(),
-    "rollouts": lambda models: Rollouts(models.densities(), models.infiller()),
-    "slerp": lambda models: Slerp(),
+    "rollouts": lambda models: RolloutInbetweener(models.densities(), models.infiller()),
+    "slerp": lambda models: SlerpInbetweener(),
 }
 """In-betweeners by the name of the method that chooses them."""
 _RENAMED = {"map": "--method auto", "linear": "--method slerp --no-finish"}

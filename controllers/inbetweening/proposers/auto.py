@@ -88,7 +88,7 @@ class ChoiceSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Auto(Inbetweener):
+class AutoInbetweener(Inbetweener):
     """The infiller's proposal, but in gaps where a rollout or a held pose costs a viewer less; the end is extended by a
     density that knows what comes before it.
     """

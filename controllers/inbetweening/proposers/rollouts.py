@@ -80,7 +80,7 @@ class RolloutSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Rollouts(Inbetweener):
+class RolloutInbetweener(Inbetweener):
     """Rolls the density under which the fallback's proposal is likeliest through gaps of which nothing is known."""
 
     densities: Sequence[Density]

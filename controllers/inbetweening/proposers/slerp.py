@@ -7,7 +7,7 @@ from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.protocols import Inbetweener
 
 
-class Slerp(Inbetweener):
+class SlerpInbetweener(Inbetweener):
     """Proposes the interpolation that the query shows; beyond the first and the last known frame poses are held."""
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from controllers.inbetweening.keyframe_poses import KeyframeClip
-from controllers.inbetweening.proposers import ModelLoaders, Rollouts, build_inbetweener
+from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, build_inbetweener
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors
 from controllers.inbetweening.variations import Tweening, Variations, lowest_energy, sample_variations
@@ -56,7 +56,7 @@ def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) ->
     """Keep the likeliest of several answers."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("answers", quiet=command.quiet) as progress:
-        rollouts = Rollouts(models.densities(), models.infiller())
+        rollouts = RolloutInbetweener(models.densities(), models.infiller())
         return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
 
 
@@ -64,7 +64,10 @@ def run_variations(command: Tween, asked: KeyframeClip, make: Tweening, models: 
     """Make, write, tell; the report names every file with its energy. Return whether all that was asked holds."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("variations", quiet=command.quiet) as progress:
-        first, rollouts = build_inbetweener(command.method, models), Rollouts(models.densities(), models.infiller())
+        first, rollouts = (
+            build_inbetweener(command.method, models),
+            RolloutInbetweener(models.densities(), models.infiller()),
+        )
         found = sample_variations(make, first, rollouts, command.variations, generator=generator, progress=progress)
     files = number_paths(command.out, command.variations)
     for one, file in zip(found.each, files, strict=True):
