@@ -3,7 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from mapctl.runtime import saving
+from mapctl.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from mapctl import curves as curves
@@ -20,6 +21,8 @@ _MODULE_OF = {
     "CANONICAL": "mapctl.skeleton",
     "curves": "mapctl.curves",
 }
+
+saving.register_writer(lambda motion, path: import_module("mapctl.formats").save(motion, path))
 
 
 def __getattr__(name: str):

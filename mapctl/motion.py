@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError, RequestError
+from mapctl.runtime import saving
 from mapctl.skeleton import Skeleton, mirror_name
 
 
@@ -144,9 +145,7 @@ class Motion:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the motion in the format that the path's ending names."""
-        from mapctl import formats
-
-        formats.save(self, path)
+        saving.save(self, path)
 
     def _offset(self, joint: int) -> Float[Tensor, "frames 3"]:
         """Return a joint's offset in every frame, animated or not."""

@@ -1,4 +1,4 @@
-"""The contact sheet: the whole motion with ghosts along the way, and a row of stills below it."""
+"""The contact sheet: the whole motion with ghosts along its trajectory, and a row of stills below it."""
 
 from dataclasses import dataclass, replace
 
@@ -66,7 +66,7 @@ def _choose_ghost_frames(stage: Stage) -> list[int]:
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
     most = max(4, _MAX_GHOSTS // len(paths))
     furthest = paths[int(np.argmax(lengths))]
-    # Someone who sways on the spot goes a long way too, but not far.
+    # Swaying on the spot makes a long path, too, that leads nowhere.
     reach = np.linalg.norm(furthest - furthest[0], axis=1).max()
     count = min(round(min(max(lengths), 2 * reach) / _GHOST_STRIDE) + 1, most)
     if count == 1:

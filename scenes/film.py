@@ -41,10 +41,10 @@ def film(
 
     `actors` are Shots, or tuples (motion, curve, colour, start seconds) of which all but the motion may be
     left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
-    the way over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
+    the trajectory over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
     them. `size` is the width and height in pixels (MP4 rounds up to even). `progress` is called with frames
-    done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for endings, sizes
-    and places that cannot be.
+    done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for endings,
+    sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
     stage, brush, camera = (

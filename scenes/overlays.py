@@ -29,7 +29,7 @@ _SHADOW_STRENGTH = 0.5
 def build_grid(places: Array) -> Surface:
     """Build squares of 1 m and lines, every fifth stronger, around positions (n, 2) x, z; they fade with distance.
 
-    Where the places are more than 60 m apart the squares grow to 5 m, 25 m and so on.
+    Where the positions are more than 60 m apart the squares grow to 5 m, 25 m and so on.
     """
     low, high = places.min(axis=0) - _FADE_END, places.max(axis=0) + _FADE_END
     step = 1.0

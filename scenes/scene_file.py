@@ -48,7 +48,7 @@ class Actor:
     turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Rotation of the curve about its origin before that, degrees; positive turns +Z toward +X."""
     start_seconds: Annotated[float, Field(ge=0, le=_MAX_SECONDS)] = 0.0
-    """Start time, seconds; until then the actor stands in its first pose."""
+    """Start time, seconds; until then the actor holds its first pose."""
 
 
 @dataclass(frozen=True)

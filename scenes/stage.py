@@ -33,7 +33,7 @@ class Shot(NamedTuple):
     colour: str | None = None
     """Name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
     start_seconds: float = 0.0
-    """Start of the motion, seconds; until then the actor stands in its first pose."""
+    """Start of the motion, seconds; until then the actor holds its first pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Stage:
         figures = [
             Figure(player.body, frame, fade)
             for player in self.players
-            # A later ghost takes the place of one in the same pose: an actor who waits or has arrived.
+            # A later ghost replaces one in the same pose: an actor who waits or has arrived.
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
         trails = [player.trail for player in self.players]
@@ -116,7 +116,7 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     motion = shot.motion.resample(fps)
     colour = colours.rgb(shot.colour or colours.default_colour(number))
     body = Mannequin(motion, colour)
-    # One actor has a red curve and a yellow trail as in Wang et al. 2019; among several both must say whose they are.
+    # One actor has a red curve and a yellow trail as in Wang et al. 2019; among several both have the actor's colour.
     wish, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
         wish, trod = colours.blend_colours(colour, colours.rgb(colours.BACKGROUND), 0.62), colour

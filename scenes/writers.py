@@ -32,7 +32,7 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
     4:2:0 colour needs even sides, so odd ones get one more row or column like their last.
     """
     av = _import_package("av")
-    # The encoder says what it does on standard error unless told not to.
+    # The encoder logs what it does on standard error by default.
     av.logging.set_level(av.logging.ERROR)
     width, height = (side + side % 2 for side in size)
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:

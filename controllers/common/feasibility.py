@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.curves import Curve
+from mapctl.curves.tracking import track_arcs
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import PathRequest
 from mapctl.motion import Motion
@@ -37,7 +38,7 @@ def check_tracking(motion: Motion, curve: Curve, joint: str) -> list[str]:
     """The stretch around the worst frame that leaves the curve by more than 15 cm, if there is one."""
     walked = motion.joint_positions()[:, motion.skeleton.index(joint)]
     places = walked[:, ::2] if curve.dims == 2 else walked
-    error = (places - curve.point(curve.track(walked, start=0.0))).norm(dim=-1)
+    error = (places - curve.point(track_arcs(curve, walked, start=0.0))).norm(dim=-1)
     if float(error.max()) * 100 <= _PATH_TOLERANCE_CM:
         return []
     first, last = (

@@ -38,7 +38,7 @@ def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
     Errors as of `from_points`, of which it is a finer case.
     """
     given = np.asarray(points, dtype=np.float64)
-    whole = from_points(given, closed=False)  # what is wrong with the points is said here
+    whole = from_points(given, closed=False)  # raises what is wrong with the points
     spans = np.sqrt(np.linalg.norm(np.diff(given, axis=0), axis=1))
     kept = np.r_[True, spans > 1e-3]
     if kept.sum() < 3:

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from mapctl.curves import tracking
 from mapctl.curves.polyline import TANGENT_BASE
 from mapctl.rotations import unwrap_angle
 
@@ -73,7 +72,7 @@ class Curve:
 
     @cached_property
     def start_heading(self) -> float:
-        """Direction of travel at the start, radians: 0 is +Z, +pi/2 is +X; what lies behind it has no say."""
+        """Direction of travel at the start, radians: 0 is +Z, +pi/2 is +X; only what lies ahead counts."""
         # Chords centred a little ahead see only what follows; extrapolating is exact on circular arcs.
         ahead = self._half_base * torch.tensor([1.0, 2.0], dtype=torch.float64)
         near, far = unwrap_angle(_direction_heading(self.tangent(ahead))).tolist()
@@ -102,7 +101,7 @@ class Curve:
         """Return the unit direction of travel: a chord of 5 cm, so that the jitter of a drawing does not flip it."""
         arc = _to_tensor(arc)
         chord = self._point_at(arc.double() + self._half_base) - self._point_at(arc.double() - self._half_base)
-        # At the tip of a way back on itself the chord vanishes; the segment still has a direction.
+        # Where a curve turns back on itself the chord vanishes; the segment still has a direction.
         gone = chord.detach().norm(dim=-1, keepdim=True) < 1e-6
         chord = torch.where(gone, self._tables[2][self._segment(arc)[1]], chord)
         return _normalise(chord).to(arc.dtype)
@@ -136,8 +135,8 @@ class Curve:
         ahead, behind = self._heading_at(arc.double() + base / 2), self._heading_at(arc.double() - base / 2)
         return ((ahead - behind) / base).to(arc.dtype)
 
-    def _of_curve(self, points_world: Tensor) -> Tensor:
-        """Return points in the curve's own coordinates: world points lose their height for a curve on the ground."""
+    def to_curve_axes(self, points_world: Float[Tensor, "*batch axes"]) -> Float[Tensor, "*batch dims"]:
+        """Return points along the curve's own axes: world points lose their height for a curve on the ground."""
         return points_world[..., ::2] if points_world.shape[-1] > self.dims else points_world
 
     def nearest(
@@ -149,7 +148,7 @@ class Curve:
         left for its other branch; the result is not wrapped (it stays near `around`) and may lie beyond the ends.
         Without, the whole curve is searched between its ends. Differentiable in the points.
         """
-        points = self._of_curve(points_world)
+        points = self.to_curve_axes(points_world)
         if around is None:
             return self._nearest_anywhere(points)
         with torch.no_grad():
@@ -199,23 +198,8 @@ class Curve:
 
     def signed_offset(self, points_world: Float[Tensor, "*batch axes"], arc: Arc) -> Float[Tensor, "*batch"]:
         """Return metres from the curve's position at `arc` to each point, sideways on the ground; left is positive."""
-        apart = self._of_curve(points_world) - self.point(arc)
+        apart = self.to_curve_axes(points_world) - self.point(arc)
         return (apart[..., :: self.dims - 1] * self.left(arc)).sum(-1)
-
-    def track(
-        self, points_world: Float[Tensor, "frames axes"], *, start: float | None = None, reach: float = 0.5
-    ) -> Float[Tensor, "frames"]:
-        """Track the arcs of a walk, not wrapped: along the curve without a jump, and forward unless the walk goes back.
-
-        So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are told apart, and
-        laps of a closed one counted (see `mapctl.curves.tracking`). `start` is where to look first, within `reach`
-        metres; by default the curve's start if the walk begins within `reach` of it (where a figure-8 crosses, arcs are
-        ambiguous), else wherever the whole walk fits best.
-        """
-        points = self._of_curve(points_world).detach().double()
-        if start is None and bool((points[0] - self.start).norm() <= reach):
-            start = 0.0
-        return tracking.track_arcs(self, points, start=start, reach=reach)
 
 
 def _to_tensor(arc: Arc) -> Tensor:

@@ -59,7 +59,7 @@ def evaluate_axes(curve, arc, axes):
     evaluate_position(curve, arc - curve.half_base, behind)
     ahead -= behind
     length = math.sqrt((ahead * ahead).sum())
-    if length < 1e-6:  # at the tip of a way back on itself the chord vanishes
+    if length < 1e-6:  # where a curve turns back on itself the chord vanishes
         ahead[:] = curve.directions[find_segment(curve, arc) % len(curve.directions)]
         length = math.sqrt((ahead * ahead).sum())
     ahead /= length
@@ -76,7 +76,7 @@ def evaluate_axes(curve, arc, axes):
 def fill_local_frames(curve, points, around, reach, places, axes, straightened):
     """Fill local frames of points (batch, frames, dims) near arcs `around` (frames); see `local_frame.LocalFrame`."""
     if curve.closed:
-        reach = min(reach, 0.5 * curve.length)  # a lap holds every place once
+        reach = min(reach, 0.5 * curve.length)  # a lap has every position once
     dims = points.shape[2]
     place, frame = np.empty(dims), np.empty((dims, dims))
     for b in range(len(points)):

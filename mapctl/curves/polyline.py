@@ -84,7 +84,7 @@ def _thin_points(points: ndarray, spacing: float) -> ndarray:
 
     bend = np.linalg.norm(points - (place(arcs - spacing) + place(arcs + spacing)) / 2, axis=1)
     bend[[0, -1]] = np.inf
-    # The last point has a piece of its own, or it might lose its place to the first.
+    # The last point has a piece of its own, or it might be dropped in favour of the first.
     piece = np.r_[(arcs[:-1] / spacing).astype(np.int64), np.iinfo(np.int64).max]
     order = np.lexsort((-bend, piece))
     best = order[np.r_[True, np.diff(piece[order]) > 0]]

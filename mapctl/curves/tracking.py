@@ -1,14 +1,13 @@
 """Arcs of a walker along a curve, from the whole walk: dynamic programming over arcs, as in map matching.
 
-The nearest position alone jumps to another branch wherever a curve comes near itself, crosses itself or goes back the
-way it came. Here the arc goes on without a jump, and forward unless going back explains the walk clearly better: of all
+The nearest position alone jumps to another branch wherever a curve comes near itself, crosses itself or returns along
+itself. Here the arc goes on without a jump, and forward unless going back explains the walk clearly better: of all
 such paths along the curve the one with the least squared distance is found (Viterbi 1967; with a hidden Markov model's
 states on the road, Newson and Krumm 2009). The walk is taken by its own length, so neither speed nor rate matter.
 """
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,28 +15,31 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from mapctl.curves.curve import Curve
+from mapctl.curves.curve import Curve
 
 _STEP = 0.02  # metres between neighbouring arcs, and between the walk's positions that are looked at
 _MAX_ARCS = 10_000  # positions and arcs: of long walks both lie farther apart
-_MAX_PACE_RATIO = 3  # times the walk's own way: how fast the arc goes where a bend or a corner is cut
+_MAX_PACE_RATIO = 3  # arc per metre walked, at most: bends and corners may be cut
 _BACKWARD_COST = 0.3**2  # square metres: going back must explain the walk better than going on or staying by 0.3 m
-_PRUNING_MARGIN = 3.0 / _STEP  # squared metres, summed: what explains the walk so much worse is given up
-_REFINED_STEP, _TIE_BREAK = (
-    0.04,
-    0.01,
-)  # metres between refined arcs; of two equally near the one nearer to the tracked arc is taken
+_PRUNING_MARGIN = 3.0 / _STEP  # squared metres, summed: arcs that explain the walk so much worse are dropped
+_REFINED_STEP = 0.04  # metres between refined arcs
+_TIE_BREAK = 0.01  # square metres per metre from the tracked arc: of two equally near arcs the one nearer to it wins
 
 
 def track_arcs(
-    curve: "Curve", points: Float[Tensor, "frames dims"], *, start: float | None, reach: float
+    curve: Curve, points_world: Float[Tensor, "frames axes"], *, start: float | None = None, reach: float = 0.5
 ) -> Float[Tensor, " frames"]:
-    """Track the arcs of a walk, metres, not wrapped; beyond open ends the curve goes on straight.
+    """Track the arcs of a walk, metres, not wrapped: without a jump, and forward unless the walk goes back.
 
-    The first arc is sought within `reach` metres of `start`, or anywhere on the curve. Every arc is the nearest within
-    `reach` metres of the tracked one.
+    So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are told apart, and laps of
+    a closed one counted; beyond open ends the curve goes on straight. Points are (x, y, z), or (x, z) for a curve on
+    the ground. The first arc is searched within `reach` metres of `start`: by default of the curve's start if the walk
+    begins within `reach` of it (where a figure-8 crosses, arcs are ambiguous), else anywhere on the curve. Every arc is
+    the nearest within `reach` metres of the tracked one.
     """
+    points = curve.to_curve_axes(points_world).detach().double()
+    if start is None and bool((points[0] - curve.start).norm() <= reach):
+        start = 0.0
     walked = torch.cat([points.new_zeros(1), points.diff(dim=0).norm(dim=-1).cumsum(0)])
     grid = _ArcGrid.of(curve, float(walked[-1]) + reach)
     count = 1 + math.ceil(float(walked[-1]) / grid.step)
@@ -67,7 +69,7 @@ class _ArcGrid:
     """Whether the numbers go round."""
 
     @staticmethod
-    def of(curve: "Curve", beyond: float) -> "_ArcGrid":
+    def of(curve: Curve, beyond: float) -> "_ArcGrid":
         """Space arcs over the whole curve, and `beyond` metres straight on from open ends."""
         step = max(_STEP, (curve.length + beyond) / _MAX_ARCS)
         lap = max(8, math.ceil(curve.length / step))
@@ -92,7 +94,7 @@ def _find_best_arcs(
 ) -> Float[ndarray, " count"]:
     """Find the numbers of the arcs at the walk's positions; the first is one of first to stop."""
     most = _MAX_PACE_RATIO + 1
-    # Columns: from how many arcs ahead (going back) to how many behind (going on); of equal ways the slowest.
+    # Columns: from how many arcs ahead (going back) to how many behind (going on); of equal costs the slowest.
     moves = np.arange(most, -most - 1, -1)
     price = np.where(moves > 0, _BACKWARD_COST * moves, 0.0) + 1e-9 * abs(moves)
     first, stop = grid.within(first, stop)
@@ -122,7 +124,7 @@ def _prune_arcs(first: int, cost: Float[ndarray, " arcs"]) -> tuple[int, int, Fl
 
 
 def _refine_arcs(
-    curve: "Curve", points: Float[Tensor, "frames dims"], arcs: Float[Tensor, " frames"], reach: float
+    curve: Curve, points: Float[Tensor, "frames dims"], arcs: Float[Tensor, " frames"], reach: float
 ) -> Float[Tensor, " frames"]:
     """Find the nearest arcs on the branch that was found."""
     room = (

@@ -1,30 +1,21 @@
-"""Files to Motion and back. Each module owns its format's quirks; this one only picks by ending."""
+"""Reading and writing motions in file formats, chosen by the ending; each module owns its format's quirks."""
 
 from collections.abc import Callable
 from fractions import Fraction
 from os import PathLike
 from pathlib import PurePath
-from types import ModuleType
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import acclaim, bvh, npz
+from mapctl.formats import acclaim, bvh, npz, usd
 from mapctl.formats.missing import MissingValues
 from mapctl.motion import Motion
 
 
-def _import_skinned_writers() -> tuple[ModuleType, ModuleType]:
-    """glTF and USD; late, since they draw a body, which the other formats need not load."""
-    from mapctl.formats import gltf, usd
-
-    return gltf, usd
-
-
 def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
-    _import_skinned_writers()[0].save(motion, path)
+    """Write a .glb; its module is imported late, since it draws a body, which the other formats need not load."""
+    from mapctl.formats import gltf
 
-
-def _save_usd(motion: Motion, path: str | PathLike[str]) -> None:
-    _import_skinned_writers()[1].save(motion, path)
+    gltf.save(motion, path)
 
 
 READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load}
@@ -37,22 +28,19 @@ WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
     ".bvh": bvh.save,
     ".npz": npz.save,
     ".glb": _save_glb,
-    ".usda": _save_usd,
-    ".usdc": _save_usd,
-    ".usd": _save_usd,
+    **dict.fromkeys(usd.ENDINGS, usd.save),
 }
-_USD = (".usda", ".usdc", ".usd")
 _UNREADABLE_REASONS = {
     ".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
     ".glb": "can be written but not read",
-    **dict.fromkeys(_USD, "can be written but not read"),
+    **dict.fromkeys(usd.ENDINGS, "can be written but not read"),
 }
 
 
 def load(
     path: str | PathLike[str], *, fps: Fraction | float | None = None, metres_per_unit: float | None = None
 ) -> Motion:
-    """Read a motion from a .bvh, .npz or .amc file, the last with the .asf beside it (see `asf_amc.load`).
+    """Read a motion from a .bvh, .npz or .amc file, the last with the .asf beside it (see `acclaim.load`).
 
     `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit`
     wins over what is found by the size of the body, in formats whose unit is not fixed. FileFormatError says what is
@@ -68,9 +56,9 @@ def load(
 def load_with_missing(
     path: str | PathLike[str], *, metres_per_unit: float | None = None
 ) -> tuple[Motion, MissingValues]:
-    """Read a motion as `load` does, from a file that may have NaN where something was lost, and what was.
+    """Read a motion as `load` does, from a file that may have NaN for missing values; also return where they are.
 
-    The motion is finite: joints stay as they were last known, places go straight from one known place to the next.
+    The motion is finite: missing rotations repeat the last known one, missing positions are interpolated linearly.
     FileFormatError where nothing is known.
     """
     motion, missing = _READERS_WITH_MISSING[_check_readable(path)](path)
@@ -98,5 +86,5 @@ def check_ending(path: str | PathLike[str]) -> None:
     ending = PurePath(path).suffix.lower()
     if ending not in WRITERS:
         raise RequestError(f"cannot write {path}: unknown ending {ending!r}; allowed: {', '.join(WRITERS)}")
-    if ending in _USD:
-        _import_skinned_writers()[1].check_installed(path)
+    if ending in usd.ENDINGS:
+        usd.check_installed(path)

@@ -1,4 +1,4 @@
-"""Output files appear whole or not at all: written beside their place, then renamed onto it."""
+"""Output files appear whole or not at all: written beside their path, then renamed onto it."""
 
 import errno
 import os

@@ -9,12 +9,12 @@ from os import PathLike
 import numpy as np
 import pygltflib
 
-from mapctl import __version__
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.skinned import SkinnedBody, build_skinned_body
 from mapctl.motion import Motion
 from mapctl.rotations import make_sign_continuous
+from mapctl.version import __version__
 
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENT = {"float32": pygltflib.FLOAT, "uint16": pygltflib.UNSIGNED_SHORT, "uint32": pygltflib.UNSIGNED_INT}

@@ -15,7 +15,7 @@ _FORMS = re.compile(r"(?<!\S)[+-]?(?:nan(?:\([^\s)]*\))?|1\.#(?:ind|qnan|snan)\S
 
 @dataclass(frozen=True, eq=False)
 class MissingValues:
-    """Where the numbers of a motion are missing: the file has NaN there."""
+    """Masks of the values of a motion that are missing, where the file has NaN."""
 
     rotations: Bool[Tensor, "frames joints"]
     """Missing local rotations; the motion repeats the last known one."""
@@ -30,17 +30,17 @@ def is_nan(word: str) -> bool:
 
 
 def normalise_nan(text: str) -> str:
-    """Return the text with such words in the one form that numpy reads."""
+    """Return the text with every form of a missing number spelled `nan`, which numpy reads."""
     return _FORMS.sub("nan", text) if "#" in text else text
 
 
 def missing_hint(word: str) -> str:
-    """Return what to add to the refusal of a word."""
+    """Return what to add to an error message about a word: advice where it is a missing number."""
     return "; `mapctl infill` fills in what is lost" if is_nan(word) else ""
 
 
 def check_any_known(path: str | PathLike[str], lost: np.ndarray) -> None:
-    """Raise FileFormatError where nothing is known."""
+    """Raise FileFormatError where every value (a boolean array) is missing."""
     if lost.size and lost.all():
         raise FileFormatError(path, "every value is nan: nothing is known of the motion")
 

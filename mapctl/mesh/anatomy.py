@@ -16,7 +16,7 @@ from mapctl.motion import Motion
 _STANDARD_LEG = 0.80
 """Hip to ankle of the person whose measures this package is written for, metres."""
 _TIP_LENGTHS = {Part.HEAD: 0.17, Part.HAND: 0.14, Part.TOES: 0.07, Part.FOOT: 0.12, Part.FINGER: 0.02}
-"""How far a last bone reaches where the file does not say, metres."""
+"""Lengths of last bones without an End Site in the file, metres."""
 _UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -46,13 +46,13 @@ class Foot:
     axes: Array
     """(3, 3) columns left, up from the sole and forward, in the ankle joint's frame."""
     toe_axes: Array
-    """(3, 3) the same in the toe joint's frame."""
+    """(3, 3) columns left, up from the sole and forward, in the toe joint's frame."""
     heights: tuple[float, float]
     """Heights of ankle and ball over the sole, metres."""
 
 
 class Anatomy:
-    """What a body is built on. `motion` may be of any rig and length."""
+    """Hips, head axes and feet of a motion of any rig and length, which a body is built on."""
 
     def __init__(self, motion: Motion):
         self.joints = motion.num_joints
@@ -132,7 +132,7 @@ class Anatomy:
         )
 
     def _flat_frames(self, ankle: int, ball: int) -> Array:
-        """Return frames in which the foot most likely stands flat: ankle and ball together at their lowest."""
+        """Return frames in which the foot is most likely flat: ankle and ball together at their lowest."""
         height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
         return height <= np.quantile(height, 0.1)
 
@@ -152,7 +152,7 @@ def _axes_from(*, up: Array, forward: Array) -> Array:
     """Return axes with columns left, up, forward; up is kept."""
     across = np.cross(up, forward)
     if np.linalg.norm(across) < 1e-6 * np.linalg.norm(forward) + 1e-12:
-        across = np.array([1.0, 0.0, 0.0])  # any will do where the motion does not tell
+        across = np.array([1.0, 0.0, 0.0])  # arbitrary where the motion does not determine it
     return frame_along(up, across)
 
 
@@ -181,7 +181,7 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
         offset = np.array(motion.skeleton.end_offsets.get(name, (0.0, 0.0, 0.0)))
         if np.linalg.norm(offset) > 0.01 * scale:
             extra.append((joint, joints[:, joint] + turns[:, joint] @ offset))
-        elif part in _TIP_LENGTHS and (leaf or part is Part.HEAD):  # eyes and the like say nothing of the crown
+        elif part in _TIP_LENGTHS and (leaf or part is Part.HEAD):  # eyes and the like do not show the crown
             along = unit(joints[:, joint] - joints[:, parents[joint]])
             extra.append((joint, joints[:, joint] + along * _TIP_LENGTHS[part] * scale))
     world = np.concatenate([joints, *(place[:, None] for _, place in extra)], axis=1)

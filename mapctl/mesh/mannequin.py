@@ -32,7 +32,7 @@ _LINKS = {
     Part.OTHER: (0.015, 0.012),
 }
 _TRUNK = ((0.0, 0.35, 0.75, 1.0), (0.100, 0.096, 0.110, 0.060))
-"""Radius of the trunk at shares of the way from hips to neck, metres."""
+"""Shares of the distance from hips to neck, and the trunk's radius there, metres."""
 _OVERLAP = 0.93
 """A trunk bone starts thinner than the one below ends, so that their skins cut cleanly."""
 _TRUNK_PARTS = (Part.HIPS, Part.TORSO)
@@ -59,7 +59,7 @@ class Bones:
     rgb: Array
     """(bones, 3) sRGB."""
     height: Array
-    """(bones,) share of the way from hips to shoulders; decides which way a flattened bone lies."""
+    """(bones,) share of the distance from hips to shoulders; decides the direction in which a bone is flattened."""
 
 
 class Mannequin:
@@ -157,7 +157,7 @@ def _is_drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
 
 
 def _trunk_shares(anatomy: Anatomy) -> Array:
-    """Return every point's share of the way from hips to neck along the bones; 0 for legs, 1 for arms and head."""
+    """Return every point's share of the distance from hips to neck along the bones; 0 for legs, 1 for arms and head."""
     points, top = anatomy.points, anatomy.find(Part.NECK)
     top = anatomy.find(Part.HEAD) if top is None else top
     way = np.zeros(len(points.parents))

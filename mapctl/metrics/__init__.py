@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves.curve import Curve
+from mapctl.curves.tracking import track_arcs
 from mapctl.errors import RequestError
 from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
 from mapctl.metrics import body, feet, path
@@ -68,7 +69,7 @@ def _measure_body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps
 
 
 def _measure_path(places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float) -> dict[str, float]:
-    arcs = curve.track(places)
+    arcs = track_arcs(curve, places)
     travelled = float(arcs[-1] - arcs[0])
     measures = _summarise_errors("path_error_{}_cm", path.compute_path_error(places, curve, arcs))
     measures |= _summarise_errors("path_error_low_passed_{}_cm", path.compute_low_pass_error(places, curve, arcs, fps))

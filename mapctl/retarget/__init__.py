@@ -1,4 +1,4 @@
-"""Between a rig's own joint frames and the canonical ones, both ways and without loss.
+"""Conversion between a rig's own joint frames and the canonical ones, in both directions and without loss.
 
 In the T-pose every canonical joint frame is aligned with the world. A rig's joint j then has some world rotation B_j,
 and at any time: canonical world rotation = U * rig's world rotation * inverse(B_j), where U turns the file's world so
@@ -7,12 +7,14 @@ that Y is up. The canonical motion keeps the performer's own bone lengths; only 
 
 import math
 from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import formats, kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
@@ -26,7 +28,7 @@ from mapctl.retarget.reference_pose import (
     find_tpose,
     upright_rotation,
 )
-from mapctl.retarget.rigs import Rig
+from mapctl.retarget.rigs import Rig, find_preset, known_rigs, read_rig_toml
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _MAX_BONE_ANGLE = math.radians(60)  # between a limb's bone in a table's T-pose and its canonical direction
@@ -43,11 +45,11 @@ class RigMap:
     joint_of: tuple[int | None, ...]
     """For each canonical joint the rig's joint, None where the rig has only an End Site or nothing."""
     tpose_quat_xyzw: Float[Tensor, "joints 4"]
-    """B: world rotation of each canonical joint's rig joint in the T-pose, in a world with Y up."""
+    """B: world rotation (xyzw) of each canonical joint's rig joint in the T-pose, in a world with Y up."""
     skeleton: Skeleton
     """Canonical names and tree with this performer's bones."""
     upright_quat_xyzw: Float[Tensor, "4"] | None = None
-    """U: turns the file's world so that Y is up; None where it is."""
+    """U: rotation from the file's world to one with Y up, xyzw; None where Y is up already."""
     idle_quat_xyzw: Float[Tensor, "rigged 4"] | None = None
     """Local rotations at rest of joints that are no canonical one; None where they are all zero."""
     match: Match | None = None
@@ -63,18 +65,43 @@ class RigMap:
     hips_travel: bool = True
     """Whether hips below the root have an animated offset; else the root carries them."""
 
+    @property
+    def joints(self) -> dict[str, int]:
+        """Index of the rig's joint by canonical name, of those that the rig has."""
+        return {c: joint for c, joint in zip(CANONICAL.names, self.joint_of, strict=True) if joint is not None}
+
+    @property
+    def joint_names(self) -> dict[str, str]:
+        """The rig's own joint name by canonical name, of those that the rig has."""
+        return {c: self.rig_skeleton.names[joint] for c, joint in self.joints.items()}
+
+
+def load_rig(name_or_path: str | PathLike[str]) -> Rig:
+    """Load a preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
+    text, path = str(name_or_path), Path(name_or_path)
+    preset = find_preset(text)
+    if preset is not None:
+        return preset
+    if path.suffix.lower() == ".toml":
+        return read_rig_toml(path)
+    if not path.suffix:
+        names = ", ".join(rig.name for rig in known_rigs())
+        raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
+    found = to_canonical(formats.load(path))[1]
+    return replace(found.rig, joints=found.joint_names, aliases={})
+
 
 def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
     """Identify the rig's joints, its T-pose and its bones; RequestError where its joints cannot be identified.
 
-    What `rig` says is taken as it is; else presets are tried, and then names, tree and places (see
-    mapctl.retarget.joint_matching). A `motion` of the skeleton shows which way is up, how knees bend, and whether it
-    begins with a T-pose, where the pose with all rotations zero does not.
+    What `rig` states is taken as it is; else presets are tried, and then names, tree and positions (see
+    mapctl.retarget.joint_matching). A `motion` of the skeleton shows the up axis, how knees bend, and whether it begins
+    with a T-pose, where the pose with all rotations zero does not.
     """
     found = match(skeleton, rig)
-    told = _map_by_table(found, skeleton, motion)
-    if told is not None:
-        return _set_hips_travel(told, motion)
+    listed = _map_by_table(found, skeleton, motion)
+    if listed is not None:
+        return _set_hips_travel(listed, motion)
     found = correct_sides(found, skeleton, motion)
     zero = RigPoses.zero(skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
@@ -86,12 +113,11 @@ def as_rig(rigmap: RigMap) -> Rig:
 
     A part may lack the first frame that showed the T-pose, or the steps that showed how knees bend.
     """
-    names = rigmap.rig_skeleton.names
-    pairs = list(zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
-    axes = {c: rotations.to_matrix(quat).T.tolist() for c, joint, quat in pairs if joint is not None}
+    tpose = zip(CANONICAL.names, rigmap.tpose_quat_xyzw, strict=True)
+    axes = {c: rotations.to_matrix(quat).T.tolist() for c, quat in tpose if c in rigmap.joints}
     return replace(
         rigmap.rig,
-        joints={c: names[joint] for c, joint, _ in pairs if joint is not None},
+        joints=rigmap.joint_names,
         aliases={},
         straighten=(),
         tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()},
@@ -116,12 +142,12 @@ def _map_by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> Ri
     up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
     idle = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(skeleton.num_joints, 4)
     rest = classify_reference_pose(zero, torch.eye(3, dtype=torch.float64))
-    told = _build_rig_map(
+    listed = _build_rig_map(
         found, skeleton, TPose(quats, idle, upright_rotation(up), up, find_rest_facing(zero), rest, "table")
     )
     if rig.rest == "tpose" and rig.name != "canonical":  # what a user asks for is done
-        return told
-    return told if (rest == "T" or not rig.straighten) and _is_canonical_pose(told.skeleton) else None
+        return listed
+    return listed if (rest == "T" or not rig.straighten) and _is_canonical_pose(listed.skeleton) else None
 
 
 def _build_rig_map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
@@ -143,7 +169,7 @@ def _build_rig_map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
 
 
 def _is_canonical_pose(skeleton: Skeleton) -> bool:
-    """Return whether limbs lie about as they do in the T-pose, and hang from their own side of an upright trunk."""
+    """Return whether limbs point about as in the T-pose, each from its own side of an upright trunk."""
     names = [side + part for side in ("left", "right") for part in ("LowerArm", "Hand", "LowerLeg", "Foot")]
     own, usual = skeleton.offsets, CANONICAL.offsets
     pairs = [(own[CANONICAL.index(name)], usual[CANONICAL.index(name)]) for name in names]
@@ -165,14 +191,14 @@ def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap
     world = motion.joint_rotations()
     picked = []
     for name, joint, tpose in zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True):
-        if joint is None:  # an End Site turns with its parent
+        if joint is None:  # an End Site rotates with its parent
             picked.append(picked[CANONICAL.parents[CANONICAL.index(name)]])
         else:
             picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
     hips = motion.joint_positions()[:, _hips_joint(rigmap)]
     upright = rigmap.upright_quat_xyzw
-    if upright is not None:  # all other joints turn with the hips
+    if upright is not None:  # all other joints rotate with the hips
         local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
         hips = rotations.rotate(upright.expand(len(world), 4), hips)
     return Motion(rigmap.skeleton, motion.fps, hips, rotations.make_sign_continuous(local)), rigmap
@@ -182,10 +208,10 @@ def rig_joint_positions(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames
     """Return positions of the rig's own joints, by canonical joint, metres, in a world with Y up; 0 for joints it
     lacks.
 
-    Joints that only the rig has, as those of twist, carry them elsewhere than the canonical motion tells.
+    They differ from those of the canonical motion where joints that only the rig has, as those of twist, move them.
     """
-    places = motion.joint_positions()
-    picked = [torch.zeros_like(places[:, 0]) if joint is None else places[:, joint] for joint in rigmap.joint_of]
+    positions = motion.joint_positions()
+    picked = [torch.zeros_like(positions[:, 0]) if joint is None else positions[:, joint] for joint in rigmap.joint_of]
     found = torch.stack(picked, dim=1)
     upright = rigmap.upright_quat_xyzw
     return found if upright is None else rotations.rotate(upright.expand(*found.shape[:2], 4), found)
@@ -223,7 +249,7 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
 
 
 def _to_file_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
-    """Return where the hips are to be, and the world rotation of each joint of the rig."""
+    """Return target positions of the hips, and the world rotation by joint of the rig, in the file's world."""
     world, hips = motion.joint_rotations(), motion.root_position
     if rigmap.upright_quat_xyzw is not None:
         back = rotations.inverse(rigmap.upright_quat_xyzw)
@@ -235,7 +261,7 @@ def _to_file_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Te
 
 
 def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion | None) -> Motion:
-    """Put the hips where they belong: by the root itself, or by their offset below it where that is animated."""
+    """Move the hips to target positions: by the root itself, or by their offset below it where that is animated."""
     joint = _hips_joint(rigmap)
     if joint == 0:
         moving = original.moving_offsets if original is not None else {}
@@ -292,7 +318,6 @@ def _straighten_bone(index: int, skeleton: Skeleton, joint_of: tuple[int | None,
 def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:
     """Map canonical names to the joints of a motion's rig, those that it has; empty where the rig is not understood."""
     try:
-        joint_of = identify_rig(motion.skeleton, rig, motion=motion).joint_of
+        return identify_rig(motion.skeleton, rig, motion=motion).joints
     except RequestError:
         return {}
-    return {name: joint for name, joint in zip(CANONICAL.names, joint_of, strict=True) if joint is not None}

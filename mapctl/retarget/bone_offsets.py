@@ -10,7 +10,7 @@ from mapctl import rotations
 from mapctl.retarget.pose_axes import JointOf, next_joint
 from mapctl.skeleton import CANONICAL, Skeleton
 
-_END_SITES = ("Toes", "Hand", "head")  # what an End Site of the joint above may stand for
+_END_SITES = ("Toes", "Hand", "head")  # joints whose position an End Site of the joint above may give
 
 
 def measure_bones(

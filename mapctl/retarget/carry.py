@@ -1,7 +1,7 @@
-"""Motion of one performer on the bones of another, who stands on the floor as the first one stood on it.
+"""Retargeting: motion of one performer on the bones of another, with the same contacts with the floor.
 
 Rotations stay, but of legs: the hips go as far and as high as the legs' lengths and both ankles' heights ask for, each
-toe joint is as high over its own rest height as the giver's over his, in scale, and while a foot stands it moves as
+toe joint is as high over its own rest height as the giver's over his, in scale, and while a foot is planted it moves as
 little as the giver's. Two-bone inverse kinematics brings the legs there. (The footsteps are kept as in Gleicher 1998,
 but joint by joint instead of by spacetime optimisation.)
 """
@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import contacts, kinematics, rotations
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
+from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import true_intervals
 from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import SIDES, Stance
@@ -31,14 +33,9 @@ _MAX_EXTENSION = 0.9995  # of the leg that one may be at most
 _SOFT_MARGIN = 0.004  # of the leg, before the most that it may be, over which it gives in
 _HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
 _MAX_TOE_SINK = 0.008  # metres under its rest height that a toe goes at most
-_HEEL_DEG, _MAX_HEEL_DEG = (
-    10.0,
-    60.0,
-)  # degrees that toes are raised by when a foot is on its heel, and until when it may be
-_LOW_SHARE, _HIGH_SHARE = (
-    0.1,
-    0.35,
-)  # of the leg: over the floor from where on rotations begin to count, and until they alone do
+_HEEL_DEG, _MAX_HEEL_DEG = 10.0, 60.0  # degrees that toes are raised by when a foot is on its heel, and at most
+# Heights over the floor, of the leg: from the first on rotations count, from the second on they alone do.
+_LOW_SHARE, _HIGH_SHARE = 0.1, 0.35
 _SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed
 _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 _NOTED_METRES = 0.005  # metres that a foot misses its target by before it is worth a line
@@ -51,7 +48,7 @@ class RiggedCharacter:
     rigmap: RigMap
     """The rig, and its bones on canonical joints."""
     stance: Stance
-    """Stance of this performer."""
+    """How the performer stands: toe heights, and tilt of the feet."""
     source: object | None = None
     """Layout and unit of the rig's file, which the result is written in."""
 
@@ -95,7 +92,7 @@ def retarget_motion(clip: Motion, body: RiggedCharacter, rig: Rig | None = None)
     """Retarget a clip of any rig to a body's bones, in the canonical joint frames of its rig.
 
     A clip of the body's own skeleton comes as it is, to the bit. `rig` is the clip's, where it is not the one that
-    would be recognised. RequestError where its joints cannot be told.
+    would be recognised. RequestError where its joints cannot be identified.
     """
     if clip.skeleton.matches(body.rigmap.rig_skeleton):
         return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
@@ -119,7 +116,7 @@ def _transfer_root(own: Motion, giver: RiggedCharacter, body: RiggedCharacter, s
     much higher as ankles and floor ask for."""
     to_thighs = body.leveled.offsets[_HIP_JOINTS].mean(0) - scale * own.skeleton.offsets[_HIP_JOINTS].mean(0)
     turns = own.joint_rotations()[:, 0]
-    # Hips are turned by noise; what they carry at another distance is not to shake for it.
+    # The hips' rotation is noisy; what they carry at another distance is not to shake for it.
     aside = _low_pass(rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _SMOOTH_SECONDS * float(own.fps))
     ankle, others = (
         _ankle_height(body.stance.toe_height, body.leveled),
@@ -154,35 +151,32 @@ def _ankle_targets(
 def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "frames 2 3"]:
     """Return the offset of the ankle from where it would be if the foot were the giver's in scale, metres.
 
-    A foot whose heel is raised stands on its toes, one whose toes are raised on its heel, which the ankle is over: then
-    the ankle goes the giver's way, as if the foot were flat.
+    A foot whose heel is raised pivots on its toes, one whose toes are raised on its heel, right below the ankle: then
+    the ankle follows the giver's trajectory, as if the foot were flat.
     """
     longer = (scale * own.skeleton.offsets - moved.skeleton.offsets)[_TOES].expand(own.num_frames, 2, 3)
     turns = own.joint_rotations()[:, _FEET]
     heading, tilt = rotations.split_heading(turns)
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(longer)
-    up = torch.rad2deg(torch.atan2(*(rotations.rotate(turns, way)[..., 1] for way in (forward, forward.roll(-1, -1)))))
+    rises = (rotations.rotate(turns, axis)[..., 1] for axis in (forward, forward.roll(-1, -1)))
+    up = torch.rad2deg(torch.atan2(*rises))
     on_toes = 1 - _smootherstep(up / _HEEL_DEG) * (1 - _smootherstep((up - _MAX_HEEL_DEG) / _MAX_HEEL_DEG))
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand_as(tilt)
     tilt = rotations.slerp(still, tilt, on_toes)
     return rotations.rotate(rotations.multiply(rotations.about_y(heading), tilt), longer)
 
 
-def _smootherstep(way: Tensor) -> Tensor:
+def _smootherstep(share: Tensor) -> Tensor:
     """Ease from 0 to 1 over 0 to 1, with two continuous derivatives."""
-    way = way.clamp(0, 1)
-    return way**3 * (10 + way * (6 * way - 15))
+    share = share.clamp(0, 1)
+    return share**3 * (10 + share * (6 * share - 15))
 
 
 def _contact_intervals(toes: Float[Tensor, "frames 2 3"], fps) -> list[list[tuple[int, int]]]:
     """Return by foot the first frames of contacts and one past their last, merged where noise alone parts them."""
-    planted, apart = contacts.detect_contacts(toes, fps), _MERGE_SECONDS * float(fps)
-    return [_merge_contacts(_planted_intervals(planted[:, k]), toes[:, k], apart) for k in range(toes.shape[1])]
-
-
-def _planted_intervals(stands: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
-    edges = torch.nn.functional.pad(stands.long(), (1, 1)).diff()
-    return list(zip((edges == 1).nonzero()[:, 0].tolist(), (edges == -1).nonzero()[:, 0].tolist(), strict=True))
+    intervals, apart = list(true_intervals(contacts.detect_contacts(toes, fps))), _MERGE_SECONDS * float(fps)
+    by_foot = ([(start, stop) for foot, start, stop in intervals if foot == k] for k in range(toes.shape[1]))
+    return [_merge_contacts(spans, toes[:, k], apart) for k, spans in enumerate(by_foot)]
 
 
 def _merge_contacts(runs: list[tuple[int, int]], toe: Float[Tensor, "frames 3"], apart: float) -> list[tuple[int, int]]:
@@ -208,18 +202,15 @@ def _hold_through_contacts(
     for (start, stop), value in zip(spans, values, strict=True):
         held[start:stop] = value
     for (_, stop), (start, _), before, after in zip(spans[:-1], spans[1:], values[:-1], values[1:], strict=True):
-        way = torch.arange(1, start - stop + 1, dtype=shift.dtype)[:, None] / (start - stop + 1)
-        held[stop:start] = before + (after - before) * _smootherstep(way)
+        share = torch.arange(1, start - stop + 1, dtype=shift.dtype)[:, None] / (start - stop + 1)
+        held[stop:start] = before + (after - before) * _smootherstep(share)
     return held
 
 
 def _low_pass(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Tensor, "frames columns"]:
     """Low-pass values over time by a Gaussian of `sigma` frames; ends are held."""
-    reach = max(1, round(3 * sigma))
-    at = torch.arange(-reach, reach + 1, dtype=values.dtype)
-    kernel = torch.exp(-0.5 * (at / max(sigma, 1e-6)) ** 2)
-    padded = torch.nn.functional.pad(values.T[:, None], (reach, reach), mode="replicate")
-    return torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None])[:, 0].T
+    taps = gaussian.kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma)))
+    return gaussian.convolve(values, taps, "repeated")
 
 
 def _leg_extension(own: Motion) -> Float[Tensor, "frames 2"]:
@@ -234,9 +225,9 @@ def _leg_bone_lengths(skeleton: Skeleton) -> Float[Tensor, "2"]:
 
 def _lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
     """Lower hips smoothly until legs reach the ankles' targets no straighter than the giver's, or than most."""
-    ways = ankles - moved.joint_positions()[:, _HIP_JOINTS]
+    to_ankles = ankles - moved.joint_positions()[:, _HIP_JOINTS]
     most = _leg_bone_lengths(moved.skeleton) * stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION)
-    level, down = ways[..., ::2].square().sum(-1), -ways[..., 1]
+    level, down = to_ankles[..., ::2].square().sum(-1), -to_ankles[..., 1]
     # The height at which the leg just reaches; a leg that points sideways or up is not helped by lower hips.
     short = (down - (most.square() - level).clamp_min(0).sqrt()).clamp_min(0)
     short = torch.where(down > 0.5 * most, short, 0.0).amax(dim=-1, keepdim=True)
@@ -251,9 +242,9 @@ def _reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> 
     """Bend and rotate legs so that ankles reach their targets; feet keep their orientation in the world."""
     places, world = moved.joint_positions().clone(), moved.joint_rotations()
     at, most = places[:, _HIP_JOINTS], _MAX_EXTENSION * _leg_bone_lengths(moved.skeleton)
-    ways = ankles - at
-    far = ways.norm(dim=-1)
-    places[:, _FEET] = at + ways * (_soft_clamp(far, most) / far.clamp_min(1e-9))[..., None]
+    to_ankles = ankles - at
+    far = to_ankles.norm(dim=-1)
+    places[:, _FEET] = at + to_ankles * (_soft_clamp(far, most) / far.clamp_min(1e-9))[..., None]
     free = torch.zeros(places.shape[:2], dtype=torch.bool)
     free[:, [*_HIP_JOINTS, *_SHINS]] = True
     legs = [LIMBS[side + "Foot"] for side in SIDES]
@@ -274,7 +265,7 @@ def _soft_clamp(far: Float[Tensor, "frames 2"], most: Float[Tensor, "2"]) -> Flo
 
 
 def _note_ankle_errors(done: Motion, ankles: Float[Tensor, "frames 2 3"]) -> tuple[str, ...]:
-    """Note feet that miss their targets."""
+    """Return a note on feet that miss their targets; none where they all reach them."""
     off = (done.joint_positions()[:, _FEET] - ankles).norm(dim=-1).amax(dim=-1)
     if float(off.max()) < _NOTED_METRES:
         return ()

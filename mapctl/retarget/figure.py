@@ -1,4 +1,4 @@
-"""A standing clip for a rig of which only names and T-pose are known: the canonical body, under the rig's names."""
+"""A clip of standing still for a rig of which only names and T-pose are known: the canonical body, renamed."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import kinematics, retarget, rotations
+from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.bvh import layout as bvh_layout
 from mapctl.motion import Motion
 from mapctl.retarget.joint_matching import REQUIRED
+from mapctl.retarget.pose_axes import RigPoses
 from mapctl.retarget.reference_pose import axis_vector, upright_rotation
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT, Skeleton
@@ -22,8 +23,8 @@ _FPS, _FRAMES = Fraction(30), 30
 def make_tpose_clip(rig: Rig) -> Motion:
     """Make a second of standing in the T-pose on the rig's joints, in its world and unit; toes on the floor.
 
-    Bones are the canonical body's, since a rig tells names and no lengths. RequestError where it does not name all that
-    a rig must have.
+    Bones are the canonical body's, since a rig has names and no lengths. RequestError where it lacks one of the names
+    that are required.
     """
     missing = [name for name in REQUIRED if name not in rig.joints]
     if missing:
@@ -40,18 +41,15 @@ def make_tpose_clip(rig: Rig) -> Motion:
 
 
 def _canonical_tpose() -> Motion:
-    places = _tpose_positions()
     root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
-    root[:, 1] = TOE_REST_HEIGHT - places[TOE_JOINTS[0], 1]
+    root[:, 1] = TOE_REST_HEIGHT - _tpose_positions()[TOE_JOINTS[0], 1]
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     return Motion(CANONICAL, _FPS, root, still.expand(_FRAMES, CANONICAL.num_joints, 4).clone())
 
 
 def _tpose_positions() -> Float[Tensor, "joints 3"]:
     """Return canonical joint positions in the T-pose, from the hips, metres."""
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)
-    root = torch.zeros(1, 3, dtype=torch.float64)
-    return kinematics.forward_kinematics(CANONICAL.offsets, CANONICAL.parents, root, still)[0][0]
+    return RigPoses.zero(CANONICAL, range(CANONICAL.num_joints)).positions[0]
 
 
 def _build_skeleton(rig: Rig) -> Skeleton:

@@ -1,6 +1,6 @@
 """Which joint of any rig is which canonical one: by listed names, by the words in names, and by the tree.
 
-Sides are checked by the positions of the joints where toes tell which way the body faces.
+Sides are checked by the positions of the joints where toes show the facing of the body.
 """
 
 import re
@@ -47,13 +47,13 @@ class Match:
     unmapped: tuple[str, ...]
     """Joints of the rig that are no canonical one, as fingers, twists and props."""
     sides_exchanged: bool = False
-    """Whether the rig's names say left for what lies on the right."""
+    """Whether joints named left are on the right."""
 
 
 def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
-    """Match a skeleton by a given rig, by the presets, or by what it looks like; sides are as names tell them.
+    """Match a skeleton by a given rig, by the presets, or by what it looks like; sides are as named.
 
-    RequestError where a score of ACCEPTED is not reached or a joint of REQUIRED is not found, naming what is missing.
+    RequestError where a score of MIN_SCORE is not reached or a joint of REQUIRED is not found, naming what is missing.
     """
     chosen, found = _find_preset(skeleton) if rig is None else (rig, _match_by_rig(rig, skeleton))
     if rig is not None:
@@ -116,7 +116,7 @@ def _find_preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
         extra = {normalise_name(name) for name in rig.also}
         explained = len(found) + len(extra & plain - {normalise_name(skeleton.names[j]) for j in found.values()})
         lacking = len(rig.joints) - len(found) + len(extra - plain)
-        # Fingers and props beyond what a list knows say nothing against it; what a list has and a rig lacks does.
+        # Fingers and props beyond what a preset lists do not count against it; what it lists and the rig lacks does.
         spelled = sum(skeleton.names[joint] in (rig.joints[c], *rig.aliases.get(c, ())) for c, joint in found.items())
         fit = len(found) + explained / (explained + lacking) + spelled / len(found)
         if fit > best:
@@ -131,8 +131,8 @@ def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[
         if joint not in found.values():
             found.setdefault(name, joint)
     credit = dict.fromkeys(found, _BY_NAME)
-    placed = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton)
-    for name, joint in placed.items():
+    by_tree = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton)
+    for name, joint in by_tree.items():
         helper = _HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
             found[name], credit[name] = joint, _BY_TOPOLOGY
@@ -140,7 +140,7 @@ def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[
 
 
 def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
-    """Match canonical joints by the side and part that names tell, below the hips, top down."""
+    """Match canonical joints by the side and part in their names, below the hips, top down."""
     if hips is None:
         try:
             hips = find_hips(skeleton)
@@ -148,29 +148,29 @@ def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
             return {}
     found = {"hips": hips}
     inside = _descendants(skeleton, hips)
-    told = [
+    roles = [
         r if j in inside and not _HELPER_NAME.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
         for j, r in enumerate(classify_joints(skeleton))
     ]
     for side in (Side.LEFT, Side.RIGHT):
-        found |= _match_limb_by_words(told, side)
+        found |= _match_limb_by_words(roles, side)
     arms = [found[name] for name in ("leftUpperArm", "rightUpperArm") if name in found]
-    trunk = [j for j, r in enumerate(told) if r == Role(Side.MIDDLE, Part.TORSO)]
+    trunk = [j for j, r in enumerate(roles) if r == Role(Side.MIDDLE, Part.TORSO)]
     holding = [j for j in trunk if arms and all(arm in _descendants(skeleton, j) for arm in arms)] or trunk
     if holding:
         found["spine"] = holding[0]
     if len(holding) > 1:
         found["chest"] = holding[-1]
     for name, part in (("neck", Part.NECK), ("head", Part.HEAD)):
-        named = [j for j, r in enumerate(told) if r == Role(Side.MIDDLE, part)]
+        named = [j for j, r in enumerate(roles) if r == Role(Side.MIDDLE, part)]
         if named:
             found[name] = named[0]
     return found
 
 
-def _match_limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
+def _match_limb_by_words(roles: list[Role], side: Side) -> dict[str, int]:
     def named(part: Part) -> list[int]:
-        return [joint for joint, role in enumerate(told) if role == Role(side, part)]
+        return [joint for joint, role in enumerate(roles) if role == Role(side, part)]
 
     upper, lower = named(Part.UPPER_LEG), named(Part.LOWER_LEG)
     if not upper and len(lower) > 1:
@@ -197,29 +197,29 @@ def _match_limb_by_words(told: list[Role], side: Side) -> dict[str, int]:
     return {side.value + part: joints[0] for part, joints in parts.items() if joints}
 
 
-def _assign_sides(placed: Mapping[str, int], told: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
-    """Put limbs found by the tree alone on the side that their joints' names or else their positions tell.
+def _assign_sides(by_tree: Mapping[str, int], roles: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
+    """Put limbs found by the tree alone on the side that their joints' names or else their positions show.
 
-    Without names, left is +X: where the rest pose faces elsewhere, the toes tell it (see `correct_sides`).
+    Without names, left is +X: where the rest pose faces elsewhere, the toes show it (see `correct_sides`).
     """
-    if not placed:
-        return placed
-    places = RigPoses.zero(skeleton, (None,) * CANONICAL.num_joints).places[0]
+    if not by_tree:
+        return by_tree
+    positions = RigPoses.zero(skeleton, (None,) * CANONICAL.num_joints).positions[0]
     left = None
     for limb in (("UpperLeg", "LowerLeg", "Foot", "Toes"), ("UpperArm", "LowerArm", "Hand", "Shoulder")):
         votes = 0
         for side, other in (("left", "right"), ("right", "left")):
-            said = [told[placed[side + part]].side.value for part in limb if side + part in placed]
+            said = [roles[by_tree[side + part]].side.value for part in limb if side + part in by_tree]
             votes += said.count(side) - said.count(other)
-        across = places[placed["left" + limb[0]]] - places[placed["right" + limb[0]]]
+        across = positions[by_tree["left" + limb[0]]] - positions[by_tree["right" + limb[0]]]
         if left is None:
             left = across * across[across.abs().argmax()].sign()
         if votes < 0 or (votes == 0 and float(across @ left) < 0):
             names = {side + part for side in ("left", "right") for part in limb}
-            placed = {mirror_name(name) if name in names else name: joint for name, joint in placed.items()}
+            by_tree = {mirror_name(name) if name in names else name: joint for name, joint in by_tree.items()}
             across = -across
         left = across
-    return placed
+    return by_tree
 
 
 def _descendants(skeleton: Skeleton, joint: int) -> set[int]:

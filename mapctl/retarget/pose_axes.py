@@ -13,8 +13,8 @@ from mapctl.skeleton import CANONICAL, Skeleton
 
 SAMPLES = 200
 """Number of frames of a clip that are looked at, spread over it."""
-_UPRIGHT_COSINE = 0.8  # cosine between an axis and the body that stands along it
-_MIN_HANDEDNESS = 0.3  # of the triple product left x up x toes, below which toes do not tell the facing
+_UPRIGHT_COSINE = 0.8  # least cosine between the vertical axis and an upright body
+_MIN_HANDEDNESS = 0.3  # least triple product left x up . toes from which the facing is inferred
 
 JointOf = Sequence[int | None]
 """For each canonical joint the rig's joint, or None."""
@@ -24,9 +24,9 @@ JointOf = Sequence[int | None]
 class RigPoses:
     """Poses of one rig in its file's world: frames of a clip, or the single pose with all rotations zero."""
 
-    places: Float[Tensor, "poses joints 3"]
+    positions: Float[Tensor, "poses joints 3"]
     """World positions, metres."""
-    turns: Float[Tensor, "poses joints 4"]
+    orientations: Float[Tensor, "poses joints 4"]
     """World rotations (xyzw)."""
     skeleton: Skeleton
     """Skeleton of the rig."""
@@ -52,7 +52,7 @@ class RigPoses:
 
     def first(self) -> "RigPoses":
         """Return the first pose alone."""
-        return RigPoses(self.places[:1], self.turns[:1], self.skeleton, self.joint_of)
+        return RigPoses(self.positions[:1], self.orientations[:1], self.skeleton, self.joint_of)
 
     def has(self, *names: str) -> bool:
         """Return whether the rig has all these canonical joints."""
@@ -62,7 +62,7 @@ class RigPoses:
         """Return the position of a canonical joint that the rig has, metres."""
         joint = self.joint_of[CANONICAL.index(name)]
         assert joint is not None
-        return self.places[:, joint]
+        return self.positions[:, joint]
 
     def end(self, name: str) -> Float[Tensor, "poses 3"] | None:
         """Return the position of the End Site of a canonical joint, metres, if there is one of some length."""
@@ -70,13 +70,13 @@ class RigPoses:
         site = self.skeleton.end_offsets.get(self.skeleton.names[joint]) if joint is not None else None
         if joint is None or site is None or max(map(abs, site)) < 1e-4:
             return None
-        offset = torch.tensor(site, dtype=torch.float64).expand(len(self.places), 3)
-        return self.places[:, joint] + rotations.rotate(self.turns[:, joint], offset)
+        offset = torch.tensor(site, dtype=torch.float64).expand(len(self.positions), 3)
+        return self.positions[:, joint] + rotations.rotate(self.orientations[:, joint], offset)
 
     def up(self) -> Float[Tensor, "poses 3"]:
         """Return the unit vector from the thighs to the upper arms."""
         high = self.place("leftUpperArm") + self.place("rightUpperArm")
-        return _unit(high - self.place("leftUpperLeg") - self.place("rightUpperLeg"))
+        return unit_vectors(high - self.place("leftUpperLeg") - self.place("rightUpperLeg"))
 
     def left(self) -> Float[Tensor, "poses 3"]:
         """Return the unit vector from the right thigh to the left, square to `up`; by the upper arms where thighs are
@@ -84,19 +84,16 @@ class RigPoses:
         across = self.place("leftUpperLeg") - self.place("rightUpperLeg")
         arms = self.place("leftUpperArm") - self.place("rightUpperArm")
         across = torch.where(across.norm(dim=-1, keepdim=True) > 1e-3, across, arms)
-        return _unit(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
+        return unit_vectors(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
 
     def toes(self) -> Float[Tensor, "poses 3"]:
         """Return the unit vector from the feet to the toes or the feet's End Sites; zero where there are none."""
-        ways = [self.way(side + "Foot") for side in ("left", "right")]
-        return _unit(sum((way for way in ways if way is not None), torch.zeros_like(self.places[:, 0])))
+        feet = [self.bone(side + "Foot") for side in ("left", "right")]
+        return unit_vectors(sum((foot for foot in feet if foot is not None), torch.zeros_like(self.positions[:, 0])))
 
-    def way(self, name: str) -> Float[Tensor, "poses 3"] | None:
+    def bone(self, name: str) -> Float[Tensor, "poses 3"] | None:
         """Return the vector, metres, from a canonical joint to the next one of its limb or trunk that the rig has, or
-        to its End Site.
-
-        None where it lacks one of the two.
-        """
+        to its End Site; None where the rig lacks either end."""
         if not self.has(name):
             return None
         following = next_joint(name)
@@ -106,7 +103,7 @@ class RigPoses:
         return None if stop is None else stop - self.place(name)
 
     def handedness(self) -> Float[Tensor, " poses"]:
-        """Return left x up along the toes: 1 where sides are what their names say, -1 where they are exchanged."""
+        """Return the triple product left x up . toes: 1 where sides are as named, -1 where they are exchanged."""
         toes, up = self.toes(), self.up()
         return (torch.linalg.cross(self.left(), up) * toes).sum(-1)
 
@@ -129,20 +126,20 @@ def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
 
 
 def find_up_axis(zero: RigPoses, clip: RigPoses | None) -> str:
-    """Find the up axis, Y or Z, of the body in the clip, else in the zero pose; Y where neither tells.
+    """Find the up axis, Y or Z, by the body in the clip, else in the zero pose; Y where neither is conclusive.
 
-    Against the zero pose, and where that tells nothing, only a clip counts in which the body stands along Z all the
-    time: people lie down, too.
+    A clip overrules the zero pose only if the body is upright along the other axis in all of its frames, since people
+    lie down, too.
     """
-    rest = zero.up()[0]
-    told = "z" if float(rest[2]) > _UPRIGHT_COSINE else "y"
+    rest = "z" if float(zero.up()[0, 2]) > _UPRIGHT_COSINE else "y"
     if clip is None:
-        return told
+        return rest
     tall = clip.up()
-    if told == "y":
+    if rest == "y":
         return "z" if float(tall[:, 2].min()) > 0.5 and float(tall[:, 2].mean()) > _UPRIGHT_COSINE else "y"
     return "y" if float(tall[:, 1].min()) > 0.5 and float(tall[:, 1].mean()) > _UPRIGHT_COSINE else "z"
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def unit_vectors(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Scale vectors to length 1; a vanishing one stays zero."""
     return torch.nn.functional.normalize(vectors, dim=-1, eps=1e-9)

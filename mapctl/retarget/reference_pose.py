@@ -1,7 +1,7 @@
 """The T-pose of any rig: the rotation of each joint in it, from a table, or found from a pose that is near it.
 
-All rotations zero, or a clip's first frame, is the pose to begin from. It is turned upright and to face +Z; then each
-limb is laid along its canonical direction by the shortest arc, from the body outward. Feet stand as they stood.
+All rotations zero, or a clip's first frame, is the pose to begin from. It is rotated upright and to face +Z; then each
+limb is laid along its canonical direction by the shortest arc, from the body outward. Feet keep their orientation.
 """
 
 import math
@@ -12,46 +12,45 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.retarget.pose_axes import RigPoses, find_up_axis
+from mapctl.retarget.pose_axes import RigPoses, find_up_axis, unit_vectors
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 
 _LIMBS = ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg")
-_SNAP = math.radians(20)  # a rest pose this near an axis stands and faces along it
+_SNAP = math.radians(20)  # a rest pose whose up or facing is this near an axis has it along that axis
 _TRUNK_TOLERANCE = math.radians(40)  # trunk and shoulders keep their own shape up to here
-_LEVEL, _HANGING = math.radians(25), math.radians(100)  # of arms: T-pose up to the first, A-pose up to the second
-_LEG_TOLERANCE = math.radians(35)  # of legs in a rest pose that somebody stands in
-_EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose and not a moment of a dance
-_MIN_HINGE_BEND, _MIN_TWIST = (
-    0.2,
-    math.radians(60),
-)  # mean bend (radians) that tells a hinge, and the twist that is put right
+# Of arms below level: a T-pose up to the first, an A-pose up to the second.
+_LEVEL, _HANGING = math.radians(25), math.radians(100)
+_LEG_TOLERANCE = math.radians(35)  # between the legs of a standing rest pose and the vertical
+_EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose on purpose
+_MIN_HINGE_BEND = 0.2  # radians: least mean bend of a joint from which its hinge axis is estimated
+_MIN_TWIST = math.radians(60)  # least twist that is corrected
 _QUARTER_TURN = math.pi / 2  # rigs are built in quarter turns
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True, eq=False)
 class TPose:
-    """The rig's pose when the canonical skeleton stands in its rest pose."""
+    """The pose of the rig that corresponds to the canonical skeleton's rest pose."""
 
     quat_xyzw: Float[Tensor, "joints 4"]
     """World rotation of each canonical joint's rig joint, in a world with Y up."""
     idle_quat_xyzw: Float[Tensor, "rigged 4"]
-    """Local rotations of the rig's joints at rest; what counts of it are joints that no canonical one stands for."""
+    """Local rotations of the rig's joints at rest, used for joints without a canonical counterpart."""
     upright_quat_xyzw: Float[Tensor, "4"] | None
     """Rotation that takes the file's world to Y up, xyzw; None where it is."""
     up: str
     """Axis of the file's world that points up."""
     facing: str
-    """Axis of the file that the rest pose faces, as far as it is along one; else `unknown`."""
+    """Axis of the file that the rest pose faces; `unknown` where it faces along none."""
     rest: str
-    """The pose with all rotations zero: T, A or neither."""
+    """What the pose with all rotations zero is: T, A or neither."""
     found: str
     """Where the T-pose comes from: table, rest pose, or frame 0."""
 
 
 def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig) -> TPose:
-    """Find the T-pose of a rig whose table has none; what the rig sets is not looked for."""
+    """Find the T-pose of a rig whose table has none; axes that the rig sets are taken, not searched for."""
     up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
     upright = upright_rotation(up)
     base, found, facing = zero, "rest pose", None if rig.facing == "auto" else axis_vector(rig.facing)
@@ -75,7 +74,7 @@ def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig) -> TPose:
 def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str:
     """Classify the first pose as a T-pose, an A-pose (arms anywhere between level and hanging), or neither.
 
-    `front` turns it to stand upright and face +Z.
+    `front` rotates it to be upright and face +Z.
     """
     arms = [
         (_bone_direction(poses, side + part, front), sign)
@@ -95,7 +94,7 @@ def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str
 
 
 def upright_rotation(up: str) -> Float[Tensor, "4"] | None:
-    """Return the rotation that turns a world so that Y is up; None where it is."""
+    """Return the rotation from a world with this up axis to one with Y up; None where it is Y already."""
     return None if up == "y" else rotations.from_matrix(align_bone(axis_vector(up), axis_vector("y")))
 
 
@@ -103,8 +102,8 @@ def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
     """Return whether the first pose is a T-pose that captures begin with: all straight, arms level, legs vertical."""
     for side, sign in (("left", 1.0), ("right", -1.0)):
         for part, aim in (("Arm", axis_vector("x") * sign), ("Leg", -axis_vector("y"))):
-            ways = [_bone_direction(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
-            if any(float(way @ aim) < math.cos(_EXACT_TPOSE_ANGLE) for way in ways):
+            bones = [_bone_direction(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
+            if any(float(bone @ aim) < math.cos(_EXACT_TPOSE_ANGLE) for bone in bones):
                 return False
     return True
 
@@ -136,7 +135,7 @@ def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 
 
 
 def _first_frame_rotation(first: RigPoses, up: Tensor) -> Float[Tensor, "3 3"]:
-    """Return the rotation of a clip's frame to face +Z; it stands as upright as its performer did."""
+    """Return the rotation of a clip's first frame to face +Z; its up axis is the world's."""
     return _body_frame(first.left()[0], up)
 
 
@@ -151,8 +150,8 @@ def _snap_to_axis(direction: Tensor) -> Tensor:
 
 
 def _bone_direction(poses: RigPoses, name: str, front: Tensor) -> Float[Tensor, "3"]:
-    way = poses.way(name)
-    return torch.zeros(3, dtype=torch.float64) if way is None else _unit(front @ way[0])
+    bone = poses.bone(name)
+    return torch.zeros(3, dtype=torch.float64) if bone is None else unit_vectors(front @ bone[0])
 
 
 def _lay_out_tpose(
@@ -166,38 +165,32 @@ def _lay_out_tpose(
         if part in ("Foot", "Toes"):
             turns.append(front if stands else _lay_out_foot(base, name, above, pitch))
             continue
-        way, aim = _bone_direction(base, name, above), _canonical_direction(index)
-        limb = part in _LIMBS
-        apart = float(torch.arccos((way @ aim).clamp(-1, 1)))
-        if (
-            aim.norm() > 0
-            and way.norm() > 0
-            and base.has(name)
-            and (limb or apart > _TRUNK_TOLERANCE)
-            and part != "Hand"
-        ):
-            above = align_bone(way, aim) @ above
+        bone, aim = _bone_direction(base, name, above), _canonical_direction(index)
+        apart = float(torch.arccos((bone @ aim).clamp(-1, 1)))
+        aligned = part in _LIMBS or (part != "Hand" and apart > _TRUNK_TOLERANCE)
+        if aligned and aim.norm() > 0 and bone.norm() > 0 and base.has(name):
+            above = align_bone(bone, aim) @ above
         if name in twists:
             above = rotations.rotation_vector_to_matrix(aim * twists[name]) @ above
         turns.append(above)
     still = [rotations.from_matrix(turn) for turn in turns]
     joints = [
-        base.turns[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1]) for joint in base.joint_of
+        base.orientations[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1])
+        for joint in base.joint_of
     ]
     return torch.stack([rotations.multiply(turn, own) for turn, own in zip(still, joints, strict=True)])
 
 
 def _lay_out_foot(base: RigPoses, name: str, above: Tensor, pitch: float | None) -> Tensor:
-    """Lay a foot flat on the floor, or toes level, where the base pose does not stand."""
-    way = base.way(name)
-    if name.endswith("Toes") and way is None:
-        way = base.way(name.replace("Toes", "Foot"))
-    if way is None:
+    """Lay a foot flat on the floor, or toes level, where the base pose is not a standing one."""
+    bone, toes = base.bone(name), name.endswith("Toes")
+    if toes and bone is None:
+        bone = base.bone(name.replace("Toes", "Foot"))
+    if bone is None:
         return above
-    slope = _canonical_foot_pitch() if pitch is None else pitch
-    slope = 0.0 if name.endswith("Toes") else slope
+    slope = 0.0 if toes else _canonical_foot_pitch() if pitch is None else pitch
     aim = torch.tensor([0.0, -math.sin(slope), math.cos(slope)], dtype=torch.float64)
-    return align_bone(_unit(above @ way[0]), aim) @ above
+    return align_bone(unit_vectors(above @ bone[0]), aim) @ above
 
 
 def _canonical_direction(index: int) -> Float[Tensor, "3"]:
@@ -205,7 +198,7 @@ def _canonical_direction(index: int) -> Float[Tensor, "3"]:
     name = CANONICAL.names[index]
     if name == "hips" or not CANONICAL.children(index):
         return torch.zeros(3, dtype=torch.float64)
-    return _unit(CANONICAL.offsets[CANONICAL.children(index)[0]])
+    return unit_vectors(CANONICAL.offsets[CANONICAL.children(index)[0]])
 
 
 def _canonical_foot_pitch() -> float:
@@ -214,9 +207,9 @@ def _canonical_foot_pitch() -> float:
 
 
 def _estimate_foot_pitch(clip: RigPoses | None, upright: Tensor | None) -> float | None:
-    """Estimate how far the foot's bone points below level while it stands flat, radians, from how much lower than the
-    ankle the toe gets over the clip."""
-    if clip is None or not clip.has("leftToes", "rightToes", "leftFoot", "rightFoot") or len(clip.places) < 10:
+    """Estimate the pitch of the foot's bone below level while the foot is flat, radians, from how much lower than the
+    ankle the toe gets over the clip; None where the clip does not show it."""
+    if clip is None or not clip.has("leftToes", "rightToes", "leftFoot", "rightFoot") or len(clip.positions) < 10:
         return None
     up = axis_vector("y") if upright is None else rotations.rotate(rotations.inverse(upright), axis_vector("y"))
     found = []
@@ -232,10 +225,10 @@ def _estimate_foot_pitch(clip: RigPoses | None, upright: Tensor | None) -> float
 
 
 def _untwist_tpose(base: RigPoses, front: Tensor, clip: RigPoses, upright: Tensor | None) -> Float[Tensor, "joints 4"]:
-    """Return the T-pose of a rig whose zero pose is none: bones tell all but the rotation of joints about them.
+    """Return the T-pose of a rig whose zero pose is none: bones determine all but the twist of joints about them.
 
     Over a clip the trunk's joints are hardly twisted, knees bend backward and elbows forward: what contradicts that is
-    put right, from the hips outward.
+    corrected, from the hips outward.
     """
     pitch, twists = _estimate_foot_pitch(clip, upright), {}
     for name in (
@@ -286,16 +279,16 @@ def _hinge_error(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | Non
 
 def _canonical_rotations(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> Float[Tensor, "poses 4"]:
     """Return the world rotations of a canonical joint over a clip."""
-    index, frames = CANONICAL.index(name), len(clip.turns)
+    index, frames = CANONICAL.index(name), len(clip.orientations)
     joint = clip.joint_of[index]
     assert joint is not None
-    turns = rotations.multiply(clip.turns[:, joint], rotations.inverse(quats[index]).expand(frames, 4))
+    turns = rotations.multiply(clip.orientations[:, joint], rotations.inverse(quats[index]).expand(frames, 4))
     return turns if upright is None else rotations.multiply(upright.expand(frames, 4), turns)
 
 
 def _local_rotations(base: RigPoses) -> Float[Tensor, "rigged 4"]:
     """Return the local rotations of the base pose."""
-    parents, turns = base.skeleton.parents, base.turns[0]
+    parents, turns = base.skeleton.parents, base.orientations[0]
     return torch.stack(
         [
             turns[j] if p < 0 else rotations.multiply(rotations.inverse(turns[p]), turns[j])
@@ -318,7 +311,3 @@ def align_bone(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Ten
         return align_bone(over @ start, stop) @ over
     sine = axis.norm().clamp_min(1e-12)
     return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    return torch.nn.functional.normalize(vectors, dim=-1, eps=1e-9)

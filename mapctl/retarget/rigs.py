@@ -1,11 +1,10 @@
-"""Known rigs, one TOML each: which of their joints is which canonical one, and how they stand in a T-pose."""
+"""Known rigs, one TOML each: which of their joints is which canonical one, and what their T-pose is."""
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ _KEYS = {"name", "about", "also", "joints", "tpose", "straighten", "end_sites", 
 
 @dataclass(frozen=True)
 class Rig:
-    """What is known of a rig before a file of it is opened."""
+    """Names, T-pose and axes of a rig, as known before any file of it is read."""
 
     name: str
     """Name by which users call the rig."""
@@ -86,34 +85,13 @@ def known_rigs() -> tuple[Rig, ...]:
     return canonical, *(_rig_from_table(tomllib.loads(path.read_text("utf-8"))) for path in paths)
 
 
-def recognise(skeleton: Skeleton) -> Rig:
-    """Recognise the rig of a skeleton, listed or not; RequestError tells which canonical joints cannot be found."""
-    from mapctl.retarget.joint_matching import match
-
-    return match(skeleton).rig
+def find_preset(name: str) -> Rig | None:
+    """Return the known rig of this name, in any case; None where there is none."""
+    return next((rig for rig in known_rigs() if rig.name == name.lower()), None)
 
 
-def load_rig(name_or_path: str | PathLike[str]) -> Rig:
-    """Load a preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
-    text, path = str(name_or_path), Path(name_or_path)
-    for rig in known_rigs():
-        if rig.name == text.lower():
-            return rig
-    if path.suffix.lower() == ".toml":
-        return _read_toml(path)
-    names = ", ".join(rig.name for rig in known_rigs())
-    if not path.suffix:
-        raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
-    from mapctl import formats, retarget
-
-    found = retarget.to_canonical(formats.load(path))[1]
-    joints = {
-        c: found.rig_skeleton.names[j] for c, j in zip(CANONICAL.names, found.joint_of, strict=True) if j is not None
-    }
-    return replace(found.rig, joints=joints, aliases={})
-
-
-def _read_toml(path: Path) -> Rig:
+def read_rig_toml(path: Path) -> Rig:
+    """Read a rig from a TOML file; FileFormatError says what is wrong with it."""
     try:
         return _rig_from_table({"name": path.stem, **tomllib.loads(read_bytes(path).decode("utf-8"))})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -1,7 +1,7 @@
 """How a performer stands: the height of the toe joints over the floor, and the tilt of feet and toes while flat on it.
 
-Both belong to the rig as much as bones do, and a T-pose alone does not tell them: a table may lay a foot along another
-performer's, and nobody's toe joints are on the floor. A clip shows them, where its feet stand; else the rest pose does.
+Both belong to the rig as much as bones do, and a T-pose alone does not show them: a table may lay a foot along another
+performer's, and no toe joint is on the floor itself. A clip shows them, where its feet are planted; else the rest pose.
 """
 
 import math
@@ -17,16 +17,14 @@ from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
 
 SIDES = ("left", "right")
-_MAX_FLOOR_OFFSET = 0.15  # of the leg: toes that rest further from 0 do not stand on a floor at 0
+_MAX_FLOOR_OFFSET = 0.15  # of the leg: where toes rest further from 0, the floor is not at 0
 _MAX_TOE_DIFFERENCE = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
 _FLAT_ANKLE_METRES = 0.01  # metres over its lowest that the ankle of a flat foot is
 _LOWEST_QUANTILE = 0.05  # quantile that is an ankle's lowest
 _MAX_TOE_DEPTH = 0.03  # metres that toes go through the floor at most, of a clip that counts
-_MIN_FLAT_SECONDS = 0.25  # seconds of a flat foot that tell how it is turned
-_MIN_TILT, _MAX_TILT = (
-    math.radians(-12),
-    math.radians(35),
-)  # tilts that are the T-pose's; a foot further down is on tip-toe
+_MIN_FLAT_SECONDS = 0.25  # seconds of a flat foot from which its tilt is estimated
+# Tilts outside are no error of the T-pose: a foot that points further down is on tip-toe.
+_MIN_TILT, _MAX_TILT = math.radians(-12), math.radians(35)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +54,8 @@ class Stance:
         """Measure the stance of a clip (canonical joints, from `to_canonical` with this map).
 
         Toes rest at a low percentile of their own height. A foot is flat where the toe is planted and the ankle at its
-        lowest, and what it is turned by then is the T-pose's error: a T-pose whose feet point down is common. One that
-        points down against the T-pose is more likely on tip-toe, and is believed for a little only.
+        lowest, and its tilt then is the T-pose's error: a T-pose whose feet point down is common. One that
+        points down against the T-pose is more likely on tip-toe, and is accepted up to a few degrees only.
         """
         rest = Stance.at_rest(rigmap.skeleton)
         toes = clip.joint_positions()[:, _side_joints("Toes")]

@@ -15,9 +15,9 @@ LimbPair = tuple[list[int], list[int]]
 
 
 def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
-    """Match canonical joint names to the rig's joints, as far as the tree tells; empty where it is no human body's.
+    """Match canonical joint names to the rig's joints, as far as the tree shows; empty where it is no human body's.
 
-    Which limb of a pair is the left one is not told: sides are to be checked by what else is known.
+    Sides are arbitrary: which limb of a pair is the left one has to be decided by names or positions.
     """
     tree = _JointTree(skeleton)
     for hips in range(skeleton.num_joints):
@@ -36,7 +36,7 @@ def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int,
     for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
         found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
         found |= tree.limb(arm, [side + part for part in ("Shoulder", "UpperArm", "LowerArm", "Hand", "")])
-    trunk = tree.way(hips, chest)
+    trunk = tree.path(hips, chest)
     if trunk:
         found["spine"] = trunk[0]
     if len(trunk) > 1:
@@ -49,7 +49,7 @@ def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int,
 
 
 class _JointTree:
-    """Bone lengths and reaches."""
+    """Children, bone lengths and reaches of a skeleton's joints; a reach is the length of the longest chain below."""
 
     def __init__(self, skeleton: Skeleton):
         self.parents = skeleton.parents
@@ -66,23 +66,24 @@ class _JointTree:
         found = []
         for k, first in enumerate(self.children[joint]):
             for second in self.children[joint][k + 1 :]:
-                ways = self.trace_limb_pair(first, second)
-                long = sum(self.length[joint] for joint in ways[0][1:])
-                if len(ways[0]) >= 3 and long >= _MIN_REACH_SHARE * self.reach[joint] and self.are_alike(first, second):
-                    found.append((-long, ways))
-        return [ways for _, ways in sorted(found)]
+                paths = self.trace_limb_pair(first, second)
+                long = sum(self.length[joint] for joint in paths[0][1:])
+                far = long >= _MIN_REACH_SHARE * self.reach[joint]
+                if far and len(paths[0]) >= 3 and self.are_alike(first, second):
+                    found.append((-long, paths))
+        return [paths for _, paths in sorted(found)]
 
     def trace_limb_pair(self, first: int, second: int) -> LimbPair:
         """Follow two branches down as long as they are alike; a sword in one hand is not."""
-        ways = [first], [second]
+        paths = [first], [second]
         while True:
-            ends = product(self.children[ways[0][-1]], self.children[ways[1][-1]])
+            ends = product(self.children[paths[0][-1]], self.children[paths[1][-1]])
             steps = [step for step in ends if self.are_alike(*step)]
             if not steps:
-                return ways
+                return paths
             best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
-            for way, joint in zip(ways, best, strict=True):
-                way.append(joint)
+            for path, joint in zip(paths, best, strict=True):
+                path.append(joint)
 
     def are_alike(self, first: int, second: int) -> bool:
         """Return whether two bones are of about the same length."""
@@ -91,10 +92,10 @@ class _JointTree:
 
     def chain(self, joint: int) -> list[int]:
         """Return the joints from this one to the farthest leaf."""
-        way = [joint]
-        while self.children[way[-1]]:
-            way.append(max(self.children[way[-1]], key=lambda child: self.length[child] + self.reach[child]))
-        return way
+        path = [joint]
+        while self.children[path[-1]]:
+            path.append(max(self.children[path[-1]], key=lambda child: self.length[child] + self.reach[child]))
+        return path
 
     def below(self, joint: int) -> list[int]:
         """Return the joint and all below it, parents first."""
@@ -103,17 +104,17 @@ class _JointTree:
             found.extend(self.children[above])
         return found
 
-    def way(self, above: int, joint: int) -> list[int]:
+    def path(self, above: int, joint: int) -> list[int]:
         """Return the joints below `above` on the chain to a joint, and that joint."""
-        way = []
+        path = []
         while joint != above:
-            way.append(joint)
+            path.append(joint)
             joint = self.parents[joint]
-        return way[::-1]
+        return path[::-1]
 
-    def limb(self, way: list[int], names: list[str]) -> dict[str, int]:
+    def limb(self, path: list[int], names: list[str]) -> dict[str, int]:
         """Name a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
-        both = [self.length[way[k + 1]] + self.length[way[k + 2]] for k in range(len(way) - 2)]
+        both = [self.length[path[k + 1]] + self.length[path[k + 2]] for k in range(len(path) - 2)]
         upper = max(range(len(both)), key=both.__getitem__)
         placed = {name: upper + k - 1 for k, name in enumerate(names)}
-        return {name: way[at] for name, at in placed.items() if len(name) > 5 and 0 <= at < len(way)}
+        return {name: path[at] for name, at in placed.items() if len(name) > 5 and 0 <= at < len(path)}

@@ -1,9 +1,8 @@
 """Particle swarm (Kennedy and Eberhart 1995; Wang et al. 2019, section 5.2) by pyswarms, and a baseline of samples.
 
 pyswarms' own optimisers keep every iterate, draw first velocities from [0, 1] whatever the unit, and cannot stop at a
-budget; so its swarm, topologies and update rules are used, and the loop is here. Two more habits are contained: it sets
-up the process's logging (and a report.log in the working folder) at import and at every object made, and it draws from
-numpy's global random state.
+budget; so its swarm, topologies and update rules are used, and the loop is here. pyswarms also sets up the process's
+logging (and a report.log in the working folder) at import and with every object made, which is suppressed here.
 """
 
 import logging.config
@@ -12,7 +11,6 @@ import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -91,14 +89,14 @@ def run_swarm(
         return track.result()
     seed = torch.randint(2**32, (8,), generator=generator, device=generator.device).cpu().numpy()
     limits = None if bounds is None else (_to_numpy(bounds[0]), _to_numpy(bounds[1]))
-    flight = _ParticleSwarm(_to_numpy(points), settings, limits, np.random.RandomState(seed))
+    swarm = _make_swarm(_to_numpy(points), settings, limits, np.random.RandomState(seed))
     for iteration in range(settings.iterations):
         if iteration:
-            flight.move()
-        energies = track.evaluate(torch.as_tensor(flight.positions).to(start))
+            swarm.move()
+        energies = track.evaluate(torch.as_tensor(swarm.positions).to(start))
         if energies is None:
             break
-        flight.learn(energies)
+        swarm.learn(energies)
     return track.result()
 
 
@@ -155,50 +153,6 @@ class _BestTracker:
         return SwarmResult(self._x, self._energy, self._evaluations, tuple(self._history))
 
 
-class _ParticleSwarm:
-    """pyswarms' swarm and topology."""
-
-    def __init__(self, points: np.ndarray, settings: SwarmSettings, bounds: Any, random: np.random.RandomState):
-        self._random, self._bounds = random, bounds
-        with _suppress_logging_config():
-            from pyswarms.backend.handlers import BoundaryHandler, VelocityHandler  # pyright: ignore[reportMissingTypeStubs]
-            from pyswarms.backend.swarms import Swarm  # pyright: ignore[reportMissingTypeStubs]
-            from pyswarms.backend.topology import Ring, Star  # pyright: ignore[reportMissingTypeStubs]
-
-            self._boundary_handler, self._velocity_handler = BoundaryHandler("nearest"), VelocityHandler("unmodified")
-            self._topology: Any = Star() if settings.neighbours is None else Ring(static=False)
-        self._topology_options = (
-            {} if settings.neighbours is None else {"p": 2, "k": min(settings.neighbours, len(points))}
-        )
-        weights = {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
-        self._swarm: Any = Swarm(points, np.zeros_like(points), options=weights)  # pyright: ignore[reportCallIssue]
-        self._swarm.pbest_cost = np.full(len(points), np.inf)
-        self._swarm.best_pos = points[0]  # until a finite energy is seen, which may be never
-
-    @property
-    def positions(self) -> np.ndarray:
-        """(particles, n)"""
-        return self._swarm.position
-
-    def learn(self, energies: np.ndarray):
-        """Take the energies at the positions in."""
-        from pyswarms.backend import operators  # pyright: ignore[reportMissingTypeStubs]
-
-        self._swarm.current_cost = energies
-        self._swarm.pbest_pos, self._swarm.pbest_cost = operators.compute_pbest(self._swarm)  # pyright: ignore[reportUnknownMemberType]
-        self._swarm.best_pos, self._swarm.best_cost = self._topology.compute_gbest(
-            self._swarm, **self._topology_options
-        )
-
-    def move(self):
-        """Move the particles; return new velocities and positions."""
-        with _use_numpy_state(self._random):
-            self._swarm.velocity = self._topology.compute_velocity(
-                self._swarm, None, self._velocity_handler, self._bounds
-            )
-        self._swarm.position = self._topology.compute_position(self._swarm, self._bounds, self._boundary_handler)
-
-
 def _sample_points(
     start: Tensor, spread: Tensor | float, bounds: Bounds | None, count: float, generator: torch.Generator
 ) -> Float[Tensor, "count n"]:
@@ -220,6 +174,19 @@ def _to_numpy(values: Tensor) -> np.ndarray:
     return values.detach().to("cpu", torch.float64).numpy()
 
 
+def _make_swarm(
+    points: np.ndarray,
+    settings: SwarmSettings,
+    limits: tuple[np.ndarray, np.ndarray] | None,
+    random: np.random.RandomState,
+):
+    with _suppress_logging_config():
+        from mapctl.solver.particle_swarm import ParticleSwarm  # slow
+
+        weights = {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
+        return ParticleSwarm(points, weights, settings.neighbours, limits, random)
+
+
 _LOGGING_LOCK = threading.Lock()
 
 
@@ -233,15 +200,3 @@ def _suppress_logging_config() -> Generator[None, None, None]:
             yield
         finally:
             logging.config.dictConfig = configure
-
-
-@contextmanager
-def _use_numpy_state(random: np.random.RandomState) -> Generator[None, None, None]:
-    """Use `random` for numpy's global draws within, and move it on; afterwards the global state is as it was."""
-    before = np.random.get_state()
-    np.random.set_state(random.get_state())
-    try:
-        yield
-    finally:
-        random.set_state(np.random.get_state())
-        np.random.set_state(before)

@@ -44,7 +44,7 @@ def is_own_page(headers: Headers, port: int) -> bool:
 def restrict_to_own_pages() -> Iterator[None]:
     """Make a viser server that is started within refuse all but its own pages, with status 403.
 
-    viser has no place to say so: it gives websockets neither `origins` nor a `process_request` of ours. What it calls
+    viser has no option for it: it gives websockets neither `origins` nor a `process_request` of ours. What it calls
     is therefore replaced for as long as its server starts.
     """
     serve = websockets_server.serve

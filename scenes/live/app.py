@@ -35,7 +35,7 @@ _WORLD = "/world"
 
 
 class LiveApp:
-    """A Deck. Everything but the loop itself runs when the loop gets to it, on one thread; what fails there is said in
+    """The live viewer of one loop. What users do is queued and runs on the loop's thread; an error there is shown in
     the page and on the console, and ends nothing else.
     """
 
@@ -110,7 +110,7 @@ class LiveApp:
             self.server.stop()
 
     def order(self, **changes: Any) -> None:
-        """See Deck."""
+        """Change the chosen character's orders, and show them; it leaves its path."""
 
         def ordered() -> None:
             self._apply_order(changes)
@@ -119,7 +119,7 @@ class LiveApp:
         self._enqueue(ordered)
 
     def typed(self, **changes: Any) -> None:
-        """See Deck."""
+        """Change orders from a control, which already shows them and may still be typed into."""
 
         def ordered() -> None:
             self._apply_order(changes)
@@ -129,7 +129,7 @@ class LiveApp:
         self._enqueue(ordered)
 
     def nudge(self, **by: float) -> None:
-        """See Deck."""
+        """Add to the chosen character's speed (m/s) or heading (degrees), as far as it goes."""
 
         def ordered() -> None:
             orders = self._chosen_member.orders
@@ -144,7 +144,7 @@ class LiveApp:
         self._enqueue(ordered)
 
     def choose(self, character: int) -> None:
-        """See Deck."""
+        """Choose the character whose orders are shown and changed from now on."""
 
         def chosen() -> None:
             if not 0 <= character < len(self._members):
@@ -157,7 +157,7 @@ class LiveApp:
         self._enqueue(chosen)
 
     def toggle_pause(self) -> None:
-        """See Deck."""
+        """Stop everybody, or go on."""
 
         def toggled() -> None:
             self._is_paused = not self._is_paused
@@ -169,7 +169,7 @@ class LiveApp:
         self._enqueue(toggled)
 
     def reset(self) -> None:
-        """See Deck."""
+        """Restart all characters."""
 
         def begun_anew() -> None:
             for member in self._members:
@@ -181,7 +181,7 @@ class LiveApp:
         self._enqueue(begun_anew)
 
     def walk_path(self) -> None:
-        """See Deck."""
+        """Let the chosen character walk the drawn path."""
 
         def walked() -> None:
             member = self._chosen_member
@@ -193,11 +193,11 @@ class LiveApp:
         self._enqueue(walked)
 
     def clear_path(self) -> None:
-        """See Deck."""
+        """Forget the drawn points."""
         self._enqueue(self._path.clear)
 
     def toggle_recording(self, client: viser.ClientHandle | None) -> None:
-        """See Deck."""
+        """Begin to record the chosen character, or end and give that browser the file."""
 
         def toggled() -> None:
             member = self._chosen_member
@@ -280,7 +280,7 @@ class LiveApp:
             self._notices.console(said or f"{member.name} keeps up again")
 
     def _draw_at(self, ray_origin: Any, ray_direction: Any) -> None:
-        """Add a point to the path where somebody clicked: a ray of two times three numbers if the browser is well."""
+        """Add a point to the path at a click: the ray's origin and direction, three numbers each, checked for that."""
 
         def added() -> None:
             ray = ground.parse_ray(ray_origin, ray_direction)

@@ -1,4 +1,4 @@
-"""The controls of the live viewer. What somebody does becomes a call on `ViewerActions`; the panel itself decides
+"""The controls of the live viewer. What a user does becomes a call on `ViewerActions`; the panel itself decides
 nothing.
 
 Callbacks are coroutines: those run in the order in which browsers did things, others on threads in any order.
@@ -150,7 +150,7 @@ class ControlPanel:
             _bind_hotkey(gui.add_command(label, hotkey=key), action)
 
     def _bind_control(self, handle: Any, action: Callable[[Any], None]) -> None:
-        """Act when somebody moves a control, on what it shows then; not when the panel itself does."""
+        """Act when a user moves a control, on what it shows then; not when the panel itself moves it."""
 
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:

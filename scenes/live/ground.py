@@ -77,7 +77,7 @@ class GroundMarks:
 
 
 class DrawnPath:
-    """Points that somebody set on the ground, and the smooth curve through them."""
+    """Points that a user set on the ground, and the smooth curve through them."""
 
     def __init__(self, scene: viser.SceneApi, name: str):
         self._scene, self._name = scene, name
@@ -135,7 +135,7 @@ def _sample_curve(points: Sequence[tuple[float, float]]) -> Array | None:
     try:
         curve = curves.through(np.array(points, dtype=np.float64).reshape(-1, 2))
     except RequestError:
-        return None  # one point, or all in one place: no curve yet
+        return None  # one point, or all at one position: no curve yet
     arcs = np.linspace(0, curve.length, min(_MAX_SHOWN_POINTS, max(2, round(curve.length / _SPACING))))
     places = np.array([curve.point(float(arc)).tolist() for arc in arcs])
     return np.insert(places, 1, _PATH_HEIGHT, axis=1)

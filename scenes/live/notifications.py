@@ -11,7 +11,7 @@ from scenes.live.access import format_error
 from scenes.live.inputs import Refusal
 
 _REFUSAL_SECONDS = 8.0  # seconds for which a refusal is shown
-_REPEAT_SECONDS = 10.0  # seconds before the same is said again
+_REPEAT_SECONDS = 10.0  # seconds before the same message is shown again
 _EVENT_SECONDS = 8.0
 
 

@@ -13,7 +13,7 @@ _MAX_SHORT_SHARE, _MAX_LONG_SHARE = (
     0.5,
     0.2,
 )  # shares of late frames that are too many in the quick and in the long look
-_SILENT_SECONDS = 0.8  # seconds without a frame that tell the same
+_SILENT_SECONDS = 0.8  # seconds without a frame that count as too late
 _MIN_SHARE_FRAMES = 6  # frames of which a share is taken: two steps
 
 

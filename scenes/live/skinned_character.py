@@ -1,4 +1,4 @@
-"""A character in the browser: its mannequin sent once, hung on joints that are then turned."""
+"""A character in the browser: its mannequin sent once, skinned to joints that are then rotated."""
 
 import numpy as np
 import trimesh
@@ -25,7 +25,7 @@ class SkinnedCharacter:
                 scene.add_mesh_trimesh(f"{paths[joint]}/skin", part)
 
     def pose(self, root: Array, quats: Array) -> None:
-        """Stand the root (3,) there, in metres, and turn every joint (joints, 4), xyzw."""
+        """Set the root's position (3,), metres, and the rotation of every joint (joints, 4), xyzw."""
         self._joints[0].position = root
         for handle, (x, y, z, w) in zip(self._joints, quats, strict=True):
             handle.wxyz = (w, x, y, z)

@@ -1,0 +1,25 @@
+"""Plots of motions over time, by matplotlib."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from typing import Any
+
+from mapctl.errors import RequestError
+from mapctl.formats.atomic import atomic_path
+
+
+@contextmanager
+def open_plots(path: str | PathLike[str], count: int, *, inches: tuple[float, float], dpi: int) -> Iterator[Any]:
+    """Yield the axes of plots below each other over one time axis, (count,); they are written as a PNG at the end.
+
+    RequestError where matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise RequestError(f"plots need matplotlib ({error}): pip install 'mapctl[render]'") from error
+    figure = Figure(figsize=inches, layout="constrained")
+    yield figure.subplots(count, 1, sharex=True)
+    with atomic_path(path) as scratch:
+        figure.savefig(scratch, format="png", dpi=dpi)

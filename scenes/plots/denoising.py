@@ -8,12 +8,11 @@ import numpy as np
 import torch
 
 from mapctl import retarget, rotations
-from mapctl.errors import RequestError
-from mapctl.formats.atomic import atomic_path
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import TOES
 from scenes.film import film
+from scenes.plots import open_plots
 
 _JOINTS = ("leftUpperArm", "rightLowerArm", "leftUpperLeg", "rightLowerLeg", "chest")
 _BEFORE, _AFTER = "#bbbbbb", "#4c78a8"
@@ -22,33 +21,23 @@ _SIDE_OFFSET = 1.4  # metres between the two of a film
 
 def plot(capture: Motion, clean: Motion, path: str | PathLike[str], *, rig: Rig | None = None) -> None:
     """Write a PNG: angles of some joints, and height and speed of the toes. RequestError without matplotlib."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise RequestError(f"plots need matplotlib ({error}): pip install 'mapctl[render]'") from error
     before, after = (retarget.to_canonical(motion, rig)[0] for motion in (capture, clean))
-    seconds = np.arange(clean.num_frames) / float(clean.fps)
-    figure = Figure(figsize=(12, 2.1 * (len(_JOINTS) + 4)), layout="constrained")
-    FigureCanvasAgg(figure)
-    rows = figure.subplots(len(_JOINTS) + 4, 1, sharex=True)
-    for row, name in zip(rows, _JOINTS, strict=False):
+    seconds, joints = np.arange(clean.num_frames) / float(clean.fps), len(_JOINTS)
+    with open_plots(path, joints + 4, inches=(12, 2.1 * (joints + 4)), dpi=90) as rows:
         for motion, colour in ((before, _BEFORE), (after, _AFTER)):
-            row.plot(seconds, _compute_joint_angle(motion, name), color=colour, linewidth=1)
-        row.set_ylabel(f"{name}\ndegrees")
-    for side, name in enumerate(TOES):
-        height, speed = rows[len(_JOINTS) + 2 * side], rows[len(_JOINTS) + 2 * side + 1]
-        for motion, colour in ((before, _BEFORE), (after, _AFTER)):
-            place = motion.joint_positions()[:, motion.skeleton.index(name)].numpy()
-            height.plot(seconds, 100 * place[:, 1], color=colour, linewidth=1)
-            steps = np.linalg.norm(np.diff(place[:, ::2], axis=0), axis=1) * float(motion.fps)
-            speed.plot(seconds[1:], steps, color=colour, linewidth=1)
-        height.set_ylabel(f"{name}\nheight, cm")
-        speed.set(ylabel=f"{name}\nspeed, m/s", ylim=(0, 5))
-    rows[0].legend(["before", "after"], loc="upper right", frameon=False)
-    rows[-1].set_xlabel("seconds")
-    with atomic_path(path) as scratch:
-        figure.savefig(scratch, format="png", dpi=90)
+            for row, name in zip(rows, _JOINTS, strict=False):
+                row.plot(seconds, _compute_joint_angle(motion, name), color=colour, linewidth=1)
+                row.set_ylabel(f"{name}\ndegrees")
+            for side, name in enumerate(TOES):
+                place = motion.joint_positions()[:, motion.skeleton.index(name)].numpy()
+                speed = np.linalg.norm(np.diff(place[:, ::2], axis=0), axis=1) * float(motion.fps)
+                upper, lower = rows[joints + 2 * side : joints + 2 * side + 2]
+                upper.plot(seconds, 100 * place[:, 1], color=colour, linewidth=1)
+                upper.set_ylabel(f"{name}\nheight, cm")
+                lower.plot(seconds[1:], speed, color=colour, linewidth=1)
+                lower.set(ylabel=f"{name}\nspeed, m/s", ylim=(0, 5))
+        rows[0].legend(["before", "after"], loc="upper right", frameon=False)
+        rows[-1].set_xlabel("seconds")
 
 
 def film_side_by_side(

@@ -1,6 +1,7 @@
 """Pictures by pyrender without a window (EGL); works in software where there is no graphics card."""
 
 import os
+import sys
 from collections.abc import Sequence
 from functools import cache
 from types import ModuleType
@@ -79,8 +80,5 @@ def _open_graphics() -> tuple[ModuleType, Any]:
 def _list_graphics_errors() -> tuple[type[Exception], ...]:
     """List what a missing library, driver or display raises somewhere between Python and EGL."""
     plain = (ImportError, OSError, AttributeError, AssertionError, ValueError, RuntimeError, TypeError)
-    try:
-        from OpenGL.error import Error
-    except (ImportError, AttributeError, TypeError):
-        return plain
-    return *plain, Error
+    own = getattr(sys.modules.get("OpenGL.error"), "Error", None)  # nobody raises it before it is imported
+    return plain if own is None else (*plain, own)

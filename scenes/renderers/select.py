@@ -6,8 +6,8 @@ from typing import Literal
 
 from mapctl.errors import RequestError
 from scenes.content import Painter
+from scenes.renderers import STICK_FIGURES
 from scenes.renderers.offscreen import NoGraphicsError, OffscreenPainter
-from scenes.renderers.stick_figure import StickPainter
 
 RendererName = Literal["auto", "egl", "stick"]
 RENDERER_VARIABLE = "MAPCTL_RENDERER"
@@ -42,11 +42,12 @@ def back_end() -> str:
     try:
         return select_painter("egl").name
     except NoGraphicsError as error:
-        return f"{StickPainter.name}: {error}"
+        return f"{STICK_FIGURES}: {error}"
 
 
 def _make_stick_painter() -> Painter:
     try:
-        return StickPainter()
+        from scenes.renderers.stick_figure import StickPainter
     except ImportError as error:
         raise RequestError(f"films need matplotlib or pyrender ({error}): pip install 'mapctl[render]'") from error
+    return StickPainter()

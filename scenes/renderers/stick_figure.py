@@ -1,14 +1,21 @@
-"""Stick figures by matplotlib, for machines without OpenGL: the same cameras, ground and colours."""
+"""Stick figures by matplotlib, for machines without OpenGL: the same cameras, ground and colours.
+
+Imported late, where they are needed: matplotlib may not be installed.
+"""
 
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure as Sheet
 
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import View
 from scenes.content import Content, Figure
 from scenes.overlays import LIGHT
+from scenes.renderers import STICK_FIGURES
 
 _NEAR = 0.1
 """Nothing closer to the camera than this is drawn, metres."""
@@ -19,14 +26,11 @@ _SHADOW_STRENGTH = 0.12
 
 
 class StickPainter:
-    """Paints bones as thick lines. Raises ImportError where there is no matplotlib."""
+    """Paints bones as thick lines."""
 
-    name = "matplotlib (stick figures)"
+    name = STICK_FIGURES
 
     def __init__(self):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as Sheet
-
         self._sheet = Sheet(dpi=_DPI, facecolor=colours.BACKGROUND)
         self._canvas = FigureCanvasAgg(self._sheet)
 
@@ -48,8 +52,6 @@ class StickPainter:
 
 
 def _draw_flat(axes, view: View, surface: Surface) -> None:
-    from matplotlib.collections import PolyCollection
-
     corners = view.project(surface.vertices)[surface.faces]
     rgba = surface.rgba[surface.faces].mean(axis=1)
     shown = (corners[..., 2] > _NEAR).all(axis=1) & (rgba[:, 3] > 0.02)
@@ -73,8 +75,6 @@ def _draw_figure(axes, view: View, figure: Figure) -> None:
 
 def _draw_lines(axes, view: View, ends: Array, radii: Array, shown: Array) -> None:
     """Draw lines (n, 2, 3) in the world as thick as the body there, the furthest first."""
-    from matplotlib.collections import LineCollection
-
     flat = view.project(ends)
     depth = flat[..., 2].mean(axis=1)
     order = np.argsort(-depth)

@@ -111,7 +111,7 @@ def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_
     jobs["convert"] = (tmp_path / "in.bvh", tmp_path / "a.bvh")
     quiet = () if job == "convert" else ("--quiet",)
     assert run(job, *jobs[job], "--rig", told_rig, *quiet) == 0
-    rig = rigs.load_rig(told_rig)
+    rig = retarget.load_rig(told_rig)
     made = mapctl.load(tmp_path / ("generated_000.bvh" if job == "generate" else "a.bvh"))
     assert set(made.skeleton.names) == set(rig.joints.values())
     canonical, rigmap = retarget.to_canonical(made, rig)
@@ -137,7 +137,7 @@ def test_a_rig_that_names_too_little_is_refused_for_a_body(prior, tmp_path, caps
 
 @pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs()])
 def test_who_stands_on_a_preset_is_the_canonical_body_in_its_t_pose(preset):
-    rig = rigs.load_rig(preset)
+    rig = retarget.load_rig(preset)
     standing = figure.make_tpose_clip(rig)
     canonical, rigmap = retarget.to_canonical(standing)
     assert rigmap.rig.name == preset  # told by its names alone
@@ -151,7 +151,7 @@ def test_who_stands_on_a_preset_is_the_canonical_body_in_its_t_pose(preset):
 
 @pytest.mark.parametrize(("up", "facing"), [("z", "-y"), ("z", "x"), ("-y", "x"), ("x", "auto"), ("y", "-z")])
 def test_a_rigs_axes_are_the_files(up, facing):
-    rig = replace(rigs.load_rig("mixamo"), up=up, facing=facing)
+    rig = replace(retarget.load_rig("mixamo"), up=up, facing=facing)
     standing = figure.make_tpose_clip(rig)
     canonical, rigmap = retarget.to_canonical(standing, rig)
     assert (rigmap.up, rigmap.rest) == (up, "T")

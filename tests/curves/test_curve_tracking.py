@@ -8,6 +8,7 @@ import torch
 from helpers import walk_through
 
 from mapctl import curves
+from mapctl.curves.tracking import track_arcs
 from mapctl.metrics import measure, path
 
 FPS = 30
@@ -45,7 +46,7 @@ def made(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
 def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
     curve = CURVES[name]
     arcs, _, places = made(curve, laps=LAPS.get(name, 1.0), fps=fps)
-    found = curve.track(places)
+    found = track_arcs(curve, places)
     assert float((found - arcs).abs().max()) < 0.12  # near a tip the other leg is as near
     assert float((found - arcs).abs().median()) < 0.005
     assert float(found[-1] - found[0]) == pytest.approx(float(arcs[-1]), abs=0.12)
@@ -80,7 +81,7 @@ def test_the_way_back_counts_even_nearer_to_the_way_out():
 def test_a_walk_that_ends_early_has_gone_so_far(share):
     for name in ("hairpin", "back on itself", "figure8"):
         arcs, _, places = made(CURVES[name], laps=share)
-        assert float(CURVES[name].track(places)[-1]) == pytest.approx(float(arcs[-1]), abs=0.13)
+        assert float(track_arcs(CURVES[name], places)[-1]) == pytest.approx(float(arcs[-1]), abs=0.13)
 
 
 def test_what_was_left_out_of_a_curve_is_missed():
@@ -92,27 +93,28 @@ def test_what_was_left_out_of_a_curve_is_missed():
     got = measure(walk_through(places), curve, speed=1.0)
     assert got["travelled_m"] == pytest.approx(curve.length, abs=0.1)
     assert 50 < got["path_error_max_cm"] < 115
-    assert float(curve.track(torch.tensor(places)).diff().max()) < 1.5  # the nearest place goes on by 2.4 m at once
+    steps = track_arcs(curve, torch.tensor(places)).diff()
+    assert float(steps.max()) < 1.5  # the nearest place goes on by 2.4 m at once
 
 
 def test_steps_back_and_standing_are_followed():
     """To and fro by 0.4 m on a line: the nearest place is the truth there."""
     z = 2 + np.concatenate([np.linspace(0, 1, 30), np.linspace(1, 0.6, 20), np.full(40, 0.6), np.linspace(0.6, 2, 40)])
     line = curves.line(length=10.0)
-    found = line.track(torch.tensor(np.stack([0.02 * np.sin(z), z], axis=1)))
+    found = track_arcs(line, torch.tensor(np.stack([0.02 * np.sin(z), z], axis=1)))
     np.testing.assert_allclose(found.numpy(), z, atol=1e-6)
 
 
 def test_one_place_is_the_nearest():
     circle = curves.circle(radius=2.0)
     still = circle.point(torch.full((5,), 3.0).double())
-    torch.testing.assert_close(circle.track(still), torch.full((5,), 3.0).double(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(track_arcs(circle, still), torch.full((5,), 3.0).double(), rtol=0, atol=1e-6)
 
 
 def test_long_walks_stay_exact():
     circle = curves.circle(radius=3.0)
     arcs = torch.linspace(0, 30 * circle.length, 6000, dtype=torch.float64)
-    torch.testing.assert_close(circle.track(circle.point(arcs)), arcs, rtol=0, atol=1e-4)
+    torch.testing.assert_close(track_arcs(circle, circle.point(arcs)), arcs, rtol=0, atol=1e-4)
 
 
 def test_path_error_is_to_the_branch_that_is_walked():

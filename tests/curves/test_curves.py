@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import curves
+from mapctl.curves.tracking import track_arcs
 from mapctl.errors import RequestError
 
 ARCS = torch.linspace(0, 30, 301, dtype=torch.float64)
@@ -148,7 +149,7 @@ def test_a_local_search_stays_on_its_branch_where_a_curve_crosses_itself():
     t = np.linspace(0, 2 * math.pi, 2000)
     bow = curves.from_points(np.stack([np.sin(2 * t), 2 * np.sin(t)], axis=1))
     arcs = torch.linspace(0, 2 * bow.length, 700, dtype=torch.float64)
-    torch.testing.assert_close(bow.track(bow.point(arcs)), arcs, rtol=0, atol=1e-4)
+    torch.testing.assert_close(track_arcs(bow, bow.point(arcs)), arcs, rtol=0, atol=1e-4)
     off_to_a_side = bow.point(arcs) + 0.05 * bow.left(arcs)
     found = bow.nearest(off_to_a_side, around=arcs + 0.1, reach=0.3)
     torch.testing.assert_close(bow.signed_offset(off_to_a_side, found), torch.full_like(arcs, 0.05), rtol=0, atol=1e-3)
@@ -157,7 +158,7 @@ def test_a_local_search_stays_on_its_branch_where_a_curve_crosses_itself():
 def test_a_walk_that_starts_elsewhere_is_tracked_from_there():
     curve = curves.circle(radius=3.0)
     arcs = torch.linspace(8, 12, 100, dtype=torch.float64)
-    torch.testing.assert_close(curve.track(curve.point(arcs)), arcs, rtol=0, atol=1e-6)
+    torch.testing.assert_close(track_arcs(curve, curve.point(arcs)), arcs, rtol=0, atol=1e-6)
 
 
 def test_gradients_of_places_and_of_searches():

@@ -140,8 +140,8 @@ def lines_out_of_format() -> Iterable[str]:
 
 CEILINGS = {
     crowded_folders: 0,
-    late_imports: 26,
-    modules_in_cycles: 19,
+    late_imports: 9,
+    modules_in_cycles: 0,
     docstrings_that_begin_with_of: 49,
     docstrings_that_cite_what_is_not_here: 0,
     models_of_any_type: 0,

@@ -97,7 +97,7 @@ def test_a_preset_says_what_it_is_and_names_what_is_required(preset):
     for version in range(versions_of(preset)):
         names = list(names_of(preset, version).values())
         assert len(set(names)) == len(names)
-    assert rigs.load_rig(preset) == rig
+    assert retarget.load_rig(preset) == rig
 
 
 @pytest.mark.parametrize("rest", RESTS)
@@ -289,7 +289,7 @@ def frozen_conversion(motion, rig):
 def test_the_rigs_that_priors_were_trained_through_convert_bit_for_bit_as_they_did(name, skeleton):
     for motion in (random_motion(skeleton, 8), retarget.from_canonical(walk(20), retarget.identify_rig(skeleton))):
         canonical, rigmap = retarget.to_canonical(motion)
-        local, hips = frozen_conversion(motion, rigs.load_rig(name))
+        local, hips = frozen_conversion(motion, retarget.load_rig(name))
         assert rigmap.rig.name == name
         assert torch.equal(canonical.local_quat_xyzw, local)
         assert torch.equal(canonical.root_position, hips)
@@ -311,13 +311,13 @@ def test_a_toml_file_wins(tmp_path):
     made, wanted, motion, *_ = converted(Make(INVENTED, zup=True, arms_down_deg=20))
     path = tmp_path / "ours.toml"
     path.write_text(TOML.format(up="z", rest="straighten", facing="-y", unit="cm"))
-    rig = rigs.load_rig(path)
+    rig = retarget.load_rig(path)
     assert (rig.name, rig.up, rig.metres_per_unit) == ("ours", "z", 0.01)
     canonical, rigmap = retarget.to_canonical(motion, rig)
     assert rigmap.rig is rig
     assert_understood(made, wanted, canonical, rigmap)
     path.write_text(TOML.format(up="y", rest="tpose", facing="auto", unit="m"))
-    canonical, rigmap = retarget.to_canonical(motion, rigs.load_rig(path))
+    canonical, rigmap = retarget.to_canonical(motion, retarget.load_rig(path))
     assert (rigmap.up, rigmap.tpose_from) == ("y", "table")
     assert_returns(motion, canonical, rigmap)
 
@@ -336,8 +336,8 @@ def test_a_unit_that_is_set_wins(tmp_path):
 def test_the_rig_of_a_clip_is_one_for_others(tmp_path):
     made, _, motion, _, rigmap = converted(Make(NONSENSE))
     motion.save(tmp_path / "a.bvh")
-    assert rigs.load_rig(tmp_path / "a.bvh").joints == NONSENSE
-    assert retarget.identify_rig(made.skeleton, rigs.load_rig(tmp_path / "a.bvh")).joint_of == rigmap.joint_of
+    assert retarget.load_rig(tmp_path / "a.bvh").joints == NONSENSE
+    assert retarget.identify_rig(made.skeleton, retarget.load_rig(tmp_path / "a.bvh")).joint_of == rigmap.joint_of
 
 
 @pytest.mark.parametrize(
@@ -357,16 +357,16 @@ def test_the_rig_of_a_clip_is_one_for_others(tmp_path):
 def test_a_bad_toml_file_is_refused_with_its_name(tmp_path, text, said):
     (tmp_path / "bad.toml").write_text(text)
     with pytest.raises(FileFormatError, match=f"bad.toml.*{said}"):
-        rigs.load_rig(tmp_path / "bad.toml")
+        retarget.load_rig(tmp_path / "bad.toml")
 
 
 def test_what_is_no_rig_at_all_is_refused(tmp_path):
     with pytest.raises(RequestError, match=r"no rig 'mixammo'; known rigs: canonical.*mixamo"):
-        rigs.load_rig("mixammo")
+        retarget.load_rig("mixammo")
     with pytest.raises(FileFormatError, match="no such file"):
-        rigs.load_rig(tmp_path / "none.toml")
+        retarget.load_rig(tmp_path / "none.toml")
     with pytest.raises(RequestError, match=r"mixamo: no joint 'mixamorig:Hips' for hips; the nearest is hip, then "):
-        retarget.identify_rig(cmu_skeleton(), rigs.load_rig("mixamo"))
+        retarget.identify_rig(cmu_skeleton(), retarget.load_rig("mixamo"))
 
 
 def test_canonical_joints_mirror_each_other_in_every_preset():

@@ -10,7 +10,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
-from mapctl.retarget import figure, rigs
+from mapctl.retarget import figure, load_rig
 from mapctl.retarget.rigs import Rig
 
 MAX_FRAMES = 3_600_000
@@ -35,7 +35,7 @@ def read_curve(text: str, metres_per_unit: float | None) -> Curve:
 
 def read_rig(text: str | None) -> Rig | None:
     """The rig of a --rig option: a preset, a TOML file, or that of a clip; None where none is asked for."""
-    return None if text is None else rigs.load_rig(text)
+    return None if text is None else load_rig(text)
 
 
 def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
@@ -43,7 +43,7 @@ def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
     and its rig."""
     if Path(text).suffix.lower() in formats.READERS:
         return formats.load(text), None
-    rig = rigs.load_rig(text)
+    rig = load_rig(text)
     return figure.make_tpose_clip(rig), rig
 
 

@@ -98,7 +98,7 @@ def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
             take = take.with_name(subject.stem + take.name)
         return subject, take if len(take.parts) > 1 else subject.parent / take
     if not file.is_file():
-        read_bytes(file)  # says what is wrong with it
+        read_bytes(file)  # raises what is wrong with it
     near = sorted(other for other in file.parent.iterdir() if other.suffix.lower() == ".asf" and other.is_file())
     same = [other for other in near if other.stem == file.stem]
     found = same or near
@@ -145,7 +145,7 @@ def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Floa
     turns = np.empty((len(values), len(asf.names), 4))
     for bone, (axes, columns) in enumerate(_columns(asf, "r")):
         angles = values[:, columns[::-1]]
-        # About fixed axes the first named turn comes first; about moving ones, last.
+        # About fixed axes the first named rotation comes first; about moving ones, last.
         turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, _reverse_axes(axes))
     frame = torch.from_numpy(asf.axis_quat_xyzw).expand(len(values), -1, 4)
     about = rotations.multiply(rotations.multiply(frame, torch.from_numpy(turns)), rotations.inverse(frame))

@@ -35,7 +35,7 @@ _KEYWORDS = (
 
 @dataclass(frozen=True, eq=False)
 class AmcText:
-    """Everything an AMC file says."""
+    """Content of an AMC file."""
 
     values: np.ndarray
     """(frames, channels) in the order of the skeleton's bones and channels, file units."""

@@ -40,13 +40,13 @@ class AsfSkeleton:
     ends: np.ndarray
     """(bones, 3) from each bone's start to its end at rest, in world axes; zero for the root."""
     axis_quat_xyzw: np.ndarray
-    """(bones, 4) rotation of the frame that a bone's angles are about, at rest; for the root its pre-set turn."""
+    """(bones, 4) rotation of the frame that a bone's angles are about, at rest; for the root its pre-set rotation."""
     channels: tuple[tuple[str, ...], ...]
-    """What an AMC line holds of each bone, as `tx` or `rz`; empty for a bone that never turns."""
+    """What an AMC line holds of each bone, as `tx` or `rz`; empty for a bone that never rotates."""
     root_position: np.ndarray
     """(3,) added to the root's position in every frame, file unit."""
     length: float
-    """`length` of :units: so many units to the inch; 1 says nothing."""
+    """`length` of :units: so many units to the inch; 1 is no information."""
     degrees: bool
     """Whether angles are in degrees."""
 

@@ -45,7 +45,7 @@ def load(path: str | PathLike[str]) -> Motion:
 def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
     """Read a BVH file in which some values are NaN, and which they are; FileFormatError where all of them are.
 
-    The place of a joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET.
+    The position of a joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET.
     """
     return _read(bvh_text.read(path, lossy=True))
 

@@ -22,7 +22,7 @@ from mapctl.motion import Motion
 def open_bvh_stream(path: str | PathLike[str], frames: int) -> Iterator["BvhStream"]:
     """Yield a stream that takes the pieces of a motion; the file appears whole when the block ends well.
 
-    MapctlError if the pieces are not `frames` frames in all, RequestError if the place cannot be written.
+    MapctlError if the pieces are not `frames` frames in all, RequestError if the path cannot be written.
     """
     with atomic_path(path) as scratch:
         with scratch.open("w", encoding="utf-8", newline="\n") as file:

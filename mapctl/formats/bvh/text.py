@@ -25,7 +25,7 @@ _FRAME_TIME = re.compile(r"\s*+frame[ \t]*+time[ \t]*+:?[ \t]*+([^\s:]+)", re.IG
 
 @dataclass(frozen=True, eq=False)
 class BvhText:
-    """Everything a BVH file says."""
+    """Content of a BVH file."""
 
     hierarchy: Hierarchy
     """Joints, channels and offsets."""
