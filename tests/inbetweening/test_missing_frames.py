@@ -3,7 +3,7 @@
 import pytest
 import torch
 from captures import apart_deg, on_rig
-from scipy.spatial.transform import Rotation, SlerpInbetweener
+from scipy.spatial.transform import Rotation, Slerp
 
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -20,7 +20,7 @@ def lost_of(motion, *masks):
 def interpolated(quats, start, stop):
     """Between the frames beside a gap, by scipy; (gap, joints, 4)."""
     between = [
-        SlerpInbetweener([start - 1, stop], Rotation.from_quat(quats[[start - 1, stop], joint].numpy()))(
+        Slerp([start - 1, stop], Rotation.from_quat(quats[[start - 1, stop], joint].numpy()))(
             range(start, stop)
         ).as_quat()
         for joint in range(quats.shape[1])
