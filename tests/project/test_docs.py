@@ -60,10 +60,22 @@ def assert_walks_weave(folder, left):
     assert mapctl.load(folder / "weaving.bvh").num_frames == left["recorder"].motion().num_frames >= 60
 
 
-def assert_hand_is_held(folder, left):
-    assert left["held"] < 0.1
-    hand = left["solution"].motion.skeleton.index("leftHand")
-    assert left["solution"].motion.joint_positions()[30:, hand, 1].mean() == pytest.approx(1.3, abs=0.1)
+def assert_hand_is_raised(folder, left):
+    assert left["missed"] < 0.05
+    hand = left["walk"].motion.skeleton.index("leftHand")
+    for job in ("walk", "tweened"):
+        assert "hand height" in left[job].ledger.summary()
+    heights = left["walk"].motion.joint_positions()[:, hand, 1]
+    assert float(heights[60]) == pytest.approx(1.3, abs=0.05)
+
+
+def assert_it_arrives(folder, left):
+    assert left["walked"].motion.root_position[-1, ::2].tolist() == pytest.approx([1.0, 3.0], abs=0.15)
+    assert (folder / "there.bvh").exists()
+
+
+def assert_it_is_named(folder, left):
+    assert left["eased"].gap_notes[0].endswith("ease in and out")
 
 
 def assert_filmed(folder, left):
@@ -87,7 +99,9 @@ def assert_cleaned(folder, left):
 OUTCOMES = {
     "README.md-python-0": assert_filmed,
     "README.md-python-1": assert_walks_weave,
-    "docs/terms.md-python-0": assert_hand_is_held,
+    "docs/adding-a-term.md-python-0": assert_hand_is_raised,
+    "docs/adding-a-prior.md-python-1": assert_it_is_named,
+    "docs/adding-a-job.md-python-0": assert_it_arrives,
     "docs/formats.md-python-0": assert_turned,
     "docs/infilling.md-python-0": assert_keys_and_gaps_are_filled,
     "docs/denoising.md-python-0": assert_cleaned,
