@@ -1,4 +1,4 @@
-"""The one definition of "this foot is planted"."""
+"""Contact detection: when a toe is planted."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -43,8 +43,8 @@ def detect_contacts(
     step = max(1, round(settings.speed_window * fps))
     low = toes[..., 1] < estimate_floor_heights(toes, settings) + settings.reach
     slow = (toes[step:] - toes[:-step])[..., ::2].norm(dim=-1) * (fps / step) < settings.slow
-    stands = remove_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
-    return torch.cat([low[:step] & (stands[:1] if len(stands) else False), stands])
+    planted = remove_short_runs(low[step:] & slow, max(1, round(settings.shortest * fps)))
+    return torch.cat([low[:step] & (planted[:1] if len(planted) else False), planted])
 
 
 def estimate_floor_heights(
@@ -54,11 +54,11 @@ def estimate_floor_heights(
     return torch.quantile(toe_positions[..., 1], settings.floor_percentile / 100, dim=0)
 
 
-def remove_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
+def remove_short_runs(mask: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
     """Remove runs of true shorter than `shortest` frames: a morphological opening."""
-    if len(stands) < shortest:
-        return torch.zeros_like(stands)
-    whole = stands.T.unfold(-1, shortest, 1).all(dim=-1)  # windows that are true throughout
+    if len(mask) < shortest:
+        return torch.zeros_like(mask)
+    whole = mask.T.unfold(-1, shortest, 1).all(dim=-1)  # windows that are true throughout
     spread = torch.nn.functional.pad(whole, (shortest - 1, shortest - 1))
     return spread.unfold(-1, shortest, 1).any(dim=-1).T
 
@@ -66,8 +66,8 @@ def remove_short_runs(stands: Bool[Tensor, "frames feet"], shortest: int) -> Boo
 def support_speed(
     heights: Float[Tensor, "*batch feet"], speeds: Float[Tensor, "*batch feet"], near: float = 0.05
 ) -> Float[Tensor, "*batch"]:
-    """Return the speed over the ground, m/s, of the slowest of the toes less than `near` metres over their rest height:
-    of what the body stands on; 0 where none is near, in flight."""
+    """Return the speed over the ground, m/s, of the slowest of the toes less than `near` metres over their rest height,
+    which supports the body; 0 in flight, where none is near."""
     close = heights < near
     return torch.where(close.any(dim=-1), torch.where(close, speeds, torch.inf).amin(dim=-1), 0.0)
 
@@ -76,6 +76,6 @@ MIN_CONTACT_FRAMES = 3
 """Least duration of a contact, or of a gap in one, frames at the prior's rate: `ContactSettings.shortest`."""
 
 
-def debounced(stands: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
+def debounced(contacts: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames feet"]:
     """Close gaps in contacts at the prior's rate, then remove contacts, of less than MIN_CONTACT_FRAMES frames."""
-    return remove_short_runs(~remove_short_runs(~stands, MIN_CONTACT_FRAMES), MIN_CONTACT_FRAMES)
+    return remove_short_runs(~remove_short_runs(~contacts, MIN_CONTACT_FRAMES), MIN_CONTACT_FRAMES)

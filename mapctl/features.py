@@ -1,8 +1,8 @@
-"""State features of the prior: a motion without position and heading.
+"""Features of the prior: a motion without position and heading.
 
 Wang et al. 2019, Eq. 2-4: per frame the root's displacement in the previous frame's heading frame, the heading change,
 the root height, the remaining tilt of the root, and the joint rotations; and two contact bits (section 4.3). Rotation
-vectors about the canonical T-pose stand in for their Euler angles, whose wraps real rigs sit near.
+vectors about the canonical T-pose replace the paper's Euler angles, near whose wraps real rigs lie.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOES, mirror_name
 
 PRIOR_FPS = 30
-"""Frames per second of every prior: steps and turns a frame mean nothing at another rate, so results are resampled."""
+"""Frames per second of every prior: features are steps and turns a frame, so motions at other rates are resampled."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class FeatureLayout:
     @cached_property
     def slices(self) -> Mapping[str, slice]:
         """Slice of each block."""
-        places, start = {}, 0
+        slices, start = {}, 0
         for name, width in self.blocks:
-            places[name] = slice(start, start + width)
+            slices[name] = slice(start, start + width)
             start += width
-        return places
+        return slices
 
     @property
     def size(self) -> int:
@@ -99,7 +99,7 @@ class GroundPose:
 def encode(motion: Motion) -> tuple[Float[Tensor, "frames size"], GroundPose]:
     """Encode features of a canonical motion (float64), and the ground pose from which `pose.decode` leads back to it.
 
-    The first frame has no past: it repeats the second frame's displacement, and the place returned lies that much
+    The first frame has no past: it repeats the second frame's displacement, and the ground pose returned is that much
     before it. Raises MapctlError for other skeletons or fewer than two frames.
     """
     if motion.skeleton.names != CANONICAL.names:

@@ -1,7 +1,7 @@
 """The pose of a body in the world: root position, heading, tilt and joint rotations, over frames and batches.
 
-The one place where these become features of a prior (Wang et al. 2019, Eq. 2-4), rotations, joint positions or a
-motion, and come from them.
+Conversions to and from features of a prior (Wang et al. 2019, Eq. 2-4), rotations, joint positions and motions are here
+alone.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class BodyPose:
     root_position: Float[Tensor, "*batch frames 3"]
     """World position of the hips, metres."""
     heading: Float[Tensor, "*batch frames"]
-    """Facing angle of the hips about +Y, radians, not wrapped."""
+    """Heading of the hips about +Y, radians, not wrapped."""
     tilt_xz: Float[Tensor, "*batch frames 2"]
     """Rotation vector (x and z) of what remains of the hips' rotation without the heading, radians."""
     joint_rotvec: Float[Tensor, "*batch frames others 3"]

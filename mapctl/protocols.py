@@ -1,5 +1,5 @@
-"""What the core asks of learned models. Subclass a protocol to write a new one: its abstract methods are all that must
-be written, all else has a default.
+"""Protocols of learned models. Subclass one to write a model: its abstract methods are all that must be written, the
+rest has defaults.
 
 Everywhere below, features are frames of `mapctl.features.LAYOUT` at PRIOR_FPS: `size` numbers, physical units (metres
 and radians, steps and turns by frame), of which the first `continuous` are real-valued and the last two are contact
@@ -11,7 +11,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,7 +28,7 @@ AnyState = TypeVar("AnyState", bound="DensityState")
 
 @runtime_checkable
 class DensityState(Protocol):
-    """What a density has seen so far, one batch row for each independent motion; never changed in place."""
+    """Memory of the frames so far, one batch row for each independent motion; never changed in place."""
 
     last_frame: Float[Tensor, "batch size"]
     """Features of the last frame seen."""
@@ -82,7 +82,7 @@ class DiscreteChoices:
 
 @dataclass(frozen=True, eq=False)
 class InitialStates(Generic[State]):
-    """Moments of mocap from which a density may begin: its state after a stretch of a clip."""
+    """Moments of mocap from which a motion may begin: a density's states after part of a clip."""
 
     state: State
     """A density's state, one batch row a start."""
@@ -91,12 +91,12 @@ class InitialStates(Generic[State]):
     names: tuple[str, ...]
     """The clip each was taken from."""
     weight: Float[Tensor, " starts"]
-    """Share of the data that each stands for, all together 1: drawn by it, motions begin as the data do."""
+    """Share of the data that each represents, all together 1: drawn by it, motions begin as the data do."""
 
 
 @dataclass(frozen=True)
 class DataLimits:
-    """What the training data show, so that impossible wishes can be named with numbers."""
+    """Ranges of the training data, so that an infeasible request is refused with numbers."""
 
     slowest: float
     """Speed, m/s, 1st percentile of one-second means."""
@@ -115,7 +115,7 @@ class DataLimits:
 class Density(Protocol[State]):
     """A density over the next frame given those before, which an explicit state sums up; the prior of a MAP problem.
 
-    Densities never change: what makes another of one returns a new one. They are told apart by identity, so a dataclass
+    Densities never change: methods that condition one return a new one. They are compared by identity, so a dataclass
     needs eq=False. Methods take a state with as many batch rows as the other arguments.
     """
 
@@ -146,8 +146,8 @@ class Density(Protocol[State]):
     ) -> Float[Tensor, "batch frames"]:
         """Compute the log density of each frame given those before it, contact bits included; differentiable in both.
 
-        In nats, of features divided by `feature_std`. Where `inputs` are given, they stand in for the frames wherever
-        a frame is what is seen before the next (teacher forcing with noise), and features are only what is scored.
+        In nats, of features divided by `feature_std`. Where `inputs` are given, each frame is conditioned on
+        them instead of on the features (teacher forcing with noise), which are scored alone.
         """
         ...
 
@@ -211,8 +211,8 @@ class Density(Protocol[State]):
         return -math.inf
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "Density[State]":
-        """Return the density of the same motion seen with independent errors of this sigma (physical units); its
-        rollouts may stay as they are. Default: itself, for a density that is not sharper than proposals are right.
+        """Return the density of motion observed with independent errors of this sigma (physical units); its
+        rollouts may stay as they are. Default: itself, for a density that is not sharper than proposals are accurate.
         """
         return self
 
@@ -236,6 +236,10 @@ class Density(Protocol[State]):
 
     def warm_up(self) -> None:
         """Load or compile what the first use would, so that no clock counts it. Default: nothing."""
+
+
+AnyDensity: TypeAlias = Density[Any]
+"""A density for those who hand its states back to it and need not know their type."""
 
 
 @runtime_checkable
@@ -277,7 +281,7 @@ class Denoiser(Protocol):
     def clean(self, capture: Capture) -> CaptureProposal:
         """Propose a motion of the capture's frames (two or more), on canonical bones at PRIOR_FPS, for each batch row.
 
-        What the capture's masks call unseen says nothing and is proposed as well.
+        What was not observed by the capture's masks is ignored, and proposed as well.
         """
         ...
 

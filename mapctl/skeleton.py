@@ -57,8 +57,8 @@ class Skeleton:
     def mirror_partners(self) -> list[int]:
         """Return by joint the index of its mirror image; itself in the middle of the body.
 
-        Sides are told by the canonical `left` and `right` alone. MapctlError for a skeleton that has none, names sides
-        in another way (which would pass for the middle), or lacks a partner.
+        Sides are read from the canonical `left` and `right` alone. MapctlError for a skeleton without sides, with
+        other names for them (such joints would pass for the middle), or without a partner.
         """
         foreign = [name for name in self.names if mirror_name(name) == name and _FOREIGN_SIDE_NAMES.search(name)]
         if foreign or all(mirror_name(name) == name for name in self.names):
@@ -120,7 +120,7 @@ _FOREIGN_SIDE_NAMES = re.compile(
     r"(?i:(?:^|[^a-z0-9])(?:l|r|left|right)(?:$|[^a-z0-9]))|Left|Right|^[lrLR](?=[A-Z][a-z])|(?i:left|right)$"
 )
 TOE_REST_HEIGHT = 0.0425
-"""Height of the canonical toe joints over the floor while the foot stands flat, metres."""
+"""Height of the canonical toe joints over the floor while the foot is flat on it, metres."""
 TOES = ("leftToes", "rightToes")
 """Canonical toe joints, in the order of the two contact bits."""
 TOE_JOINTS = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
@@ -140,7 +140,7 @@ class Limb:
     bend_direction: tuple[float, float, float]
     """Direction in which the elbow or the knee of a straight limb would bend, in the frame of `upper`."""
     shown: bool = True
-    """Whether the initial motion shows how it bends; if not, only the proposed elbow or knee tells."""
+    """Whether the initial motion shows how the limb bends; if not, only the proposed elbow or knee does."""
 
 
 _KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)

@@ -5,7 +5,7 @@ from helpers import generator, tiny_density
 
 from controllers.common.initial_state import select_initial_state
 from mapctl import curves
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
@@ -39,3 +39,7 @@ def solver(method=METHOD, density=DENSITY, settings=SHORT):
 
 def context(committed):
     return WindowContext(DENSITY, committed.state, committed.place, committed.joints_world, SHORT.frames)
+
+
+def request(committed, terms, seed=0):
+    return WindowRequest(context(committed), terms, committed.warm_start, generator(seed))

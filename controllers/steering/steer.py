@@ -20,7 +20,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
 from mapctl.pose import decode
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowRequest
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Outcome, Solution, Status
@@ -279,17 +279,10 @@ class _RelaxedFootingFirst:
     half: LatentNoiseSolver
     relaxed_terms: Sequence[Term]
 
-    def __call__(
-        self,
-        context: WindowContext,
-        terms: Sequence[Term],
-        warm_start: Tensor,
-        generator: torch.Generator,
-        *,
-        seconds: float = math.inf,
-    ) -> SolvedWindow:
-        first = self.relaxed_method(context, self.relaxed_terms, warm_start, generator, seconds=seconds / 2)
-        second = self.half(context, terms, first.warm_start, generator, seconds=seconds / 2)
+    def __call__(self, request: WindowRequest) -> SolvedWindow:
+        request = replace(request, seconds=request.seconds / 2)
+        first = self.relaxed_method(replace(request, terms=self.relaxed_terms))
+        second = self.half(replace(request, warm_start=first.warm_start))
         return replace(second, evaluations=first.evaluations + second.evaluations)
 
 

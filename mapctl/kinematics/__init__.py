@@ -54,15 +54,15 @@ def positions_from_matrices(
     All joints of one depth are multiplied at once: a window of frames then takes a dozen tensor operations.
     """
     offsets = skeleton.offsets.to(local_matrix.dtype)
-    order, world, places = [0], local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, :, 0])
-    above_world, above_places, above = world, places, [0]
-    collected = [places]
+    order, world, positions = [0], local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, :, 0])
+    above_world, above_positions, above = world, positions, [0]
+    collected = [positions]
     while level := [j for j, parent in enumerate(skeleton.parents) if parent in above]:
         rows = [above.index(skeleton.parents[j]) for j in level]
         parent_world = above_world[..., rows, :, :]
-        above_places = above_places[..., rows, :] + (parent_world @ offsets[level].unsqueeze(-1)).squeeze(-1)
+        above_positions = above_positions[..., rows, :] + (parent_world @ offsets[level].unsqueeze(-1)).squeeze(-1)
         above_world = parent_world @ local_matrix[..., level, :, :]
-        collected.append(above_places)
+        collected.append(above_positions)
         order, above = order + level, level
     inverse = torch.argsort(torch.tensor(order))
     return torch.cat(collected, dim=-2)[..., inverse, :]

@@ -30,7 +30,7 @@ class FeatureColumns(NamedTuple):
 
 
 def _find_columns() -> FeatureColumns:
-    first = {block: places.start for block, places in LAYOUT.slices.items()}
+    first = {block: part.start for block, part in LAYOUT.slices.items()}
     step, tilt = first["root_displacement_heading"], first["root_tilt"]
     return FeatureColumns(
         step, step + 1, first["heading_change"], first["root_height"], tilt, tilt + 1, first["joint_rotations"]
@@ -98,8 +98,8 @@ class _Body(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, ground: Tensor, heading: Tensor, skeleton: Skeleton):
         parents, offsets = np.array(skeleton.parents), skeleton.offsets.double().numpy()
-        places = features.new_empty(*features.shape[:2], len(parents), 3)
-        world = np.empty((*places.shape, 3), np.float32)
+        positions = features.new_empty(*features.shape[:2], len(parents), 3)
+        world = np.empty((*positions.shape, 3), np.float32)
         known = _contiguous_array(features)
         fast_kernels.body_forward(
             known,
@@ -108,11 +108,11 @@ class _Body(torch.autograd.Function):
             _contiguous_array(heading),
             parents,
             offsets,
-            places.numpy(),
+            positions.numpy(),
             world,
         )
         ctx.known = known, parents, offsets, world
-        return places
+        return positions
 
     @staticmethod
     @once_differentiable

@@ -86,12 +86,12 @@ def fill_rotation_about_y(turn, heading):
 
 
 @entry
-def body_forward(features, columns, ground, headings, parents, offsets, places, world):
+def body_forward(features, columns, ground, headings, parents, offsets, positions, world):
     """Fill positions (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint."""
     heading_frame = np.empty((3, 3))
     for b in range(len(features)):
         for t in range(features.shape[1]):
-            now, at, frames = features[b, t], places[b, t], world[b, t]
+            now, at, frames = features[b, t], positions[b, t], world[b, t]
             fill_rotation_about_y(heading_frame, np.float64(headings[b, t]))
             compose_rotation(
                 frames[0], heading_frame, np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
@@ -128,18 +128,18 @@ def rotation_vector_gradient(world, torque, x, y, z):
 
 
 @entry
-def body_backward(features, columns, parents, offsets, world, d_places, d_features, d_ground, d_headings):
+def body_backward(features, columns, parents, offsets, world, d_positions, d_features, d_ground, d_headings):
     """Apply the adjoint of `body_forward`, by forces and torques as in statics.
 
-    A gradient on a place is a force there. What a small turn of a joint does is the torque, about that joint, of the
-    forces on all that hangs from it; both are summed from the leaves to the root. Fills the body's columns of
+    A gradient on a position is a force there. The gradient of a joint's rotation is the torque about that joint of the
+    forces on all its descendants; both are summed from the leaves to the root. Fills the body's columns of
     d_features, which come in as zeros, d_ground and d_headings.
     """
     force, torque = np.empty((len(parents), 3)), np.empty((len(parents), 3))
     for b in range(len(features)):
         for t in range(features.shape[1]):
             now, out, frames = features[b, t], d_features[b, t], world[b, t]
-            force[:], torque[:] = d_places[b, t], 0.0
+            force[:], torque[:] = d_positions[b, t], 0.0
             for joint in range(len(parents) - 1, 0, -1):
                 v = columns.joints + 3 * (joint - 1)
                 out[v], out[v + 1], out[v + 2] = rotation_vector_gradient(

@@ -1,8 +1,8 @@
-"""From joint positions to rotations on a skeleton whose bones keep their lengths: the one inverse kinematics.
+"""Inverse kinematics: rotations of a skeleton whose bones keep their lengths, from joint positions.
 
-Joint by joint from the root down, each is rotated as little as its children's directions ask for, from where its parent
-leaves it. What positions do not tell (the rotation of a bone about itself, and joints without children) stays as it is
-in the initial motion, but for the plane in which an elbow or a knee bends: a bent limb shows it.
+From the root down, every joint is rotated from where its parent leaves it by as little as its children's directions
+need. What positions do not determine (a bone's rotation about itself, and joints without children) stays as in the
+initial motion, except for the plane in which an elbow or a knee bends: a bent limb shows it.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from mapctl.skeleton import Limb, Skeleton
 _BEND_THRESHOLD = 0.15  # sine of a limb's bend at which its plane counts half
 _TINY = 1e-9
 _STRAIGHT_MARGIN = 1e-4  # metres that a limb is kept from being straight
-_BEND_OFFSET = 0.003  # metres that an elbow or a knee is off the line before it shows where the limb bends to
-_TRUST_POWER = 8  # power of a bone's share of its length: nine tenths of it are half a reason to believe it
+_BEND_OFFSET = 0.003  # metres that an elbow or a knee is off the line before it shows in which direction the limb bends
+_TRUST_POWER = 8  # power of a proposed bone's share of its length: nine tenths of the length count half
 
 
 def solve_inverse_kinematics(
-    places_world: Float[Tensor, "frames joints 3"],
+    positions_world: Float[Tensor, "frames joints 3"],
     start_quat_xyzw: Float[Tensor, "frames joints 4"],
     skeleton: Skeleton,
     *,
@@ -33,20 +33,20 @@ def solve_inverse_kinematics(
 ) -> Float[Tensor, "frames joints 4"]:
     """Solve for local rotations (xyzw) with which the joints come nearest to the target positions, metres.
 
-    `start_quat_xyzw` are local rotations; those that are not `free` stay as they are. `root_position` is the first
-    joint's, if it is not its place. A limb that cannot reach points at its place. Of `limbs` the ends count, and elbows
-    and knees as far as their bones have their lengths (see `_reached`), and the first bone turns about itself with the
-    plane in which the limb bends. RequestError for other shapes.
+    `start_quat_xyzw` are the initial local rotations; those that are not `free` stay. `root_position` is the first
+    joint's where it is not its target. A limb that cannot reach points at its target. In `limbs` the effectors count,
+    elbows and knees as far as their bones have their lengths (see `_solve_two_bones`), and the first bone rotates about
+    itself with the plane in which the limb bends. RequestError for other shapes.
     """
-    frames, joints = places_world.shape[:2]
+    frames, joints = positions_world.shape[:2]
     if start_quat_xyzw.shape[:2] != (frames, joints) or joints != skeleton.num_joints:
         raise RequestError(
-            f"places {tuple(places_world.shape)} and rotations {tuple(start_quat_xyzw.shape)} must be "
+            f"positions {tuple(positions_world.shape)} and rotations {tuple(start_quat_xyzw.shape)} must be "
             f"of the same frames and of {skeleton.num_joints} joints"
         )
-    offsets = skeleton.offsets.to(places_world)
-    start, bending = start_quat_xyzw.to(places_world), {limb.upper: limb for limb in limbs}
-    at, world, local = [places_world[:, 0] if root_position is None else root_position], [], []
+    offsets = skeleton.offsets.to(positions_world)
+    start, bending = start_quat_xyzw.to(positions_world), {limb.upper: limb for limb in limbs}
+    at, world, local = [positions_world[:, 0] if root_position is None else root_position], [], []
     for joint, parent in enumerate(skeleton.parents):
         above = None if parent < 0 else world[parent]
         if above is not None:
@@ -56,13 +56,13 @@ def solve_inverse_kinematics(
         if joint in bending and bending[joint].shown:
             lower = bending[joint].lower
             ends = torch.tensor([lower, bending[joint].end])
-            reached = _solve_two_bones(bending[joint], turn, start[:, lower], at[joint], places_world, offsets)
-            places_world = places_world.index_copy(1, ends, reached)
+            reached = _solve_two_bones(bending[joint], turn, start[:, lower], at[joint], positions_world, offsets)
+            positions_world = positions_world.index_copy(1, ends, reached)
         if children:
-            aims = [places_world[:, child] - at[joint] for child in children]
+            aims = [positions_world[:, child] - at[joint] for child in children]
             found = _align_bones(turn, [offsets[child] for child in children], aims)
             if joint in bending:
-                found = _align_bend_plane(found, start, skeleton, children[0], places_world, at[joint])
+                found = _align_bend_plane(found, start, skeleton, children[0], positions_world, at[joint])
             turn = found if free is None else torch.where(free[:, joint, None], found, turn)
         world.append(turn)
         local.append(turn if above is None else rotations.multiply(rotations.inverse(above), turn))
@@ -74,34 +74,34 @@ def _solve_two_bones(
     turn: Float[Tensor, "frames 4"],
     bent: Float[Tensor, "frames 4"],
     at: Float[Tensor, "frames 3"],
-    places: Float[Tensor, "frames joints 3"],
+    positions: Float[Tensor, "frames joints 3"],
     offsets: Float[Tensor, "joints 3"],
 ) -> Float[Tensor, "frames 2 3"]:
-    """Return where elbow or knee is if the end is at its target, as far as the bones reach; and where the end then is.
+    """Return the positions of elbow or knee, and of the effector at its target as far as the bones reach.
 
-    A proposal that is the mean of several poses has short bones, and a forearm that is short points anywhere, also
-    where no arm bends to. So its place counts only as far as its bones have their lengths; what lacks is the way the
-    limb bends as it is (`turn` of its first joint in the world, `bent` of the second in the first), turned towards the
-    end.
+    A proposal that is the mean of several poses has short bones, and a short forearm may point anywhere, also where no
+    arm bends. So the proposed elbow or knee counts only as far as its bones have their lengths; the rest is the bend of
+    the initial limb (`turn` of its first joint in the world, `bent` of the second in the first), rotated toward the
+    target.
     """
     upper, lower = offsets[limb.lower], offsets[limb.end]
     long, short = upper.norm(), lower.norm()
-    way = places[:, limb.end] - at
-    far = way.norm(dim=-1, keepdim=True).clamp_min(_TINY)
-    axis = way / far
-    reach = far.clamp((long - short).abs() + _STRAIGHT_MARGIN, long + short - _STRAIGHT_MARGIN)
+    direction = positions[:, limb.end] - at
+    distance = direction.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+    axis = direction / distance
+    reach = distance.clamp((long - short).abs() + _STRAIGHT_MARGIN, long + short - _STRAIGHT_MARGIN)
     knee = rotations.rotate(turn, upper.expand(len(turn), 3))
     foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(len(turn), 3))
-    towards = rotations.between_vectors(foot, way)
+    toward = rotations.between_vectors(foot, direction)
     usual = rotations.rotate(
-        rotations.multiply(towards, turn), offsets.new_tensor(limb.bend_direction).expand(len(turn), 3)
+        rotations.multiply(toward, turn), offsets.new_tensor(limb.bend_direction).expand(len(turn), 3)
     )
     proposed = torch.stack(
-        [places[:, limb.lower] - places[:, limb.upper], places[:, limb.end] - places[:, limb.lower]], dim=1
+        [positions[:, limb.lower] - positions[:, limb.upper], positions[:, limb.end] - positions[:, limb.lower]], dim=1
     )
     whole = (proposed.norm(dim=-1) / torch.stack([long, short])).amin(dim=1, keepdim=True).clamp(max=1)
     trust = whole**_TRUST_POWER
-    side = trust * (places[:, limb.lower] - at) + (1 - trust) * rotations.rotate(towards, knee) + _BEND_OFFSET * usual
+    side = trust * (positions[:, limb.lower] - at) + (1 - trust) * rotations.rotate(toward, knee) + _BEND_OFFSET * usual
     side = torch.nn.functional.normalize(side - (side * axis).sum(-1, keepdim=True) * axis, dim=-1)
     along = (long.square() - short.square() + reach.square()) / (2 * reach)
     between = at + along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side
@@ -111,7 +111,7 @@ def _solve_two_bones(
 def _align_bones(
     turn: Float[Tensor, "frames 4"], bones: Sequence[Float[Tensor, "3"]], aims: Sequence[Float[Tensor, "frames 3"]]
 ) -> Float[Tensor, "frames 4"]:
-    """Rotate `turn` on so that the bones point along the aims: one bone exactly, several in the least squares."""
+    """Rotate `turn` further so that the bones point along the aims: one bone exactly, several by least squares."""
     pointing = [rotations.rotate(turn, bone.expand(len(turn), 3)) for bone in bones]
     if len(bones) == 1:
         return rotations.multiply(rotations.between_vectors(pointing[0], aims[0]), turn)
@@ -129,24 +129,24 @@ def _align_bend_plane(
     start: Float[Tensor, "frames joints 4"],
     skeleton: Skeleton,
     child: int,
-    places: Float[Tensor, "frames joints 3"],
+    positions: Float[Tensor, "frames joints 3"],
     at: Float[Tensor, "frames 3"],
 ) -> Float[Tensor, "frames 4"]:
     """Rotate `turn` about its bone so that the child bends in the plane that its own child's target asks for."""
     below = skeleton.children(child)
     if len(below) != 1:
         return turn
-    offsets = skeleton.offsets.to(places)
+    offsets = skeleton.offsets.to(positions)
     frames = len(turn)
     bone = rotations.rotate(turn, offsets[child].expand(frames, 3))
     knee = at + bone
     would = rotations.rotate(rotations.multiply(turn, start[:, child]), offsets[below[0]].expand(frames, 3))
     axis = torch.nn.functional.normalize(bone, dim=-1)
-    wanted = places[:, below[0]] - knee
+    wanted = positions[:, below[0]] - knee
     would, wanted = (torch.nn.functional.normalize(vector, dim=-1) for vector in (would, wanted))
     would, wanted = (vector - (vector * axis).sum(-1, keepdim=True) * axis for vector in (would, wanted))
     angle = torch.atan2((torch.linalg.cross(would, wanted) * axis).sum(-1), (would * wanted).sum(-1) + _TINY)
-    # A straight limb has no plane: the smaller of the two bends says how much it counts.
+    # A straight limb has no plane: the smaller of the two bends is the weight.
     bend = torch.minimum(would.norm(dim=-1), wanted.norm(dim=-1))
-    believed = bend.square() / (bend.square() + _BEND_THRESHOLD**2)
-    return rotations.multiply(rotations.from_rotation_vector(axis * (angle * believed)[:, None]), turn)
+    weight = bend.square() / (bend.square() + _BEND_THRESHOLD**2)
+    return rotations.multiply(rotations.from_rotation_vector(axis * (angle * weight)[:, None]), turn)

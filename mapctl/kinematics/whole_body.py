@@ -1,9 +1,9 @@
 """Whole-body inverse kinematics for single frames: hands and feet at target positions, with the rest of the body.
 
-Limbs alone reach as far as they are long. What lies beyond asks the trunk to lean, the shoulder girdle to follow, the
-hips to go down on bending knees, and a moving body to be a little further along. The smallest such change, weighed by
-how far each usually goes, is the mode of a Gaussian over offsets of the pose, found by damped Gauss-Newton steps. Arms
-and legs then bend exactly, by their two bones.
+Limbs alone reach as far as they are long. For what lies beyond, the trunk leans, the shoulder girdle follows, the hips
+sink on bending knees, and a moving body is a little further along. The smallest such change in sigmas is the mode of a
+Gaussian over offsets of the pose, found by damped Gauss-Newton steps. Arms and legs then bend exactly, by their two
+bones.
 """
 
 import math
@@ -26,10 +26,10 @@ _SIGMA_LEAN = 0.08
 _SIGMA_REACH, _SIGMA_BALANCE = 0.004, 0.06  # metres
 _IS_FOOT = torch.tensor([float(name.endswith("Foot")) for name in LIMBS])
 _STRETCH_LIMIT = torch.where(_IS_FOOT > 0, 0.985, 0.9).double()
-"""Share of a limb's length from which on its target asks the body to come nearer."""
+"""Share of a limb's length beyond which its target pulls the body nearer."""
 _FOLD_LIMIT = 0.3
-"""Share of a limb's length below which its target asks the body to make room."""
-_SOFTPLUS_WIDTH = 0.015  # metres over which either begins
+"""Share of a limb's length below which its target pushes the body away."""
+_SOFTPLUS_WIDTH = 0.015  # metres over which either sets in
 _MAX_STEPS, _DAMPING, _TOLERANCE = 40, 0.1, 1e-3  # the last in sigmas of an offset
 _DIFFERENCE_STEP = 1e-6  # metres and radians
 _MASS_JOINTS, _MASSES = [CANONICAL.index(name) for name in ("head", "chest", "hips")], torch.tensor([0.1, 0.4, 0.5])
@@ -45,13 +45,13 @@ def reach_targets(
     moving: Bool[Tensor, " frames"],
     stray: Float[Tensor, " frames"],
 ) -> tuple[Motion, Float[Tensor, "frames 3"]]:
-    """Solve for a canonical motion whose poses reach the targets of hands and feet, in the frames that have one.
+    """Solve for a canonical motion whose hands and feet reach their targets, in the frames that have one.
 
-    `turning` are joints that may turn and `moving` frames in which the hips may move; all else stays. By about `stray`
-    (metres) the whole body, feet and all, may as well be elsewhere on the ground. Feet that are not wanted elsewhere
-    keep their places but for that, and how they lie. Frames without a wanted place stay to the bit; a place that is out
-    of reach is pointed at. Also returns that shift over the ground, metres; nothing in all other frames. RequestError
-    for wanted places of joints that end no limb.
+    `turning` are joints that may rotate and `moving` frames in which the hips may move; all else stays. `stray` is the
+    standard deviation, metres, of a shift of the whole body, feet included, over the ground. Feet without a target keep
+    their positions, but for that shift, and their orientations. Frames without a target stay to the bit; limbs point at
+    a target out of reach. Also returns the shift, metres; 0 in all other frames. RequestError for targets of joints
+    that end no limb.
     """
     check_limbs(targets)
     frames = targets.wanted.any(dim=1).nonzero()[:, 0]
@@ -120,7 +120,7 @@ def _minimise_offsets(
 
 @dataclass(frozen=True, eq=False)
 class _ReachResidual:
-    """Residual of poses: limbs that reach, legs that reach the ground, weight over the feet."""
+    """Residuals of poses: reach of limbs to their targets and of legs to the ground, and balance over the feet."""
 
     part: Motion
     before: Float[Tensor, "poses joints 3"]
@@ -143,19 +143,19 @@ class _ReachResidual:
         return ((self.residual(shifted) - now) / _DIFFERENCE_STEP).permute(1, 2, 0)
 
     def residual(self, x: Float[Tensor, "*more poses offsets"]) -> Float[Tensor, "*more poses residuals"]:
-        """Return by limb how much too far and too near its target is; and how far the weight has left the feet."""
+        """Return by limb how much its target is too far and too near, then the offset of the centre of mass (x, z)."""
         root, quats, shift = _apply_offsets(x, self.part.root_position, self.part.local_quat_xyzw)
         skeleton = self.part.skeleton
-        places = forward_kinematics(skeleton.offsets.to(root), skeleton.parents, root, quats)[0]
+        positions = forward_kinematics(skeleton.offsets.to(root), skeleton.parents, root, quats)[0]
         goals = torch.where(self.wanted[..., None] > 0, self.goals, self.before[:, _ENDS] + shift[..., None, :])
-        far = (goals - places[..., _UPPER, :]).norm(dim=-1)
+        far = (goals - positions[..., _UPPER, :]).norm(dim=-1)
         was = (self.before[:, _ENDS] - self.before[:, _UPPER]).norm(dim=-1)
         limit = _STRETCH_LIMIT * self.lengths
         # A leg that was stretched before may stay so.
         over = _soft_excess(far - limit) - (1 - self.wanted) * _soft_excess(was - limit)
         counts = torch.maximum(self.wanted, _IS_FOOT)
         near = counts * self.wanted * _soft_excess(_FOLD_LIMIT * self.lengths - far)
-        weight = ((places - self.before)[..., _MASS_JOINTS, :] * _MASSES[:, None]).sum(dim=-2) - shift
+        weight = ((positions - self.before)[..., _MASS_JOINTS, :] * _MASSES[:, None]).sum(dim=-2) - shift
         return torch.cat([counts * over / _SIGMA_REACH, near / _SIGMA_REACH, weight[..., ::2] / _SIGMA_BALANCE], dim=-1)
 
 
@@ -188,24 +188,28 @@ def bend_limbs(
 ) -> Motion:
     """Bend limbs so that feet, and hands with a target, are at `ends` (world, metres), as far as limbs reach.
 
-    Feet lie as they lay `before`, and arms of which nothing is wanted hang as they hung; joints that are not `turning`
-    stay.
+    Feet, and arms without a target, keep their orientations of `before`; joints that are not `turning` stay.
     """
-    lay = _world_rotations(before)
+    orientations = _world_rotations(before)
     for name, limb in LIMBS.items():
-        told = wanted[:, limb.end] | name.endswith("Foot")
-        # Limbs hang from a trunk that leans as they hung before: carried along, knees would end up behind.
-        posed = _keep_orientation(posed, limb.upper, lay[:, limb.upper], turning[:, limb.upper])
-        places = posed.joint_positions().clone()
-        places[:, limb.end] = torch.where(told[:, None], ends[:, limb.end], places[:, limb.end])
+        placed = wanted[:, limb.end] | name.endswith("Foot")
+        # Under a trunk that leans, limbs keep their orientation: carried along, knees would end up behind.
+        posed = _keep_orientation(posed, limb.upper, orientations[:, limb.upper], turning[:, limb.upper])
+        positions = posed.joint_positions().clone()
+        positions[:, limb.end] = torch.where(placed[:, None], ends[:, limb.end], positions[:, limb.end])
         free = torch.zeros_like(turning)
-        free[:, [limb.upper, limb.lower]] = (turning[:, [limb.upper, limb.lower]].all(dim=1) & told)[:, None]
+        free[:, [limb.upper, limb.lower]] = (turning[:, [limb.upper, limb.lower]].all(dim=1) & placed)[:, None]
         quats = inverse.solve_inverse_kinematics(
-            places, posed.local_quat_xyzw, posed.skeleton, free=free, limbs=(limb,), root_position=posed.root_position
+            positions,
+            posed.local_quat_xyzw,
+            posed.skeleton,
+            free=free,
+            limbs=(limb,),
+            root_position=posed.root_position,
         )
         posed = replace(posed, local_quat_xyzw=torch.where(free[..., None], quats, posed.local_quat_xyzw))
         if name.endswith("Foot"):
-            posed = _keep_orientation(posed, limb.end, lay[:, limb.end], turning[:, limb.end])
+            posed = _keep_orientation(posed, limb.end, orientations[:, limb.end], turning[:, limb.end])
     return posed
 
 

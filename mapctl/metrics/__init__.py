@@ -29,8 +29,8 @@ def measure(
     speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm, and sway_cm: from the straight line
     between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, likewise
     path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s) wanted_m and progress_ratio too. `joint`
-    names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or feet cannot be
-    told, unknown joints and motions of one frame.
+    names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or feet are not found,
+    unknown joints and motions of one frame.
     """
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
@@ -68,14 +68,18 @@ def _measure_body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps
     }
 
 
-def _measure_path(places: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float) -> dict[str, float]:
-    arcs = track_arcs(curve, places)
+def _measure_path(
+    positions: Float[Tensor, "frames 3"], curve: Curve, speed: float | None, fps: float
+) -> dict[str, float]:
+    arcs = track_arcs(curve, positions)
     travelled = float(arcs[-1] - arcs[0])
-    measures = _summarise_errors("path_error_{}_cm", path.compute_path_error(places, curve, arcs))
-    measures |= _summarise_errors("path_error_low_passed_{}_cm", path.compute_low_pass_error(places, curve, arcs, fps))
-    measures |= {"sway_cm": path.sway(curve.signed_offset(places, arcs), fps) * _CM, "travelled_m": travelled}
+    measures = _summarise_errors("path_error_{}_cm", path.compute_path_error(positions, curve, arcs))
+    measures |= _summarise_errors(
+        "path_error_low_passed_{}_cm", path.compute_low_pass_error(positions, curve, arcs, fps)
+    )
+    measures |= {"sway_cm": path.sway(curve.signed_offset(positions, arcs), fps) * _CM, "travelled_m": travelled}
     if speed is not None:
-        wanted = speed * (len(places) - 1) / fps
+        wanted = speed * (len(positions) - 1) / fps
         measures |= {"wanted_m": wanted, "progress_ratio": travelled / wanted if wanted else float("nan")}
     return measures
 

@@ -17,23 +17,23 @@ SWAY_SECONDS = 0.35
 
 
 def compute_path_error(
-    places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
+    positions: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames"]:
     """Compute the distance of each position to the curve at the walk's arc, between the curve's ends, metres; without
     height for a ground curve. `arcs` come from `track`: the nearest point of all may belong to another branch."""
     on_it = arcs if curve.closed else arcs.clamp(0, curve.length)
-    apart = curve.point(on_it) - (places[:, ::2] if places.shape[1] > curve.dims else places)
+    apart = curve.point(on_it) - (positions[:, ::2] if positions.shape[1] > curve.dims else positions)
     return apart.norm(dim=-1)
 
 
 def compute_low_pass_error(
-    places: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
+    positions: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
 ) -> Float[Tensor, "frames"]:
     """Compute the size of the sideways offset after a Gaussian of 0.5 s, metres.
 
     The offset is smoothed and not the walk, which would shrink on every bend. `arcs` come from `track`.
     """
-    return low_pass(curve.signed_offset(places, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
+    return low_pass(curve.signed_offset(positions, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
 
 
 def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECONDS) -> float:

@@ -15,7 +15,7 @@ from mapctl.joint_roles import find_feet
 from mapctl.metrics.realism.gait import step_lengths
 from mapctl.motion import Motion
 
-_SLOW_SECONDS = 0.25  # a stride's own rise and fall is no answer to a command
+_SLOW_SECONDS = 0.25  # a Gaussian that removes a stride's own rise and fall of speed
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
 _HOLD_SECONDS = 0.4  # seconds for which a command must hold to count as reached
 _NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
@@ -46,17 +46,17 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     """Measure a row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
 
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
-    it never was), steady_speed_mps (net way over time; the mean speed while turning), steady_heading_error_deg and
+    it never was), steady_speed_mps (net displacement over time; mean speed while turning), steady_heading_error_deg and
     steady_turn_deg_s (None where the other, standing, or no steady part was wanted), step_m and steady_step_m (None
     unless a step length was wanted).
     """
-    way, rows = compute_low_pass_velocity(motion), []
+    velocity, rows = compute_low_pass_velocity(motion), []
     asked = any(command.step_length is not None for command in track.commands)
-    steps = _step_length_by_frame(motion) if asked else np.full(len(way.seconds), math.nan)
+    steps = _step_length_by_frame(motion) if asked else np.full(len(velocity.seconds), math.nan)
     ground = motion.joint_positions()[:, 0, ::2].numpy()
-    ends = [*track.times[1:], float(way.seconds[-1])]
+    ends = [*track.times[1:], float(velocity.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
-        part = (way.seconds >= began) & (way.seconds <= until)
+        part = (velocity.seconds >= began) & (velocity.seconds <= until)
         turning = None if command.turning is None else math.degrees(command.turning)
         row: dict[str, float | None] = {
             "time_s": began,
@@ -64,11 +64,13 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
             "turn_deg_s": turning,
             "heading_deg": math.degrees(command.heading),
         }
-        row["reached_s"] = _find_time_reached(way, part, began, command, float(motion.fps))
-        steady = np.flatnonzero(part & (way.seconds >= began + _STEADY_AFTER))
-        row |= _measure_steady_errors(way, ground, steady, command, float(motion.fps))
-        seen = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
-        rows.append(row | {"step_m": command.step_length, "steady_step_m": float(np.mean(seen)) if len(seen) else None})
+        row["reached_s"] = _find_time_reached(velocity, part, began, command, float(motion.fps))
+        steady = np.flatnonzero(part & (velocity.seconds >= began + _STEADY_AFTER))
+        row |= _measure_steady_errors(velocity, ground, steady, command, float(motion.fps))
+        taken = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
+        rows.append(
+            row | {"step_m": command.step_length, "steady_step_m": float(np.mean(taken)) if len(taken) else None}
+        )
     return rows
 
 
@@ -78,19 +80,21 @@ def _step_length_by_frame(motion: Motion) -> Float[ndarray, " frames"]:
     return step_lengths(toes[..., ::2], contacts.detect_contacts(toes, float(motion.fps)), float(motion.fps)).numpy()
 
 
-def _find_time_reached(way: LowPassVelocity, part: ndarray, began: float, command: Command, fps: float) -> float | None:
-    near = np.abs(way.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
+def _find_time_reached(
+    velocity: LowPassVelocity, part: ndarray, began: float, command: Command, fps: float
+) -> float | None:
+    near = np.abs(velocity.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
     if command.speed > 0 and command.turning is None:
-        near &= np.abs(rotations.wrap_angle(way.direction - command.heading)) < _NEAR_ANGLE
+        near &= np.abs(rotations.wrap_angle(velocity.direction - command.heading)) < _NEAR_ANGLE
     at = np.flatnonzero(part)
     for first in at:
         if near[first : min(first + round(_HOLD_SECONDS * fps), at[-1] + 1)].all():
-            return float(way.seconds[first] - began)
+            return float(velocity.seconds[first] - began)
     return None
 
 
 def _measure_steady_errors(
-    way: LowPassVelocity, ground: ndarray, frames: ndarray, command: Command, fps: float
+    velocity: LowPassVelocity, ground: ndarray, frames: ndarray, command: Command, fps: float
 ) -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(
         ("steady_speed_mps", "steady_heading_error_deg", "steady_turn_deg_s")
@@ -98,9 +102,9 @@ def _measure_steady_errors(
     if len(frames) < fps / 2:
         return found
     if command.turning is not None:
-        turned = np.unwrap(way.direction[frames])
+        turned = np.unwrap(velocity.direction[frames])
         rate = math.degrees(float(turned[-1] - turned[0])) * fps / (len(frames) - 1)
-        return found | {"steady_speed_mps": float(way.speed[frames].mean()), "steady_turn_deg_s": rate}
+        return found | {"steady_speed_mps": float(velocity.speed[frames].mean()), "steady_turn_deg_s": rate}
     step = (ground[frames[-1]] - ground[frames[0]]) * fps / (len(frames) - 1)
     off = math.degrees(float(rotations.wrap_angle(math.atan2(step[0], step[1]) - command.heading)))
     found["steady_speed_mps"] = float(np.linalg.norm(step))

@@ -18,9 +18,9 @@ def true_intervals(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, 
         yield column, start, stop
 
 
-def fill_missing(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
+def fill_missing(values: Float[Tensor, "batch frames width"], observed: Bool[Tensor, "batch frames"]) -> Tensor:
     """Fill frames that were not observed linearly between those around them; hold first and last beyond."""
-    before, after = last_observed(seen), next_observed(seen)
+    before, after = last_observed(observed), next_observed(observed)
     start = torch.take_along_dim(values, before[..., None], dim=1)
     stop = torch.take_along_dim(values, after[..., None], dim=1)
     frame = torch.arange(values.shape[1], device=values.device)
@@ -28,21 +28,21 @@ def fill_missing(values: Float[Tensor, "batch frames width"], seen: Bool[Tensor,
     return torch.lerp(start, stop, weight[..., None])
 
 
-def fill_missing_angle(angle: Float[Tensor, "batch frames"], seen: Bool[Tensor, "batch frames"]) -> Tensor:
+def fill_missing_angle(angle: Float[Tensor, "batch frames"], observed: Bool[Tensor, "batch frames"]) -> Tensor:
     """Fill angles, radians, not wrapped, as `fill_missing` does, along the shorter arc."""
     # Frames that were not observed may hold anything: whole turns are counted from one observed frame to the next.
-    held = torch.take_along_dim(angle, last_observed(seen), dim=1)
-    return fill_missing(rotations.unwrap_angle(held)[..., None], seen)[..., 0]
+    held = torch.take_along_dim(angle, last_observed(observed), dim=1)
+    return fill_missing(rotations.unwrap_angle(held)[..., None], observed)[..., 0]
 
 
-def last_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
+def last_observed(observed: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
     """Return for each frame the last observed one at or before it; before the first of them, that one."""
-    frame = torch.arange(seen.shape[1], device=seen.device)
-    last = torch.where(seen, frame, -1).cummax(dim=1).values
-    first = torch.where(seen.any(dim=1), seen.to(torch.uint8).argmax(dim=1), 0)
+    frame = torch.arange(observed.shape[1], device=observed.device)
+    last = torch.where(observed, frame, -1).cummax(dim=1).values
+    first = torch.where(observed.any(dim=1), observed.to(torch.uint8).argmax(dim=1), 0)
     return torch.where(last < 0, first[:, None], last)
 
 
-def next_observed(seen: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
+def next_observed(observed: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
     """Return for each frame the first observed one at or after it; after the last of them, that one."""
-    return seen.shape[1] - 1 - last_observed(seen.flip(1)).flip(1)
+    return observed.shape[1] - 1 - last_observed(observed.flip(1)).flip(1)

@@ -1,5 +1,7 @@
-"""What is known before a window: what a parametrisation of its frames builds trials from."""
+"""What is known before a window, from which parametrisations build trials; and the request to solve the window."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -9,23 +11,24 @@ from torch import Tensor
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.problem.density_selection import DensityEnsemble
-from mapctl.protocols import Density, DensityState
+from mapctl.protocols import AnyDensity, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.terms.base import Term
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
 class WindowContext:
-    """Everything before a window that its frames depend on."""
+    """What comes before a window, as far as its frames depend on it."""
 
-    density: Density | DensityEnsemble
-    """The prior, or several."""
+    density: AnyDensity | DensityEnsemble
+    """Density, or several of which the solver selects one."""
     state: DensityState | tuple[DensityState, ...]
-    """The prior's state after the committed frames, batch of one or one row for each candidate; a tuple of several."""
+    """Density's state after the committed frames, batch of one or one row a candidate; a tuple for an ensemble."""
     place: GroundPose
     """Ground pose of the last committed frame."""
     before: Float[Tensor, "past joints 3"]
-    """World joint positions of the last committed frames, metres."""
+    """World joint positions of the last committed frames, metres, oldest first."""
     frames: int
     """Number of frames in the window."""
     skeleton: Skeleton = CANONICAL
@@ -33,15 +36,15 @@ class WindowContext:
     fps: float = PRIOR_FPS
     """Frames per second."""
     contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
-    """Left and right toe planted in the last committed frame; unbatched or one row for each candidate."""
+    """Left and right toe planted in the last committed frame; unbatched or one row a candidate."""
     first_frame: int = 0
-    """Frame of the whole motion that the window begins at, counted from 0."""
+    """Frame of the whole motion with which the window begins, from 0."""
 
     @property
-    def prior(self) -> Density:
-        """The one density; MapctlError where there are several or none."""
+    def prior(self) -> AnyDensity:
+        """The one density; MapctlError for an ensemble."""
         if isinstance(self.density, DensityEnsemble):
-            raise MapctlError("a rollout needs one density")
+            raise MapctlError("a rollout needs one density, not an ensemble")
         return self.density
 
     @property
@@ -51,7 +54,7 @@ class WindowContext:
         return self.state
 
     def expand_state(self, batch: int) -> DensityState:
-        """The one density's state for a batch of candidates."""
+        """Expand the one density's state to a batch of candidates."""
         return self.prior_state.expand(batch)
 
     def build_trial(
@@ -62,7 +65,7 @@ class WindowContext:
         noise: Tensor | None,
         log_density: Tensor | None,
     ) -> Trial:
-        """The trial of candidate features in this context."""
+        """Build the trial of candidate features, physical units, in this context."""
         return Trial(
             features,
             self.place,
@@ -75,3 +78,20 @@ class WindowContext:
             fps=self.fps,
             first_frame=self.first_frame,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class WindowRequest:
+    """One window to solve."""
+
+    context: WindowContext
+    """What is known before the window."""
+    terms: Sequence[Term]
+    """Terms whose energies are summed over the window's frames."""
+    warm_start: Float[Tensor, "ahead width"]
+    """What the last window found for the first of these frames (see `Parametrisation.warm_start`); none at the start.
+    """
+    generator: torch.Generator
+    """Source of all random draws."""
+    seconds: float = math.inf
+    """Time that is left, seconds."""

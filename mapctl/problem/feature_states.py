@@ -2,8 +2,6 @@
 al. 2019, Eq. 14-16).
 """
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -11,91 +9,78 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.receding_horizon import replay
 from mapctl.problem.window_solvers import SolvedWindow, minimise_window
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms.base import Term
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureStates:
-    """Unknowns are features (in units of `scale`) and the noise on the network's input, side by side."""
+    """Unknowns are features, in units of `scale` about `centre`, and the noise on the network's input, side by side."""
 
     context: WindowContext
     """What is known before the window."""
     scale: Float[Tensor, " continuous"]
     """Physical size of one unit of each feature: the prior's standard deviations."""
     centre: Float[Tensor, " continuous"]
-    """The prior's means."""
+    """Features of unknowns 0, physical units: the prior's means."""
     contacts: Bool[Tensor, "1 frames 2"]
-    """Fixed contact bits."""
+    """Left and right toe planted in each frame; fixed."""
     input_noise: float = 0.05
-    """Standard deviation of the input noise, normalised units: what one unit of its unknowns is worth."""
+    """Standard deviation of the input noise, normalised units: one unit of its unknowns (the paper's 0.05)."""
 
     def from_features(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch unknowns"]:
-        """Unknowns of a motion without input noise."""
+        """Convert features, physical units, to unknowns without input noise."""
         states = (features[..., : LAYOUT.continuous] - self.centre) / self.scale
         return torch.cat([states.flatten(1), torch.zeros_like(states).flatten(1)], dim=-1)
 
-    def initial(self, warm_start: Float[Tensor, "ahead width"]) -> Float[Tensor, "1 unknowns"]:
-        """The last window's features and the prior's zero-noise rollout after them."""
-        return self.from_features(_continue_features(self.context, warm_start))
-
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
-        """Score the states with teacher forcing."""
+        """Build the trials of the features, scored with teacher forcing; differentiable."""
         context, half = self.context, unknowns.shape[-1] // 2
         shape = (context.frames, LAYOUT.continuous)
-        states, noise = unknowns[:, :half].unflatten(-1, shape), unknowns[:, half:].unflatten(-1, shape)
+        states, noise = torch.unflatten(unknowns[:, :half], -1, shape), torch.unflatten(unknowns[:, half:], -1, shape)
         bits = self.contacts.expand(len(states), -1, -1).to(states.dtype)
         features = torch.cat([states * self.scale + self.centre, bits], dim=-1)
-        inputs = features[..., : LAYOUT.continuous] + noise * self.input_noise * self.scale
-        seen = torch.cat([inputs, bits], dim=-1)
-        log_density = context.prior.log_prob(features, context.expand_state(len(states)), inputs=seen)
+        noisy = features[..., : LAYOUT.continuous] + noise * self.input_noise * self.scale
+        inputs = torch.cat([noisy, bits], dim=-1)
+        log_density = context.prior.log_prob(features, context.expand_state(len(states)), inputs=inputs)
         contacts = self.contacts.expand(len(states), -1, -1)
         return context.build_trial(features, contacts, noise=noise, log_density=log_density)
 
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """The features by frame."""
+        """Return the features by frame."""
         return self.build(unknowns).features[0].detach()
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureStateSolver:
-    """L-BFGS over feature states (Wang et al. 2019, Eq. 14-19). The terms should hold a likelihood.
+    """L-BFGS over feature states (Wang et al. 2019, Eq. 14-19). A likelihood should be among the terms.
 
-    Starts from the last window's states and the prior's plain continuation of them, whose contact bits are kept.
+    The search starts from the last window's features and their zero-noise rollout, whose contact bits are kept.
     """
 
     scale: Float[Tensor, " continuous"]
-    """The prior's standard deviations: one unit of each unknown."""
+    """Physical size of one unit of each feature: the prior's standard deviations."""
     centre: Float[Tensor, " continuous"]
-    """The prior's means."""
+    """Features of unknowns 0, physical units: the prior's means."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=150))
-    """L-BFGS of one window."""
+    """Settings of L-BFGS in one window."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=160))
     """Budget of one window."""
 
-    def __call__(
-        self,
-        context: WindowContext,
-        terms: Sequence[Term],
-        warm_start: Tensor,
-        generator: torch.Generator,
-        *,
-        seconds: float = math.inf,
-    ) -> SolvedWindow:
-        """Solve one window."""
-        meter = Meter(self.budget.within(seconds))
-        features = _continue_features(context, warm_start)
-        states = FeatureStates(context, self.scale, self.centre, LAYOUT.pick(features, "contacts") > 0.5)
-        return minimise_window(states, terms, states.from_features(features), self.lbfgs, meter)
+    def __call__(self, request: WindowRequest) -> SolvedWindow:
+        """Solve one window; the start stays where nothing finite is found."""
+        meter = Meter(self.budget.within(request.seconds))
+        features = _continue_features(request.context, request.warm_start)
+        states = FeatureStates(request.context, self.scale, self.centre, LAYOUT.pick(features, "contacts") > 0.5)
+        return minimise_window(states, request.terms, states.from_features(features), self.lbfgs, meter)
 
 
 def _continue_features(context: WindowContext, warm_start: Tensor) -> Float[Tensor, "1 frames size"]:
-    """The last window's features and the prior's zero-noise rollout after them."""
+    """Return the last window's features and the prior's zero-noise rollout after them."""
     known = warm_start[: context.frames].unsqueeze(0)
     state = replay(context.prior, known[0], context.prior_state) if len(warm_start) else context.prior_state
     noise = warm_start.new_zeros(1, context.frames - known.shape[1], LAYOUT.continuous)

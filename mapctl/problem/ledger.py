@@ -10,16 +10,16 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class LedgerEntry:
-    """One term over all frames."""
+    """Energy and residual of one term, frame by frame."""
 
     name: str
-    """The term's name."""
+    """Name of the term."""
     unit: str
-    """Of the residual."""
+    """Unit of the residual."""
     energy: Float[Tensor, " frames"]
-    """Nats."""
+    """Energy of each frame, nats."""
     residual: Float[Tensor, " frames"]
-    """How far the wish is missed."""
+    """Distance of each frame from what the term wants, in `unit`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,17 +27,17 @@ class Ledger:
     """Energy and physical residual by term and frame."""
 
     entries: tuple[LedgerEntry, ...] = ()
-    """One for each term."""
+    """Entries, one a term."""
 
     def join(self, other: "Ledger") -> "Ledger":
-        """This ledger's frames followed by the other's; a term that only one of them lists is 0 in the other's."""
+        """Join this ledger's frames with the other's after them; a term that one of them lacks is 0 there."""
         if not self.entries:
             return other
         mine, theirs = ({entry.name: entry for entry in ledger.entries} for ledger in (self, other))
         return Ledger(tuple(_join_entries(mine.get(name), theirs.get(name), self, other) for name in mine | theirs))
 
     def slice(self, frames: int) -> "Ledger":
-        """The first frames."""
+        """Return the ledger of the first frames."""
         return self.pick(builtins.slice(frames))
 
     def pick(self, frames: builtins.slice) -> "Ledger":
@@ -45,7 +45,7 @@ class Ledger:
         return Ledger(tuple(replace(e, energy=e.energy[frames], residual=e.residual[frames]) for e in self.entries))
 
     def summary(self) -> dict[str, dict[str, float | str]]:
-        """For a report: by term the total energy, and mean, 95th percentile and maximum of the residual."""
+        """Summarise for a report: by term the total energy, and mean, 95th percentile and maximum of the residual."""
         return {
             entry.name: {
                 "energy_nats": float(entry.energy.sum()),
@@ -59,7 +59,7 @@ class Ledger:
 
 
 def _join_entries(before: LedgerEntry | None, after: LedgerEntry | None, first: Ledger, second: Ledger) -> LedgerEntry:
-    """One term of two ledgers, of which one may not have it."""
+    """Join one term of two ledgers, of which one may lack it."""
     some = before or after
     assert some is not None, "the term comes from one of them"
     nothing = [torch.zeros_like(ledger.entries[0].energy) for ledger in (first, second)]

@@ -1,12 +1,13 @@
-"""The MAP objective of one window: unknowns to a trial, terms to energies, autograd to the gradient (Eq. 19).
+"""The MAP objective of one window: unknowns to a trial, terms to energies, autograd to the gradient (Wang et al. 2019,
+Eq. 19).
 
 The density offers a rollout (and, on the fast path, its hand-written pullback behind autograd); a term offers an energy
-on the trial's quantities. No piece here knows a network, and no network knows a term.
+on the trial's quantities. Nothing here knows a network, and no network knows a term.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -21,48 +22,52 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Energy of a batch of unknown vectors."""
+    """Energy of a batch of unknown vectors. A term that is at fault is named by a RequestError."""
 
     build: Callable[[Float[Tensor, "batch unknowns"]], Trial]
     """Unknowns to the trial; differentiable."""
     terms: Sequence[Term]
-    """Summed over, and over frames."""
+    """Terms whose energies are summed, over frames too."""
 
     def energy(self, unknowns: Float[Tensor, "batch unknowns"]) -> Float[Tensor, " batch"]:
-        """Total nats of each candidate."""
+        """Total nats of each candidate; RequestError where a term gives another shape than a number a frame."""
         return self._sum_terms(self.build(unknowns)).sum(-1)
 
     def _sum_terms(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        total = check_shape(self.terms[0], "energy", self.terms[0](trial), trial)
+        total = _evaluate(self.terms[0], "energy", trial)
         for term in self.terms[1:]:
-            total = total + check_shape(term, "energy", term(trial), trial)
+            total = total + _evaluate(term, "energy", trial)
         return total
 
     def energy_and_gradient(self, unknowns: Tensor) -> tuple[Tensor, Tensor]:
         """Nats (batch,) and their gradient (batch, unknowns); candidates are independent of each other.
 
-        RequestError that names the term where one is not finite though the motion is: then the term is at fault.
+        RequestError as in `energy`, and where a term is not finite, or its gradient, for a motion that is.
         """
         energy, gradient = differentiate(self.energy)(unknowns)
         if not bool(torch.isfinite(energy.sum() + gradient.sum())):
-            self._raise_for_bad_term(unknowns.detach().requires_grad_(True))
+            self._raise_for_bad_term(unknowns)
         return energy, gradient
 
     def _raise_for_bad_term(self, unknowns: Tensor) -> None:
-        """Find the term that is not finite, one after the other; says nothing where the motion is none either."""
-        for term in self.terms:
+        """Find the first term that is not finite; do nothing where the motion or its log density is not finite."""
+        with torch.no_grad():
             trial = self.build(unknowns)
-            if not _is_plausible(trial):
-                return
-            energy = term(trial)
+        if not _is_plausible(trial):
+            return
+        for term in self.terms:
+            # What the trial itself is made of: how it comes about is no term's fault.
+            leaves = {name: values.detach().requires_grad_(True) for name, values in _parts(trial).items()}
+            energy = _evaluate(term, "energy", replace(trial, **leaves))
             _check_finite(term, "energy", energy)
             if energy.requires_grad:
-                (gradient,) = torch.autograd.grad(energy.sum(), unknowns, allow_unused=True)
-                if gradient is not None:
-                    _check_finite(term, "gradient", gradient)
+                slopes = torch.autograd.grad(energy.sum(), list(leaves.values()), materialize_grads=True)
+                for slope in slopes:
+                    _check_finite(term, "gradient", slope.sum(-1) if slope.ndim > 2 else slope)
 
     def build_ledger(self, trial: Trial) -> Ledger:
-        """By term, the energies and residuals of a trial of one candidate."""
+        """By term, the energies and residuals of a trial of one candidate; RequestError where one of them has another
+        shape, or is not finite for a motion that is."""
         with torch.no_grad():
             return Ledger(tuple(_build_entry(term, trial) for term in self.terms))
 
@@ -70,39 +75,58 @@ class Objective:
 _PLAUSIBLE_LIMIT = 1e4  # metres or radians: a motion that a search has thrown this far says nothing of a term
 
 
-def check_shape(term: Term, what: str, values: Any, trial: Trial) -> Float[Tensor, "batch frames"]:
-    """What a term gave, if it has a number for each candidate and frame; RequestError that names the term if not."""
-    wanted = tuple(trial.features.shape[:-1])
-    got = tuple(values.shape) if torch.is_tensor(values) else None
-    if got == wanted:
+def _parts(trial: Trial) -> dict[str, Tensor]:
+    """What terms differentiate: the features, and the noise and the log density where there are any."""
+    parts = {"features": trial.features, "noise": trial.noise, "log_density": trial.log_density}
+    return {name: values for name, values in parts.items() if values is not None}
+
+
+def _is_plausible(trial: Trial) -> bool:
+    parts = _parts(trial)
+    log_density = parts.pop("log_density", torch.zeros(()))
+    within = all(bool((values.abs() < _PLAUSIBLE_LIMIT).all()) for values in parts.values())
+    return within and bool(torch.isfinite(log_density).all())
+
+
+def _evaluate(term: Term, what: Literal["energy", "residual"], trial: Trial) -> Float[Tensor, "batch frames"]:
+    """A term's energy or residual; what the term raises is raised on, with a note that names it."""
+    try:
+        values = term(trial) if what == "energy" else term.residual(trial)
+    except Exception as error:
+        error.add_note(f"while the term {term.name!r} computed its {what}")
+        raise
+    return _check_shape(term, what, values, trial)
+
+
+def _check_shape(term: Term, what: str, values: object, trial: Trial) -> Float[Tensor, "batch frames"]:
+    """The values, if they are a number for each candidate and frame; RequestError if not."""
+    expected = trial.features.shape[:-1]
+    if isinstance(values, Tensor) and values.shape == expected:
         return values
-    told = f"shape {list(got)}" if got is not None else f"a {type(values).__name__}"
-    article = "an" if what == "energy" else "a"
+    found = f"shape {list(values.shape)}" if isinstance(values, Tensor) else f"a {type(values).__name__}"
     raise RequestError(
-        f"the term {term.name!r} gave {article} {what} of {told}; expected a tensor of shape"
-        f" {list(wanted)}: candidates, frames"
+        f"the term {term.name!r} gave {_with_article(what)} of {found}; expected a tensor of shape"
+        f" {list(expected)}: candidates, frames"
     )
 
 
 def _build_entry(term: Term, trial: Trial) -> LedgerEntry:
-    energy = check_shape(term, "energy", term(trial), trial)
-    residual = check_shape(term, "residual", term.residual(trial), trial)
+    energy, residual = _evaluate(term, "energy", trial), _evaluate(term, "residual", trial)
     if _is_plausible(trial):
+        _check_finite(term, "energy", energy)
         _check_finite(term, "residual", residual)
     return LedgerEntry(term.name, term.unit, energy[0], residual[0])
 
 
-def _is_plausible(trial: Trial) -> bool:
-    made = [trial.features] if trial.noise is None else [trial.features, trial.noise]
-    return all(bool((values.detach().abs() < _PLAUSIBLE_LIMIT).all()) for values in made)
-
-
-def _check_finite(term: Term, what: str, values: Tensor) -> None:
+def _check_finite(term: Term, what: str, values: Float[Tensor, "batch frames"]) -> None:
     if bool(torch.isfinite(values).all()):
         return
-    bad = int((~torch.isfinite(values)).nonzero()[0, -1])
-    where = "" if what == "gradient" else f", first in frame {bad} of its window"
+    frame = int((~torch.isfinite(values)).nonzero()[0, -1])
     raise RequestError(
-        f"the term {term.name!r} gave {'an' if what == 'energy' else 'a'} {what} that is not finite"
-        f" for a motion that is{where}"
+        f"the term {term.name!r} gave {_with_article(what)} that is not finite for a motion that is, first in frame"
+        f" {frame} of its window"
     )
+
+
+def _with_article(noun: str) -> str:
+    return f"an {noun}" if noun == "energy" else f"a {noun}"

@@ -1,14 +1,12 @@
-"""Unknowns about a proposed motion: how far each frame's pose and place are from it, in sigmas, smooth in time.
+"""Unknowns that are offsets of each frame's pose and position about a proposed motion, in sigmas, smooth in time.
 
 x = proposal + sigma * (K z): the posterior of a model that proposes whole motions, as a rollout's x = mu + sigma d is
 that of a density, so that the standard normal prior of z is the observation term of denoising (Wang et al. 2019, Eq.
 25) in coordinates that converge. K smooths white z to unit variance, so that a correction of one frame moves its
-neighbours along. Positions are in the world, not steps from frame to frame: terms that hold the motion where it was
-observed are then well conditioned.
+neighbours along. Positions are in the world, not steps from frame to frame: terms on observed positions are then well
+conditioned.
 """
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -18,26 +16,25 @@ from torch import Tensor
 
 from mapctl.numerics import gaussian
 from mapctl.pose import BodyPose
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.window_solvers import SolvedWindow, minimise_window
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms.base import Term
 from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
 class PoseOffsets:
-    """Unknowns are offsets about a proposal's root, heading and angles, one batch row a candidate."""
+    """Unknowns are offsets about a proposal's root position, heading and angles, one batch row a candidate."""
 
     context: WindowContext
-    """What is known before the window; its density, if it is one, scores the motion with teacher forcing (Eq. 15)."""
+    """What is known before the window. A single density scores the motion with teacher forcing (Eq. 15)."""
     proposal: BodyPose
-    """The window's frames, unbatched."""
+    """Proposed poses of the window's frames, unbatched."""
     contacts: Bool[Tensor, "frames 2"]
-    """Left and right toe planted in them."""
+    """Left and right toe planted in each frame."""
     sigma: Float[Tensor, "frames width"]
     """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
     smooth: float = 2.0
@@ -47,13 +44,9 @@ class PoseOffsets:
     def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
         return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
 
-    def initial(self, warm_start: Float[Tensor, "ahead width"]) -> Float[Tensor, "1 unknowns"]:
-        """The proposal itself, whatever the last window found: that has moved what these offsets are smoothed with."""
-        return torch.zeros(1, self.sigma.numel())
-
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
-        """The proposal, changed."""
-        white = unknowns.unflatten(-1, tuple(self.sigma.shape))
+        """Build the trials of the proposal with the offsets added; differentiable."""
+        white = torch.unflatten(unknowns, -1, self.sigma.shape)
         offset = self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
         pose = BodyPose.unpack(self.proposal.pack() + offset)
         features = pose.features(self.context.place, self.contacts)
@@ -64,45 +57,42 @@ class PoseOffsets:
         return self.context.build_trial(features, contacts, noise=white, log_density=log_density)
 
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """The offsets by frame, in sigmas."""
-        return unknowns[0].unflatten(-1, tuple(self.sigma.shape))
+        """Return the white offsets by frame, in sigmas."""
+        return torch.unflatten(unknowns[0], -1, self.sigma.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseOffsetSolver:
     """L-BFGS over the offsets of a proposed motion, window by window.
 
-    Of the densities that the context holds, the one under which a window's proposal is likeliest scores it, and counts
-    less where the proposal is out of its depth.
+    Of an ensemble, the density under which a window's proposal is likeliest scores the window, with less weight where
+    the proposal is less likely than that density's own data.
     """
 
     proposal: BodyPose
     """The proposed motion, unbatched."""
     contacts: Bool[Tensor, "frames 2"]
-    """Left and right toe planted in it."""
+    """Left and right toe planted in each frame of it."""
     sigma: Float[Tensor, "frames width"]
     """Standard deviations of root, heading and angles by frame (see `BodyPose.pack`): metres and radians."""
     smooth: float = 2.0
     """Sigma of the smoothing, frames."""
     temperature: float = 1.0
-    """Temperature of a density's likelihood."""
+    """Temperature of the selected density's likelihood."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
-    """L-BFGS of one window."""
+    """Settings of L-BFGS in one window."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=20))
     """Budget of one window."""
     first_frame: int = 0
     """Frame of the whole motion that the proposal begins at."""
 
-    def __call__(
-        self,
-        context: WindowContext,
-        terms: Sequence[Term],
-        warm_start: Tensor,
-        generator: torch.Generator,
-        *,
-        seconds: float = math.inf,
-    ) -> SolvedWindow:
-        """Solve one window; it stays as it was proposed where nothing finite was found."""
+    def __call__(self, request: WindowRequest) -> SolvedWindow:
+        """Solve one window; the proposal stays where nothing finite is found.
+
+        The search starts from the proposal, without a warm start: the frames that the last window's offsets were
+        smoothed together with are committed now.
+        """
+        context, terms = request.context, request.terms
         first = context.first_frame - self.first_frame
         stop = first + context.frames
         proposal, contacts = self.proposal.slice(first, stop), self.contacts[first:stop]
@@ -112,5 +102,5 @@ class PoseOffsetSolver:
             context = replace(context, density=choice.density, state=state)
             terms = (*terms, Likelihood(self.temperature / choice.weight))
         offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop], smooth=self.smooth)
-        meter = Meter(self.budget.within(seconds))
-        return replace(minimise_window(offsets, terms, offsets.initial(warm_start), self.lbfgs, meter), choice=choice)
+        start, meter = torch.zeros(1, offsets.sigma.numel()), Meter(self.budget.within(request.seconds))
+        return replace(minimise_window(offsets, terms, start, self.lbfgs, meter), choice=choice)

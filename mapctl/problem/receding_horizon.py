@@ -14,39 +14,39 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, WindowRecord
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
-from mapctl.protocols import Density, DensityState
+from mapctl.protocols import AnyDensity, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term
 
 TermsOf = Callable[[int, int], Sequence[Term]]
-"""Terms of the window that begins at a frame and has so many frames."""
+"""(first frame, number of frames) of a window to its terms."""
 
 
 @dataclass(frozen=True)
 class HorizonSettings:
-    """How windows are laid."""
+    """Lengths of windows."""
 
     frames: int = 34
-    """Length of a window (the paper's)."""
+    """Length of a window, frames (as in the paper)."""
     overlap: int = 17
-    """Frames of it that the next window solves again."""
+    """Look-ahead: frames of a window that the next one solves again."""
     past: int = 40
-    """Committed frames that terms may look back on."""
+    """Number of committed frames whose joint positions are kept for the terms."""
     beyond_end: bool = True
-    """Whether windows look their full length ahead, so that the last frames are solved with a future too; if not, they
-    end with the motion, as where it is known from the beginning."""
+    """Whether windows have their full length beyond the motion's end, so that its last frames are solved with a
+    look-ahead too; if not, they end with the motion, as where all of it is proposed."""
 
     def __post_init__(self):
         if not 0 <= self.overlap < self.frames or self.past < 1:
             raise RequestError(f"windows need frames > overlap >= 0 and past >= 1, got {self}")
 
     def lay_window(self, done: int, frames: int) -> tuple[int, int]:
-        """Length of the window after `done` of `frames` frames, and how many of its frames are committed."""
+        """Return the length of the window after `done` of `frames` frames, and how many of its frames are committed."""
         left = frames - done
         if self.beyond_end:
             return self.frames, min(self.frames - self.overlap, left)
@@ -55,29 +55,29 @@ class HorizonSettings:
 
 @dataclass(frozen=True, eq=False)
 class CommittedFrames:
-    """Everything fixed so far."""
+    """What is fixed so far, and the warm start of the next window."""
 
     state: DensityState | tuple[DensityState, ...]
-    """The density's state after it, batch of one."""
+    """Density's state after the last frame, batch of one."""
     place: GroundPose
-    """Ground pose of its last frame."""
+    """Ground pose of the last frame."""
     features: Float[Tensor, "frames size"]
-    """Features of every committed frame; the first may be a start that was not solved."""
+    """Features of the committed frames, physical units; the first may be an initial state that was not solved."""
     joints_world: Float[Tensor, "past joints 3"]
-    """World joint positions of its last frames, metres."""
+    """World joint positions of the last frames, metres, oldest first."""
     warm_start: Float[Tensor, "ahead width"] = field(default_factory=lambda: torch.zeros(0, LAYOUT.continuous))
-    """What the last window found for the frames beyond: where the next one starts (see `Parametrisation`)."""
+    """Warm start of the next window: what the last one found for its look-ahead (see `Parametrisation`)."""
     ledger: Ledger = field(default_factory=Ledger)
     """Energy and residual of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
-    """Cost of each window."""
+    """Record of each window, its cost among them."""
     forecast: Float[Tensor, "ahead joints 3"] | None = None
-    """World joint positions of the frames that the last window found beyond, metres."""
+    """World joint positions of the last window's look-ahead, metres."""
     discarded: int = 0
-    """Frames of the motion before the first of `features`, which nothing looks back on any more."""
+    """Number of committed frames before the first of `features`, which are no longer kept."""
 
     def discard_history(self, keep: int) -> "CommittedFrames":
-        """With the features of the last frames only, and neither ledger nor records."""
+        """Return this with the features of the last `keep` frames only, and without ledger and records."""
         gone = max(0, len(self.features) - keep)
         return replace(
             self, features=self.features[gone:], ledger=Ledger(), windows=(), discarded=self.discarded + gone
@@ -98,18 +98,18 @@ class CommittedFrames:
 
 @dataclass(frozen=True, eq=False)
 class RecedingHorizonSolver:
-    """What stays the same from window to window."""
+    """The receding horizon: what is the same for every window."""
 
-    density: Density | DensityEnsemble
-    """The prior, or several of which the window solver picks."""
+    density: AnyDensity | DensityEnsemble
+    """Density, or several of which the window solver selects one."""
     settings: HorizonSettings = field(default_factory=HorizonSettings)
-    """Lengths and budgets."""
+    """Lengths of windows."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
     fps: float = PRIOR_FPS
     """Frames per second."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
-    """How one window is solved."""
+    """Solver of one window."""
 
     def solve(
         self,
@@ -121,10 +121,10 @@ class RecedingHorizonSolver:
         progress: Callable[[int, int], None] | None = None,
         deadline: float | None = None,
     ) -> tuple[CommittedFrames, Outcome]:
-        """Extend `committed` to `frames` frames; stops early, with all that is committed, at the deadline or Ctrl-C.
+        """Extend `committed` to `frames` frames; stop early, with what is committed, at the deadline or on Ctrl-C.
 
-        `deadline` is a time.monotonic() value in seconds; the window it falls into is committed as far as it was
-        improved by then. KeyboardInterrupt goes on where nothing has been solved yet.
+        `deadline` is a time.monotonic() value in seconds; the window into which it falls is committed as far as it was
+        improved by then. KeyboardInterrupt is raised on where nothing has been solved yet.
         """
         begun = len(committed.features)
         try:
@@ -132,7 +132,9 @@ class RecedingHorizonSolver:
                 if (left := _seconds_until(deadline)) <= 0:
                     return committed, Outcome.BUDGET
                 length, count = self.settings.lay_window(done, frames)
-                following = self._solve_next(committed, terms_of(done, length), length, count, generator, left)
+                terms, began = terms_of(done, length), time.perf_counter()
+                window = self.solve_window(committed, terms, length, generator=generator, seconds=left)
+                following = self._commit(committed, window, count, time.perf_counter() - began)
                 if not following.windows[-1].evaluations and _seconds_until(deadline) <= 0:
                     return committed, Outcome.BUDGET
                 if not following.finite(count):
@@ -155,7 +157,7 @@ class RecedingHorizonSolver:
         generator: torch.Generator,
         seconds: float = math.inf,
     ) -> SolvedWindow:
-        """Solve one window of so many frames after the committed ones, and commit nothing."""
+        """Solve one window of so many frames after the committed ones; commit nothing."""
         context = WindowContext(
             self.density,
             committed.state,
@@ -167,29 +169,14 @@ class RecedingHorizonSolver:
             contacts_before=committed.contacts,
             first_frame=committed.discarded + len(committed.features),
         )
-        return self.method(context, terms, committed.warm_start, generator, seconds=seconds)
+        return self.method(WindowRequest(context, terms, committed.warm_start, generator, seconds))
 
-    def _solve_next(
-        self,
-        done: CommittedFrames,
-        terms: Sequence[Term],
-        length: int,
-        count: int,
-        generator: torch.Generator,
-        seconds: float,
-    ) -> CommittedFrames:
-        began = time.perf_counter()
-        window = self.solve_window(done, terms, length, generator=generator, seconds=seconds)
+    def _commit(self, done: CommittedFrames, window: SolvedWindow, count: int, seconds: float) -> CommittedFrames:
+        """Commit the first frames of a window that took so many seconds."""
         features = window.trial.features[0, :count]
         ground, heading = integrate_root(features, done.place)
         record = WindowRecord(
-            count,
-            time.perf_counter() - began,
-            window.evaluations,
-            window.start_energy,
-            window.energy,
-            window.stop_reason,
-            window.choice,
+            count, seconds, window.evaluations, window.start_energy, window.energy, window.stop_reason, window.choice
         )
         return CommittedFrames(
             state=self.density.advance(done.state, features.unsqueeze(0)),
@@ -205,10 +192,10 @@ class RecedingHorizonSolver:
 
 
 def replay(
-    density: Density, features: Float[Tensor, "frames size"], state: DensityState | None = None, *, since: int = 0
+    density: AnyDensity, features: Float[Tensor, "frames size"], state: DensityState | None = None, *, since: int = 0
 ) -> DensityState:
-    """The density's state after known frames: from its state before the frame `since`, or where there is none from one
-    before the first that makes them likely (Wang et al. 2019, Eq. 26).
+    """Return the density's state after observed frames, by its state before frame `since`; without one, by a state
+    before the first frame that makes the motion likely (Wang et al. 2019, Eq. 26).
     """
     return density.advance(density.infer_state(features) if state is None else state, features[None, since:])
 

@@ -1,11 +1,10 @@
-"""Where L-BFGS starts in a window: the last solution's tail, the best of random draws, or a particle swarm.
+"""Warm starts of L-BFGS in a window: the last window's noise, the best of random draws, or a particle swarm.
 
-A swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise when tried. Here it
-searches a few numbers that steer: the root's noise (sideways, forward, turn) at a handful of time knots, joined
-linearly.
+A swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise when tried. Here it searches a
+few numbers that steer: the root's noise (sideways, forward, turn) at a few knots in time, linear in between.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -13,44 +12,39 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowRequest
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.solver.budget import Meter
 from mapctl.solver.swarm import SwarmSettings, run_best_of_samples, run_swarm
-from mapctl.terms.base import Term
 
-WarmStartProposal = Callable[
-    [WindowContext, Sequence[Term], Float[Tensor, "1 unknowns"], Meter, torch.Generator], Tensor
-]
-"""(context, terms, warm start, meter, generator) to unknowns (1, unknowns)."""
+WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter], Float[Tensor, "1 unknowns"]]
+"""(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
 
 
-def keep_warm_start(
-    context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
-) -> Tensor:
-    """The warm start itself."""
+def keep_warm_start(request: WindowRequest, warm: Tensor, meter: Meter) -> Tensor:
+    """Return the warm start itself."""
     return warm
 
 
 @dataclass(frozen=True)
 class SteeringKnots:
-    """A low-dimensional space of window noise: some blocks of features at some knots in time."""
+    """A space of few dimensions in the noise of a window: some blocks of features at knots in time."""
 
     knots: int = 4
-    """Evenly spaced over the window; between them the noise is linear."""
+    """Number of knots, evenly spaced over the window; between them the noise is linear."""
     blocks: tuple[str, ...] = ("root_displacement_heading", "heading_change")
     """Feature blocks whose noise is searched."""
     spread: float = 0.7
     """Standard deviation of draws at each knot."""
 
     def size(self) -> int:
-        """How many numbers."""
+        """Return the number of dimensions."""
         return self.knots * len(self._columns())
 
     def expand(self, values: Float[Tensor, "batch size"], frames: int) -> Float[Tensor, "batch frames continuous"]:
-        """Noise of whole windows."""
-        knots = values.unflatten(-1, (self.knots, -1)).transpose(1, 2)
+        """Return the noise of whole windows at points of the space."""
+        knots = torch.unflatten(values, -1, (self.knots, -1)).transpose(1, 2)
         dense = torch.nn.functional.interpolate(knots, size=frames, mode="linear", align_corners=True)
         noise = values.new_zeros(len(values), frames, LAYOUT.continuous)
         noise[..., self._columns()] = dense.transpose(1, 2)
@@ -60,54 +54,60 @@ class SteeringKnots:
         return [i for block in self.blocks for i in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)]
 
 
+@dataclass(frozen=True, eq=False)
+class _SteeredNoise:
+    """A window's noise as points of the steering space around the warm start."""
+
+    request: WindowRequest
+    warm: Float[Tensor, "1 unknowns"]
+    space: SteeringKnots
+
+    def unknowns(self, points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
+        """Return the unknowns of whole windows."""
+        noise = self.space.expand(points.to(self.warm.dtype), self.request.context.frames)
+        return self.warm + noise.flatten(1)
+
+    def energy(self, points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
+        """Compute the total energy of each point, nats, under a plan of its own."""
+        unknowns = self.unknowns(points)
+        with torch.no_grad():
+            latents = LatentNoise.from_unknowns(self.request.context, unknowns)
+            return Objective(latents.build, self.request.terms).energy(unknowns)
+
+
 @dataclass(frozen=True)
 class BestOfSamples:
     """The best of random draws in the steering space, the warm start among them."""
 
     count: int = 32
-    """Draws."""
+    """Number of draws."""
     space: SteeringKnots = SteeringKnots()
-    """Where they are drawn."""
+    """Space in which they are drawn."""
 
-    def __call__(
-        self, context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
-    ) -> Tensor:
-        """Propose a start; see WarmStartProposal."""
-        cost, start = _steering_cost(context, terms, warm, self.space), torch.zeros(self.space.size())
+    def __call__(self, request: WindowRequest, warm: Tensor, meter: Meter) -> Tensor:
+        """Propose a start; see `WarmStartProposal`."""
+        noise, generator = _SteeredNoise(request, warm, self.space), request.generator
+        start, spread = torch.zeros(self.space.size()), self.space.spread
         found = run_best_of_samples(
-            cost, start=start, spread=self.space.spread, count=self.count, meter=meter, generator=generator
+            noise.energy, start=start, spread=spread, count=self.count, meter=meter, generator=generator
         )
-        return warm + self.space.expand(found.x.to(warm.dtype)[None], context.frames).flatten(1)
+        return noise.unknowns(found.x[None])
 
 
 @dataclass(frozen=True)
 class SwarmProposal:
-    """A particle swarm (rnn paper, section 5.2) in the steering space, started at the warm start."""
+    """A particle swarm (Wang et al. 2019, section 5.2) in the steering space, started at the warm start."""
 
     settings: SwarmSettings = field(default_factory=lambda: SwarmSettings(particles=16, iterations=6))
-    """Particles and iterations."""
+    """Number of particles and iterations."""
     space: SteeringKnots = SteeringKnots()
-    """Where they fly."""
+    """Space in which they move."""
 
-    def __call__(
-        self, context: WindowContext, terms: Sequence[Term], warm: Tensor, meter: Meter, generator: torch.Generator
-    ) -> Tensor:
-        """Propose a start; see WarmStartProposal."""
-        cost, start = _steering_cost(context, terms, warm, self.space), torch.zeros(self.space.size())
+    def __call__(self, request: WindowRequest, warm: Tensor, meter: Meter) -> Tensor:
+        """Propose a start; see `WarmStartProposal`."""
+        noise, generator = _SteeredNoise(request, warm, self.space), request.generator
+        start, spread = torch.zeros(self.space.size()), self.space.spread
         found = run_swarm(
-            cost, start=start, spread=self.space.spread, settings=self.settings, meter=meter, generator=generator
+            noise.energy, start=start, spread=spread, settings=self.settings, meter=meter, generator=generator
         )
-        return warm + self.space.expand(found.x.to(warm.dtype)[None], context.frames).flatten(1)
-
-
-def _steering_cost(
-    context: WindowContext, terms: Sequence[Term], warm: Tensor, space: SteeringKnots
-) -> Callable[[Tensor], Tensor]:
-    """Energy of many points of the steering space around the warm start; every point has its own plan."""
-
-    def cost(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
-        unknowns = warm + space.expand(points.to(warm.dtype), context.frames).flatten(1)
-        with torch.no_grad():
-            return Objective(LatentNoise.from_unknowns(context, unknowns).build, terms).energy(unknowns)
-
-    return cost
+        return noise.unknowns(found.x[None])

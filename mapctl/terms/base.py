@@ -1,4 +1,4 @@
-"""What a term is: an energy for every frame of every candidate, and what it measures in physical units."""
+"""The protocol of a term: an energy for every frame of every candidate, and a residual in a physical unit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,24 +12,25 @@ from mapctl.terms.trial import Trial
 
 @runtime_checkable
 class Term(Protocol):
-    """Sigmas in physical units are a term's only weights; energies are negative log likelihoods (nats)."""
+    """One thing that is wanted of a motion. Energies are negative log likelihoods (nats), so that sigmas in physical
+    units are the only weights; constants may be left out. Candidates are independent of each other."""
 
     @property
     def name(self) -> str:
-        """In the ledger."""
+        """Name in the ledger; different among the terms of one problem."""
         ...
 
     @property
     def unit(self) -> str:
-        """Of the residual."""
+        """Unit of the residual."""
         ...
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Compute the energies, nats; differentiable once."""
         ...
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """How far the wish is missed, in the term's unit."""
+        """Compute how far each frame is from what is wanted, in the term's unit."""
         ...
 
 

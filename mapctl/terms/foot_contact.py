@@ -1,55 +1,41 @@
-"""Planted feet stay where they are, on the ground (rnn paper, Eq. 18)."""
+"""Foot contact: planted feet do not move and are on the ground (Wang et al. 2019, Eq. 18)."""
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.skeleton import TOE_REST_HEIGHT, TOES
+from mapctl.skeleton import TOE_REST_HEIGHT
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)
 class FootContact:
-    """A toe that the prior calls planted does not travel and is at its rest height; no toe goes below it."""
+    """A toe whose contact bit is set does not travel and is at its rest height; no toe goes below it."""
 
     sigma_speed: float = 0.03
-    """Horizontal speed of a planted toe, m/s."""
+    """Standard deviation of the horizontal speed of a planted toe, m/s."""
     sigma_height: float = 0.01
-    """Height error of a planted toe, metres."""
+    """Standard deviation of the height of a planted toe about its rest height, metres."""
     sigma_below: float = 0.005
-    """Depth of any toe below its rest height, metres."""
+    """Standard deviation of the depth of any toe below its rest height, metres."""
     rest_height: float = TOE_REST_HEIGHT
-    """Height of the toe joint while the foot stands flat, metres."""
+    """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "footing"
     unit: str = "m/s"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Nats over both toes."""
-        planted = self._planted(trial)
-        energy = 0.5 * (planted * (self._speeds(trial) / self.sigma_speed).square()).sum(-1)
-        above = self._heights(trial) - self.rest_height
+        """Energies of both toes, nats."""
+        energy = 0.5 * (self._planted(trial) * (trial.toe_speeds / self.sigma_speed).square()).sum(-1)
+        above = trial.toe_heights - self.rest_height
         energy = energy + 0.5 * (trial.contacts * (above / self.sigma_height).square()).sum(-1)
         return energy + 0.5 * (above.clamp(max=0) / self.sigma_below).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Horizontal speed of the faster planted toe, m/s; 0 where none is planted."""
-        return (self._planted(trial) * self._speeds(trial)).amax(-1)
-
-    def _toes(self, trial: Trial) -> list[int]:
-        return trial.skeleton.indices(TOES)
-
-    def _speeds(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        steps = torch.stack([trial.step(toe)[..., ::2] for toe in self._toes(trial)], dim=-2)
-        return torch.sqrt(steps.square().sum(-1) + 1e-12) * trial.fps
-
-    def _heights(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        return trial.joints_world[..., self._toes(trial), 1]
+        return (self._planted(trial) * trial.toe_speeds).amax(-1)
 
     def _planted(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        """A toe is held between two frames only if it is planted in both, the one before the window among them."""
-        bits = trial.contacts
-        past = trial.contacts_before.to(bits.device).expand(len(bits), 2).unsqueeze(1)
-        before = torch.cat([past, bits[:, :-1]], dim=1)
-        return (bits & before).to(trial.features.dtype)
+        """1 where a toe is planted in a frame and in the one before it, be that before the window; else 0."""
+        planted = trial.planted
+        return (planted[:, 1:] & planted[:, :-1]).to(trial.features.dtype)

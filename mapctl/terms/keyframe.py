@@ -1,4 +1,4 @@
-"""Joints are where keys want them, in single frames or over some: hands that reach, feet that step on a mark."""
+"""Keyframes: joints at target positions in single frames or over some: hands that reach, feet that step on a mark."""
 
 from dataclasses import dataclass
 
@@ -11,26 +11,26 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """Places in the world that joints are wanted at. Whole poses that are keys need no term: they are no unknowns."""
+    """Joints are at target positions in the world. Whole poses that are given need no term: they are no unknowns."""
 
     places: Float[Tensor, "frames joints 3"]
-    """World, metres; anything finite where no place is wanted."""
+    """Target positions in the world, metres; anything finite where there is no target."""
     wanted: Bool[Tensor, "frames joints"]
-    """Whether a place is."""
+    """Whether a joint has a target in a frame."""
     sigma: float = 0.002
-    """Distance from it, metres."""
+    """Standard deviation of a joint about its target along each axis, metres."""
     name: str = "keyframe"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Nats, summed over joints."""
+        """Energies, nats, summed over joints."""
         return 0.5 * (self._squares(trial) / self.sigma**2).sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance of the joint that misses its place by most, metres; 0 where none is wanted."""
+        """Distance of the joint that is farthest from its target, metres; 0 where there is none."""
         return torch.sqrt(self._squares(trial).amax(-1))
 
     def _squares(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
         """Squared distances, m^2."""
-        away = trial.joints_world - self.places.to(trial.features)
-        return away.square().sum(-1) * self.wanted
+        error = trial.joints_world - self.places.to(trial.features)
+        return error.square().sum(-1) * self.wanted

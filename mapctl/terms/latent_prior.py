@@ -1,4 +1,4 @@
-"""The Gaussian prior of the noise (rnn paper, Eq. 16)."""
+"""The Gaussian prior of the noise (Wang et al. 2019, Eq. 16)."""
 
 from dataclasses import dataclass
 
@@ -10,15 +10,15 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True)
 class LatentPrior:
-    """Noise is small: latents of a rollout have sigma 1, noise on the network's input the paper's 0.05."""
+    """The trial's noise is normal with mean 0: latents of a rollout, input noise or pose offsets."""
 
     sigma: float = 1.0
-    """Standard deviation of each number."""
+    """Standard deviation of each number; above 1 leaves more of the noise."""
     name: str = "noise"
     unit: str = "rms"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Half the squared numbers of each frame over sigma squared."""
+        """Energies, nats: half the squared numbers of each frame over sigma squared."""
         return 0.5 * (trial.require_noise() / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:

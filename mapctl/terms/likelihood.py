@@ -1,4 +1,4 @@
-"""The prior's own density of the motion (rnn paper, Eq. 15)."""
+"""The prior's density of the motion (Wang et al. 2019, Eq. 15)."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ class Likelihood:
     """Minus the log density of each frame given those before it, divided by a temperature."""
 
     temperature: float = 1.0
-    """Above 1 the prior is trusted less."""
+    """Temperature; above 1 the prior counts less."""
     name: str = "likelihood"
     unit: str = "nats"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Nats; may be negative, since densities may pass 1."""
+        """Energies, nats; negative where the density is above 1."""
         return -trial.require_log_density() / self.temperature
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """The same, without the temperature."""
+        """Minus the log density, nats."""
         return -trial.require_log_density()

@@ -1,4 +1,4 @@
-"""Stay close to another motion: to its poses, and to how it moves over the ground rather than to where it stands."""
+"""Tracking of another motion: of its poses, and of its trajectory over the ground from the window's beginning on."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,30 +13,30 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class MotionTracking:
-    """Poses near those of a target, and a walk near its walk.
+    """The poses are near those of a target motion, and so is the trajectory.
 
-    Poses are compared as joint positions seen from the hips, facing and all; the way over the ground is compared from
-    the window's own beginning on. Where feet that slid are made to stand, the character lags behind the target a little
-    with each step: it may, since no place in the world was asked for.
+    Poses are compared as joint positions relative to the hips' position and heading; trajectories from the window's
+    first frame on, not in the world: where sliding feet are made to stand, the character falls a little behind the
+    target with each step, which costs nothing in later windows.
     """
 
     target: Float[Tensor, "frames size"]
     """Features of the window's frames, physical units."""
     sigma_pose: float = 0.03
-    """Distance of a joint from the target's, seen from the hips, metres."""
+    """Standard deviation of a joint about the target's, relative to the hips, metres."""
     sigma_height: float = 0.03
-    """Of the hips, metres."""
+    """Standard deviation of the height of the hips, metres."""
     sigma_trajectory: float = 0.15
-    """Of the hips over the ground, from the window's beginning on, metres."""
+    """Standard deviation of the position of the hips over the ground since the window's beginning, metres."""
     sigma_heading: float = 0.15
-    """Of the heading, from the window's beginning on, radians."""
+    """Standard deviation of the heading since the window's beginning, radians."""
     effective_joints: float = 6.0
-    """Independent joints that a body is worth: neighbours move together, so a body of 21 is not 21 observations."""
+    """Number of independent joints that a body is worth: neighbours move together, so 21 are not 21 observations."""
     name: str = "closeness"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Nats."""
+        """Energies, nats."""
         height = LAYOUT.pick(trial.features - self.target.to(trial.features), "root_height")[..., 0]
         ground, turn = self._trajectory_error(trial)
         return 0.5 * (
@@ -47,7 +47,7 @@ class MotionTracking:
         )
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Root mean square distance of the joints from the target's, seen from the hips, metres."""
+        """Root mean square distance of the joints from the target's, relative to the hips, metres."""
         return self._pose(trial).mean(-1).sqrt()
 
     def _pose(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
@@ -56,9 +56,8 @@ class MotionTracking:
         return (own - self._target_from_hips(trial).to(own)).square().sum(-1)
 
     def _trajectory_error(self, trial: Trial) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-        """Where the hips are (metres) and how far they turned (radians), less the target's, from one common place."""
-        place = trial.start
-        ground, heading = integrate_root(self.target.to(trial.features), place)
+        """Ground position (metres) and heading (radians) of the hips less the target's, from one ground pose."""
+        ground, heading = integrate_root(self.target.to(trial.features), trial.start)
         return trial.root_xz_world - ground, trial.heading - heading
 
     def _target_from_hips(self, trial: Trial) -> Float[Tensor, "1 frames joints 3"]:
@@ -70,7 +69,7 @@ class MotionTracking:
 
     @cached_property
     def _target_cache(self) -> dict[int, Tensor]:
-        """By skeleton; terms are asked many times about one window."""
+        """The target's joint positions by skeleton: a term is evaluated many times in one window."""
         return {}
 
 

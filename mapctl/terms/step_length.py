@@ -1,7 +1,6 @@
-"""Step length: how far ahead of the other foot a foot comes down (the rnn paper's step-size knob, section 5.3)."""
+"""Step length: the distance of a foot that comes down from the other one (Wang et al. 2019, section 5.3)."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -10,57 +9,52 @@ from torch import Tensor
 from mapctl.skeleton import TOES
 from mapctl.terms.trial import Trial
 
-TouchDown = tuple[int, int, int, int]
+_NEVER = -2  # below every frame
 
 
 @dataclass(frozen=True)
 class StepLength:
-    """Where a toe touches down, it is a wanted distance from where the other one last stood.
+    """A toe that touches down is at a target distance from where the other one was last planted.
 
-    Touch-downs are the prior's own contact bits, as in footing; one whose partner last stood before the window is
-    measured only if that was in the frame just before it.
+    Touch-downs are those of the prior's contact bits, as in foot contact. One after which the other toe was last
+    planted before the window counts only if that was in the frame just before it.
     """
 
     length: float
-    """Wanted, over the ground, metres."""
+    """Target distance over the ground, metres."""
     sigma: float = 0.012
-    """Of a step's length, metres: narrow, since only a few frames of a window are touch-downs."""
+    """Standard deviation of a step's length, metres: small, since few frames of a window are touch-downs."""
     name: str = "steps"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Nats, in the frames of touch-downs."""
-        return 0.5 * (self._missed(trial) / self.sigma).square()
+        """Energies in the frames of touch-downs, nats; 0 in all others."""
+        return 0.5 * (self._length_error(trial) / self.sigma).square()
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """By how much the steps are too long or too short, metres; 0 between touch-downs."""
-        return self._missed(trial).abs()
+        """Error of the step length, metres; 0 between touch-downs."""
+        return self._length_error(trial).abs()
 
-    def _missed(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        missed = torch.zeros_like(trial.features[..., 0])
-        if not (touches := _find_touch_downs(trial)):
-            return missed
+    def _length_error(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        errors = torch.zeros_like(trial.features[..., 0])
         toes = trial.joints_world[..., trial.skeleton.indices(TOES), ::2]
         if len(trial.before):
             feet = trial.before[-1, trial.skeleton.indices(TOES), ::2].to(toes.dtype)
             toes = torch.cat([feet.expand(len(toes), 1, 2, 2), toes], dim=1)
         shift = int(len(trial.before) > 0)
-        clip, frame, foot, stood = torch.tensor(touches).T
-        apart = toes[clip, frame + shift, foot] - toes[clip, stood + shift, 1 - foot]
+        row, frame, foot, last = _find_touch_downs(trial)
+        apart = toes[row, frame + shift, foot] - toes[row, last + shift, 1 - foot]
         lengths = torch.sqrt(apart.square().sum(-1) + 1e-12)
-        return missed.index_put((clip, frame), lengths - self.length, accumulate=True)
+        return errors.index_put((row, frame), lengths - self.length, accumulate=True)
 
 
-def _find_touch_downs(trial: Trial) -> list[TouchDown]:
-    """Clip, frame and foot of each touch-down, and the frame in which the other foot last stood; -1 is before."""
-    bits = trial.contacts
-    past = trial.contacts_before.to(bits.device).expand(len(bits), 2).unsqueeze(1)
-    table = torch.cat([past, bits], dim=1).tolist()
-    found = []
-    for clip, rows in enumerate(table):
-        last = [-1 if rows[0][foot] and len(trial.before) else None for foot in (0, 1)]
-        for frame, (before, now) in enumerate(pairwise(rows)):
-            last = [frame if now[foot] else last[foot] for foot in (0, 1)]
-            touching = [foot for foot in (0, 1) if now[foot] and not before[foot]]
-            found += [(clip, frame, foot, stood) for foot in touching if (stood := last[1 - foot]) is not None]
-    return found
+def _find_touch_downs(trial: Trial) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Batch row, frame and foot of each touch-down, and the frame in which the other foot was last planted; -1 is the
+    frame before the window."""
+    planted = trial.planted
+    known = planted.clone()
+    known[:, 0] &= len(trial.before) > 0  # else nobody knows where that was
+    frames = torch.arange(-1, planted.shape[1] - 1)[:, None]
+    last = torch.where(known, frames, _NEVER).cummax(dim=1).values[:, 1:].flip(-1)
+    row, frame, foot = (planted[:, 1:] & ~planted[:, :-1] & (last > _NEVER)).nonzero().unbind(-1)
+    return row, frame, foot, last[row, frame, foot]

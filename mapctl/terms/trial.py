@@ -1,4 +1,4 @@
-"""One candidate motion as the terms see it: built once per evaluation, world poses computed at most once."""
+"""Candidate motions as terms see them: built once per evaluation, world poses computed at most once."""
 
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
@@ -11,7 +11,7 @@ from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.kinematics import fast
 from mapctl.pose import BodyPose
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, TOES, Skeleton
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,8 @@ class Trial:
     contacts: Bool[Tensor, "batch frames 2"]
     """Left and right toe planted, by the prior's own bits; fixed during a solve."""
     noise: Float[Tensor, "batch frames width"] | None = None
-    """The unknowns that have a standard normal prior: latents of a rollout, noise on the network's input, or whitened
-    pose offsets; None for a motion that was made in no such way."""
+    """Unknowns with a standard normal prior: latents of a rollout, noise on the network's input, or whitened pose
+    offsets; None for a motion that has none."""
     log_density: Float[Tensor, "batch frames"] | None = None
     """Nats of each frame given those before it, under the prior; None where no density scored the motion."""
     before: Float[Tensor, "past joints 3"] = field(default_factory=lambda: torch.zeros(0, CANONICAL.num_joints, 3))
@@ -43,7 +43,7 @@ class Trial:
 
     @staticmethod
     def of_features(features: Float[Tensor, "batch frames size"], *, skeleton: Skeleton = CANONICAL) -> "Trial":
-        """A motion that no prior made, from the origin on, with the contacts that its features tell."""
+        """A motion from the origin on, with the contacts of its features and without noise or density."""
         origin = GroundPose(features.new_zeros(len(features), 2), features.new_zeros(len(features)))
         before = features.new_zeros(0, skeleton.num_joints, 3)
         bits = LAYOUT.pick(features, "contacts") > 0.5
@@ -57,7 +57,7 @@ class Trial:
     def require_noise(self) -> Float[Tensor, "batch frames width"]:
         """The noise; MapctlError where there is none."""
         if self.noise is None:
-            raise MapctlError("this motion was made without noise that has a prior")
+            raise MapctlError("this motion has no noise with a prior")
         return self.noise
 
     def require_log_density(self) -> Float[Tensor, "batch frames"]:
@@ -72,8 +72,8 @@ class Trial:
 
     @cached_property
     def _root(self) -> tuple[Tensor, Tensor]:
-        places = fast.integrate_root_fast if self._use_kernels else integrate_root
-        return places(self.features, self.start)
+        integrate = fast.integrate_root_fast if self._use_kernels else integrate_root
+        return integrate(self.features, self.start)
 
     @property
     def root_xz_world(self) -> Float[Tensor, "batch frames 2"]:
@@ -82,7 +82,7 @@ class Trial:
 
     @property
     def heading(self) -> Float[Tensor, "batch frames"]:
-        """Facing angle about +Y, radians, not wrapped."""
+        """Heading of the hips, radians about +Y, not wrapped."""
         return self._root[1]
 
     @property
@@ -104,8 +104,25 @@ class Trial:
         """World positions of one joint, metres."""
         return self.joints_world[..., self.skeleton.index(name), :]
 
+    @property
+    def planted(self) -> Bool[Tensor, "batch steps 2"]:
+        """Left and right toe planted in the frame before the window and in each of its frames."""
+        past = self.contacts_before.to(self.contacts.device).expand(len(self.contacts), 2).unsqueeze(1)
+        return torch.cat([past, self.contacts], dim=1)
+
     def step(self, joint: int) -> Float[Tensor, "batch frames 3"]:
         """Displacement of a joint since the frame before, metres; the first frame's needs a past, or is 0."""
-        places = self.joints_world[..., joint, :]
-        past = self.before[-1:, joint].to(places.dtype) if len(self.before) else places[:, :1].detach()
-        return torch.diff(places, dim=-2, prepend=past.expand(len(places), 1, 3))
+        positions = self.joints_world[..., joint, :]
+        past = self.before[-1:, joint].to(positions.dtype) if len(self.before) else positions[:, :1].detach()
+        return torch.diff(positions, dim=-2, prepend=past.expand(len(positions), 1, 3))
+
+    @property
+    def toe_speeds(self) -> Float[Tensor, "batch frames 2"]:
+        """Speed of the left and the right toe over the ground since the frame before, m/s; its gradient exists at 0."""
+        steps = torch.stack([self.step(toe)[..., ::2] for toe in self.skeleton.indices(TOES)], dim=-2)
+        return torch.sqrt(steps.square().sum(-1) + 1e-12) * self.fps
+
+    @property
+    def toe_heights(self) -> Float[Tensor, "batch frames 2"]:
+        """Height of the left and the right toe joint in the world, metres."""
+        return self.joints_world[..., self.skeleton.indices(TOES), 1]

@@ -20,18 +20,18 @@ from priors.lstm_gmm.state_inference import infer_lstm_state
 
 @dataclass(frozen=True, eq=False)
 class LstmGmmDensity(Density[LstmState]):
-    """The network as a density that rolls out on the fast path unless told otherwise."""
+    """The network as a density; rollouts take the fast path unless `use_fast` is off."""
 
     name: str
     """Name, file or run folder by which it was asked for."""
     reference: LstmGmm
-    """The torch network: the specification, and the only path on a GPU."""
+    """The torch network: specification of the fast path, and the only path on a GPU."""
     initial_states: InitialStates[LstmState]
-    """Moments of mocap to begin from."""
+    """States after moments of mocap, to begin from."""
     limits: DataLimits
     """Speeds and turning that the training data show."""
     card: checkpoints.Card
-    """What the weights are."""
+    """Card of the weights: configuration, data, licence, quality."""
     use_fast: bool = True
     """Whether rollouts and samples take the hand-written kernels."""
 
@@ -49,22 +49,22 @@ class LstmGmmDensity(Density[LstmState]):
         _ = self._rollout_engine
 
     def without_kernels(self) -> "LstmGmmDensity":
-        """The same density on the torch reference, to compare the fast path with."""
+        """Return the density on the torch reference, to compare the fast path with."""
         return replace(self, use_fast=False)
 
     @property
     def feature_mean(self) -> Float[Tensor, " size"]:
-        """Mean of the training data."""
+        """Mean of the training data, physical units."""
         return self.reference.mean
 
     @property
     def feature_std(self) -> Float[Tensor, " size"]:
-        """Spread of the training data."""
+        """Standard deviation of the training data, physical units."""
         return self.reference.std
 
     @property
     def labels(self) -> dict[str, list[str]]:
-        """What it can be told, by group (gait, style)."""
+        """Values by group (gait, style) that it can be conditioned on."""
         found: dict[str, list[str]] = {}
         for name in self.reference.config.labels:
             group, _, value = name.partition("=")
@@ -72,8 +72,8 @@ class LstmGmmDensity(Density[LstmState]):
         return found
 
     def conditioned_on(self, labels: Sequence[str]) -> "LstmGmmDensity":
-        """The same density given labels of its data for good (`run`, `active`, `style=active`), with initial states to
-        match. RequestError for labels that it does not know.
+        """Return the density given labels of its data (`run`, `active`, `style=active`), with initial states to match.
+        RequestError for labels that it does not know.
         """
         full, starts = [self._label(name) for name in labels], self.initial_states
         known = clip_labels.read(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
@@ -89,42 +89,41 @@ class LstmGmmDensity(Density[LstmState]):
         return replace(self, reference=self.reference.conditioned_on(full), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
-        """The same density given what its data say of the clip that a start was taken from, so that it goes on so."""
+        """Return the density given the labels of the clip that an initial state was taken from: its gait goes on."""
         held = clip_labels.read(self.initial_states.names, self.card.data.get("labels", ""))
         names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
         known = [name for name in names if name in self.reference.config.labels]
         return replace(self, reference=self.reference.conditioned_on(known))
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
-        """The same density, scoring motion that was seen with errors of this sigma (physical units); see LstmGmm."""
+        """Return the density of motion observed with errors of this sigma (physical units); see `LstmGmm`."""
         return replace(self, reference=self.reference.with_observation_noise(sigma))
 
     @property
     def reference_log_density(self) -> float:
         """Log density a frame (physical units, see mapctl.problem.density_selection) that 98 % of the windows of its
-        own held-out data reach when blurred by `proposal_sigma()`; minus infinity where the card does not say.
+        own held-out data reach, observed with errors of `proposal_sigma()`; minus infinity where the card has none.
         """
         return float(self.card.quality.get("windows", {}).get("p2", -math.inf))
 
     def _label(self, name: str) -> str:
-        """The whole label that a name, or its part after the `=`, stands for."""
+        """Find the label `group=value` of a name, which may be the value alone; RequestError if there is none."""
         known = self.reference.config.labels
         for label in known:
             if name in (label, label.split("=", 1)[-1]):
                 return label
-        group, told, value = name.partition("=")
-        if not told or group not in self.labels:
+        group, equals, value = name.partition("=")
+        if not equals or group not in self.labels:
             group, value = " or ".join(self.labels) or "label", name
         values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items()) or "none"
         raise RequestError(f"the prior {self.name!r} knows no {group} {value!r}, only {values}")
 
     def start_after(self, last_frame: Float[Tensor, "batch size"]) -> LstmState:
-        """A state with empty memory after one frame."""
+        """Return a state with empty memory after one frame."""
         return self.reference.start_after(last_frame)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
-        """The state, before them, that makes a motion's first frames likely (Eq. 26); see
-        priors.lstm_gmm.state_inference."""
+        """Find the state before a motion that makes its first frames likely (Wang et al. 2019, Eq. 26)."""
         return infer_lstm_state(self.reference, self.initial_states.state, features)
 
     def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
@@ -155,7 +154,7 @@ class LstmGmmDensity(Density[LstmState]):
 
 
 def load(name: str) -> LstmGmmDensity:
-    """A bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
+    """Load a bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "lstm-gmm", called="density") as (tensors, card):
         starts = InitialStates(
             LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),

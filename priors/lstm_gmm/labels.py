@@ -1,4 +1,4 @@
-"""Labels of clips, read from their names: what a density can be told of a motion (gait, style)."""
+"""Labels of clips (gait, style), read from their names: what a density can be conditioned on."""
 
 import re
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ class Labels:
     """Which labels hold for which clip."""
 
     names: tuple[str, ...]
-    """`group=value`, sorted: gait=run, style=active."""
+    """Labels as `group=value`, sorted: gait=run, style=active."""
     held: Float[Tensor, "clips labels"]
     """1 where a label holds."""
 
     @staticmethod
     def none(clips: int) -> "Labels":
-        """No labels."""
+        """Return no labels, for so many clips."""
         return Labels((), torch.zeros(clips, 0))
 
     @property
@@ -35,12 +35,12 @@ class Labels:
 
     @property
     def mirrored(self) -> list[int]:
-        """Index of each label's mirror image: left and right change places where both are known."""
+        """Index of each label's mirror image: left and right are swapped where both are known."""
         swapped = [re.sub("left|right", lambda side: _OTHER_SIDE[side[0]], name) for name in self.names]
         return [self.names.index(other) if other in self.names else i for i, other in enumerate(swapped)]
 
     def renamed(self, names: tuple[str, ...]) -> "Labels":
-        """The same clips under other labels: those that both know."""
+        """Return the clips under other labels; a label that only one of both knows holds for none."""
         held = torch.zeros(len(self.held), len(names))
         for column, name in enumerate(names):
             if name in self.names:
@@ -49,7 +49,7 @@ class Labels:
 
 
 def read(clips: Sequence[str], pattern: str) -> Labels:
-    """From each clip's name by the named groups of a regular expression; an empty pattern reads none.
+    """Read labels from clips' names by the named groups of a regular expression; an empty pattern reads none.
 
     RequestError where it is no regular expression, has no named group or matches no clip.
     """

@@ -1,11 +1,11 @@
-"""LSTM with a mixture of Gaussians over the next frame: the density of the rnn paper (section 4.1, figure 3).
+"""LSTM with a mixture of Gaussians over the next frame: the density of Wang et al. 2019 (section 4.1, figure 3).
 
 FC, FC, LSTM, LSTM, FC, then five Gaussians (Eq. 6-8) and two Bernoulli contact bits (section 4.3). By default it
 departs from the paper in three ways, each measured (docs/results.md): the network predicts a change added to a slightly
 shrunken copy of the current frame, which learns faster and stays bounded in free run; each component's Gaussian is
-correlated, by a unit triangular factor of its own, since what the hips do the legs must undo if the foot is to stand;
-and the network is told how noisy its input is, so that with clean input it need not spread its predictions as if it
-were not. It can also be told labels of the data (gait, style), or none.
+correlated, by a unit triangular factor of its own, since a planted foot needs legs that compensate the hips; and the
+level of the noise on the input is an input too, so that predictions from clean input are not as wide as from noisy
+input. It can also be conditioned on labels of the data (gait, style).
 """
 
 import copy
@@ -23,7 +23,7 @@ from mapctl.protocols import DensityState, DiscreteChoices
 from priors.config import NetworkConfig, require_at_least
 
 NOISE_UNIT = 0.1
-"""Level of input noise (normalised units) that the network is told as 1."""
+"""Level of input noise (normalised units) that is 1 in the network's condition."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class LstmGmmConfig(NetworkConfig):
     min_log_sigma: float = -4.6
     """Floor of the predicted log standard deviations (normalised units)."""
     max_log_sigma: float = 1.0
-    """Their ceiling."""
+    """Ceiling of the predicted log standard deviations (normalised units)."""
     correlated: bool = True
-    """Each component has a triangular factor that correlates its values; the paper's Gaussians are diagonal."""
+    """Whether each component has a triangular factor that correlates its values; the paper's Gaussians are diagonal."""
     knows_noise: bool = True
-    """The network is told the level of the noise on its input."""
+    """Whether the level of the noise on the input is an input of the network."""
     labels: tuple[str, ...] = ()
-    """What else it can be told of a motion, each yes or no: `gait=run`, `style=active`."""
+    """Labels on which it can be conditioned, each yes or no: `gait=run`, `style=active`."""
 
     def __post_init__(self):
         require_at_least(self, 1, "width", "components")
@@ -55,7 +55,7 @@ class LstmGmmConfig(NetworkConfig):
 
 @dataclass(frozen=True, eq=False)
 class LstmState(DensityState):
-    """What the density has seen: the last frame and the memory of both LSTM layers."""
+    """Memory of the density: the last frame and the state of both LSTM layers."""
 
     last_frame: Float[Tensor, "batch size"]
     """Last committed frame, physical units."""
@@ -128,8 +128,8 @@ class LstmGmm(nn.Module):
         self.fc1, self.fc2 = nn.Linear(layout.size, width), nn.Linear(width, width)
         self.lstm = nn.LSTM(width, width, num_layers=2, batch_first=True)
         self.fc3, self.out = nn.Linear(width, width), nn.Linear(width, outputs)
-        told = int(config.knows_noise) + len(config.labels)
-        self.condition = nn.Linear(told, width, bias=False) if told else None
+        conditions = int(config.knows_noise) + len(config.labels)
+        self.condition = nn.Linear(conditions, width, bias=False) if conditions else None
         square = (config.components, layout.continuous, layout.continuous)
         self.correlation = nn.Parameter(torch.zeros(square)) if config.correlated else None
 
@@ -149,7 +149,7 @@ class LstmGmm(nn.Module):
         return torch.linalg.solve_triangular(whitening, unit, upper=False, unitriangular=True)
 
     def conditioned_on(self, labels: Iterable[str]) -> "LstmGmm":
-        """A copy given these labels for good; its inputs are taken to be clean.
+        """Return a copy conditioned on these labels; its inputs are taken to be clean.
 
         RequestError for a label that the network does not know.
         """
@@ -167,10 +167,10 @@ class LstmGmm(nn.Module):
         return model
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmm":
-        """A copy whose `log_prob` is of motion seen with independent errors of this sigma (physical units).
+        """Return a copy whose `log_prob` is of motion observed with independent errors of this sigma (physical units).
 
-        Sharp densities say nothing of how wrong a motion is that is off by more than they allow. What the errors add
-        to the correlated values is taken to be independent as well, which keeps the density a density.
+        A sharp density hardly grades motions that are off by more than it allows. What the errors add to the correlated
+        values is taken to be independent as well, so that the result is still a density.
         """
         model, size = copy.deepcopy(self), self.layout.continuous
         variance = (sigma.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
@@ -193,12 +193,12 @@ class LstmGmm(nn.Module):
         inputs: Float[Tensor, "batch frames size"],
         memory: tuple[Tensor, Tensor],
         *,
-        condition: Float[Tensor, "batch told"] | None = None,
+        condition: Float[Tensor, "batch conditions"] | None = None,
     ) -> tuple[Mixture, tuple[Tensor, Tensor]]:
         """Mixtures of the frames after each input; inputs normalised, `memory` is (h, C) of both layers.
 
-        `condition` is what is known of each window: the level of its noise, in units of NOISE_UNIT, then 1 for each
-        label that holds. Zeros, the same as none, say: clean, and nothing known.
+        `condition` is by window the level of its noise, in units of NOISE_UNIT, then 1 for each label that holds.
+        Zeros, the same as None, are clean input and no label.
         """
         x = self.fc1(inputs)
         if condition is not None and self.condition is not None:
@@ -225,17 +225,17 @@ class LstmGmm(nn.Module):
         *,
         inputs: Float[Tensor, "batch frames size"] | None = None,
     ) -> Float[Tensor, "batch frames"]:
-        """Log density (nats, normalised units) of each frame given those before it (Eq. 5-8).
+        """Compute the log density (nats, normalised units) of each frame given those before it (Eq. 5-8).
 
-        `inputs` is what the network sees of the frames where that differs from them: the noisy inputs of Eq. 15.
+        `inputs` are the frames as the network takes them in, where they differ: the noisy inputs of Eq. 15.
         """
-        seen = features if inputs is None else inputs
-        before = torch.cat([state.last_frame.unsqueeze(1), seen[:, :-1]], dim=1)
+        given = features if inputs is None else inputs
+        before = torch.cat([state.last_frame.unsqueeze(1), given[:, :-1]], dim=1)
         mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
         return mixture.log_prob(self._target(features), self.whitening, self.blur)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
-        """The state after the committed frames were seen."""
+        """Return the state after the committed frames, without gradient."""
         before = torch.cat([state.last_frame.unsqueeze(1), committed[:, :-1]], dim=1)
         with torch.no_grad():
             _, (hidden, cell) = self(self.normalise(before), (state.hidden, state.cell))
@@ -244,7 +244,7 @@ class LstmGmm(nn.Module):
     def sample(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Frames drawn one after the other (section 4.1.4); temperature scales the Gaussians' spread."""
+        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas."""
         with torch.no_grad():
             return self.draw(state, frames, generator, temperature=temperature)
 
@@ -259,8 +259,8 @@ class LstmGmm(nn.Module):
             weights = mixture.log_weight.detach().exp().cpu()
             component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
             noise = temperature * torch.randn(len(weights), self.layout.continuous, generator=generator).to(device)
-            odds = torch.sigmoid(mixture.contact_logit.detach())
-            bits = torch.rand(odds.shape, generator=generator).to(device) < odds
+            planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
+            bits = torch.rand(planted.shape, generator=generator).to(device) < planted
             frame, _ = self._compose(mixture, component, noise, bits, mixing)
             state = LstmState(frame, state.hidden, state.cell)
             drawn.append(frame)

@@ -10,7 +10,7 @@ from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_fe
 from mapctl.contacts import remove_short_runs
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.problem.context import WindowContext
+from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.window_solvers import GuidedNoiseSolver
 from mapctl.terms import FootContact, MotionTracking
@@ -93,9 +93,9 @@ def test_a_guide_that_is_all_that_is_wished_comes_back():
     state = DENSITY.start_after(clip(13)[:1])
     context = WindowContext(DENSITY, state, GroundPose.origin(), torch.zeros(0, 21, 3), 12)
     exact = GuidedNoiseSolver(guide, share=1.0)
-    tail = torch.zeros(0, LAYOUT.continuous)
-    solved = exact(context, [MotionTracking(guide)], tail, generator())
+    request = WindowRequest(context, [MotionTracking(guide)], torch.zeros(0, LAYOUT.continuous), generator())
+    solved = exact(request)
     assert float((solved.trial.features[0] - guide).abs().max()) < 1e-3
     assert torch.equal(solved.trial.contacts[0], guide[:, -2:] > 0.5)
-    pulled = GuidedNoiseSolver(guide, share=0.5)(context, [MotionTracking(guide), FootContact()], tail, generator())
+    pulled = GuidedNoiseSolver(guide, share=0.5)(replace(request, terms=[MotionTracking(guide), FootContact()]))
     assert pulled.energy < pulled.start_energy

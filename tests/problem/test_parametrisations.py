@@ -136,19 +136,25 @@ def offsets():
     return PoseOffsets(CONTEXT, pose, bits, torch.full(pose.pack().shape, 0.03, dtype=torch.float64))
 
 
-PARAMETRISATIONS = {
-    "latent noise": LatentNoise.from_unknowns(CONTEXT, noise(1, FRAMES, dtype=torch.float64).flatten(1)),
-    "feature states": states()[1],
-    "pose offsets": offsets(),
-}
+def parametrisations():
+    """Each kind by its name, with unknowns of the stretch of the walk."""
+    zero = torch.zeros(1, FRAMES * SIZE, dtype=torch.float64)
+    features, variables = states()
+    return {
+        "latent noise": (LatentNoise.from_unknowns(CONTEXT, zero), zero),
+        "feature states": (variables, variables.from_features(features)),
+        "pose offsets": (offsets(), torch.zeros(1, offsets().sigma.numel(), dtype=torch.float64)),
+    }
+
+
+PARAMETRISATIONS = parametrisations()
 
 
 @pytest.mark.parametrize("name", PARAMETRISATIONS)
 def test_every_parametrisation_keeps_its_contract(name):
-    """Of any kind: a start, trials of candidates that are independent, and what the next window starts from."""
-    unknowns = PARAMETRISATIONS[name]
+    """Trials of candidates that are independent, their gradient, and what the next window starts from."""
+    unknowns, begin = PARAMETRISATIONS[name]
     assert isinstance(unknowns, Parametrisation)
-    begin = unknowns.initial(torch.zeros(0, LAYOUT.size, dtype=torch.float64)[:, : begin_width(unknowns)]).double()
     points = begin + 0.3 * torch.randn(3, begin.shape[1], generator=generator(4), dtype=torch.float64)
     trial = unknowns.build(points)
     assert trial.features.shape == (3, FRAMES, LAYOUT.size)
@@ -161,11 +167,6 @@ def test_every_parametrisation_keeps_its_contract(name):
     direction = torch.randn(points.shape, generator=generator(5), dtype=torch.float64)
     wanted = finite_difference(lambda at: energy(at).sum(), points, direction)
     assert slope(lambda at: energy(at).sum(), points, direction) == pytest.approx(wanted, rel=1e-4)
-
-
-def begin_width(unknowns):
-    """Numbers a frame of what the last window hands on."""
-    return LAYOUT.size if isinstance(unknowns, FeatureStates) else LAYOUT.continuous
 
 
 def test_pose_offsets_move_the_proposal_by_so_many_sigmas():

@@ -7,7 +7,7 @@ from typing import ClassVar
 import pytest
 import torch
 from helpers import corpus, generator, tiny_density
-from tiny_horizon import ARCS, BEGUN, CURVE, DENSITY, METHOD, SHORT, context, solver, terms_of
+from tiny_horizon import ARCS, BEGUN, CURVE, DENSITY, METHOD, SHORT, context, request, solver, terms_of
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, integrate_root
@@ -44,7 +44,7 @@ METHODS = {
 def test_a_window_ends_lower_than_it_began_within_its_budget(name):
     terms = (*terms_of(1, SHORT.frames), Likelihood())
     begun = BEGUN
-    solved = METHODS[name](context(begun), terms, begun.warm_start, generator())
+    solved = METHODS[name](request(begun, terms))
     assert solved.energy < solved.start_energy
     assert solved.evaluations <= 12
     assert sum(float(e.energy.sum()) for e in solved.ledger.entries) == pytest.approx(solved.energy, rel=1e-4)
@@ -72,9 +72,7 @@ def test_windows_join_without_a_seam(method):
 def test_the_next_window_starts_from_the_last_ones_tail():
     done, _ = solve(7)
     assert done.warm_start.shape == (4, LAYOUT.continuous)
-    spent = LatentNoiseSolver(rounds=1, budget=Budget(evaluations=0))(
-        context(done), terms_of(7, 10), done.warm_start, generator()
-    )
+    spent = LatentNoiseSolver(rounds=1, budget=Budget(evaluations=0))(request(done, terms_of(7, 10)))
     torch.testing.assert_close(spent.warm_start[:4], done.warm_start)
     assert float(spent.warm_start[4:].abs().max()) == 0
 
@@ -208,7 +206,7 @@ def test_the_warm_start_is_among_the_candidates():
     plain = Objective(LatentNoise.from_unknowns(context(begun), zero).build, terms).energy(zero)
     for name in ("best of", "swarm"):
         method = replace(METHODS[name], rounds=1, budget=Budget(evaluations=100))
-        solved = method(context(begun), terms, begun.warm_start, generator())
+        solved = method(request(begun, terms))
         assert solved.start_energy <= float(plain) + 1e-3
 
 

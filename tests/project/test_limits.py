@@ -111,10 +111,35 @@ def models_of_any_type() -> Iterable[str]:
 def advances_elsewhere() -> Iterable[str]:
     """A model's state moves on in one place of a solve."""
     return [
-        place
-        for place, node in nodes(ast.Attribute)
-        if isinstance(node, ast.Attribute) and node.attr == "advance" and not place.startswith(MAY_ADVANCE)
+        f"{file}:{line}"
+        for file in PACKAGE_FILES
+        if not str(file).startswith(MAY_ADVANCE)
+        for line in advances(tree_of(file))
     ]
+
+
+def advances(tree: ast.Module) -> list[int]:
+    """Lines that move a model's state on.
+
+    Two kinds do not: a method `advance` that hands the call on (whoever called it is counted), and a model that calls
+    its own in `sample`, as the protocol's default does: drawing frames returns the state after them, no solve is going
+    on, and the caller's state stays as it was.
+    """
+    parts = {node: name for name in ("advance", "sample") for node in inside(tree, name)}
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and node.attr == "advance"
+        if parts.get(node) != "advance" and not (parts.get(node) == "sample" and ast.unparse(node.value) == "self")
+    ]
+
+
+def inside(tree: ast.Module, name: str) -> Iterator[ast.AST]:
+    """Everything in methods of this name."""
+    for kind in ast.walk(tree):
+        for method in kind.body if isinstance(kind, ast.ClassDef) else ():
+            if isinstance(method, FUNCTIONS) and method.name == name:
+                yield from ast.walk(method)
 
 
 def shortest_arcs_of_their_own() -> Iterable[str]:
@@ -142,10 +167,10 @@ CEILINGS = {
     crowded_folders: 0,
     late_imports: 9,
     modules_in_cycles: 0,
-    docstrings_that_begin_with_of: 49,
+    docstrings_that_begin_with_of: 36,
     docstrings_that_cite_what_is_not_here: 0,
     models_of_any_type: 0,
-    advances_elsewhere: 2,
+    advances_elsewhere: 0,
     shortest_arcs_of_their_own: 0,
     terms_without_a_controller: 0,
     lines_out_of_format: 0,
@@ -169,3 +194,19 @@ def test_late_and_typing_imports_make_a_cycle_too():
     assert imported_modules(Path("mapctl/formats/bvh.py"), late, known) == {"mapctl.motion", "mapctl.formats"}
     module = ast.parse("from mapctl.formats import bvh")
     assert imported_modules(Path("mapctl/motion.py"), module, known) == {"mapctl.formats.bvh"}
+
+
+@pytest.mark.parametrize(
+    ("source", "lines"),
+    [
+        ("def solve(prior, state): return prior.advance(state, 0)", [1]),
+        ("def advance(prior, state): return prior.advance(state, 0)", [1]),
+        ("class Solver:\n  def solve(self): self.density.advance(0, 0)", [2]),
+        ("class Solver:\n  def solve(self): self.advance(0, 0)", [2]),
+        ("class Prior:\n  def sample(self): self.advance(0, 0)", []),
+        ("class Solver:\n  def sample(self): self.density.advance(0, 0)", [2]),
+        ("class Prior:\n  def advance(self): return self.density.advance(0, 0)", []),
+    ],
+)
+def test_what_moves_a_state_on_is_seen_and_what_hands_it_on_is_not(source, lines):
+    assert advances(ast.parse(source)) == lines

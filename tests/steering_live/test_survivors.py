@@ -7,7 +7,7 @@ import pytest
 import torch
 from catalogue import trial
 from helpers import generator
-from tiny_horizon import BEGUN, METHOD, SHORT, context, solver, terms_of
+from tiny_horizon import BEGUN, METHOD, SHORT, request, solver, terms_of
 from tiny_steering import AHEAD, QUICK, begun
 
 from controllers.steering import loop, steer
@@ -34,9 +34,9 @@ def test_a_toe_below_the_ground_costs_whether_it_is_planted_or_not(planted):
 def test_each_window_is_given_what_the_last_found_for_the_same_frames(frames):
     given, found = [], []
 
-    def method(context, terms, tail, generator, *, seconds=math.inf):
-        solved = METHOD(context, terms, tail, generator, seconds=seconds)
-        given.append(tail)
+    def method(request):
+        solved = METHOD(request)
+        given.append(request.warm_start)
         found.append(solved.warm_start)
         return solved
 
@@ -51,7 +51,7 @@ def test_each_window_is_given_what_the_last_found_for_the_same_frames(frames):
 def test_a_warm_start_begins_at_the_first_frame_of_the_window(monkeypatch):
     started = []
 
-    def proposal(context, terms, warm, meter, generator):
+    def proposal(request, warm, meter):
         started.append(warm.unflatten(-1, (SHORT.frames, -1))[0])
         return warm
 
@@ -108,9 +108,9 @@ def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypat
     budgets = []
     solve = LatentNoiseSolver.__call__
 
-    def watched(self, context, terms, tail, generator, *, seconds=math.inf):
-        budgets.append((self.budget.within(seconds).seconds, {term.name for term in terms}))
-        return solve(self, context, terms, tail, generator, seconds=math.inf)
+    def watched(self, request):
+        budgets.append((self.budget.within(request.seconds).seconds, {term.name for term in request.terms}))
+        return solve(self, replace(request, seconds=math.inf))
 
     monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
     stuck = replace(begun()[0], settings=replace(QUICK, stuck=-1.0, random_starts=5))
@@ -125,11 +125,11 @@ def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypat
 def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
     given, solve = [], LatentNoiseSolver.__call__
 
-    def watched(self, context, terms, tail, generator, *, seconds=math.inf):
-        given.append(seconds)
-        return solve(self, context, terms, tail, generator)
+    def watched(self, request):
+        given.append(request.seconds)
+        return solve(self, replace(request, seconds=math.inf))
 
     monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
     terms = terms_of(1, SHORT.frames)
-    steer._RelaxedFootingFirst(METHOD, METHOD, terms)(context(BEGUN), terms, BEGUN.warm_start, generator(), seconds=8.0)
+    steer._RelaxedFootingFirst(METHOD, METHOD, terms)(replace(request(BEGUN, terms), seconds=8.0))
     assert given == [4.0, 4.0]

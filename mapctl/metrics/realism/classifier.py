@@ -58,9 +58,9 @@ def compute_held_out_accuracy(
     sets = [_split_folds(clips, settings.folds, generator) for clips in (first, second)]
     scores = []
     for fold in range(settings.folds):
-        seen = [torch.cat([part for k, part in enumerate(parts) if k != fold]) for parts in sets]
+        training = [torch.cat([part for k, part in enumerate(parts) if k != fold]) for parts in sets]
         with _isolate_torch(generator):
-            network = _train_network(seen, settings)
+            network = _train_network(training, settings)
             scores.append(_balanced_accuracy(network, [parts[fold] for parts in sets]))
         tick()
     return sum(scores) / len(scores)

@@ -18,10 +18,9 @@ class Diversity(NamedTuple):
     """Average pairwise distance of samples."""
 
     world_cm: float
-    """Distance between the joints in the world, metres: where they go and how."""
+    """Distance between the joints in the world, centimetres: of trajectories and poses."""
     root_aligned_cm: float
-    """Distance between the joints relative to each frame's own hips and facing, metres: poses and their timing alone.
-    """
+    """Distance between the joints relative to the hips and facing of each frame, centimetres: of poses and timing."""
 
 
 def measure_diversity(samples: Sequence[Motion]) -> Diversity:
@@ -29,8 +28,8 @@ def measure_diversity(samples: Sequence[Motion]) -> Diversity:
     lengths."""
     lengths = sorted({sample.num_frames / sample.fps for sample in samples})
     if len(samples) < 2 or len(lengths) > 1:
-        told = " and ".join(f"{float(length):.4g}" for length in lengths)
-        raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {told} s")
+        shown = " and ".join(f"{float(length):.4g}" for length in lengths)
+        raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {shown} s")
     return measure_position_diversity(torch.stack([canonical_positions(sample) for sample in samples]))
 
 
@@ -55,5 +54,5 @@ def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"
 
 
 def _align_to_root(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
-    seen = transform_to_ground_frame(positions, positions[:, HIPS, ::2], facing_angle(positions))
-    return seen - seen[:, HIPS : HIPS + 1]
+    relative = transform_to_ground_frame(positions, positions[:, HIPS, ::2], facing_angle(positions))
+    return relative - relative[:, HIPS : HIPS + 1]

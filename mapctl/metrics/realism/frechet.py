@@ -17,7 +17,7 @@ _LEAST_STD = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Principal components of a reference set of windows; both sets of a distance are seen in one basis."""
+    """Principal components of a reference set of windows; both sets of a distance are projected on one basis."""
 
     mean: Float[Tensor, "features"]
     """Mean of each feature, m or m/s."""

@@ -21,7 +21,7 @@ PIECE_SECONDS = 3.0
 LONGEST_STEP = 1.0
 """Longest step, seconds; touch-downs further apart have a contact between them that was not detected."""
 _MOVING = 0.2
-"""Slower than this over the ground, m/s, travel has no direction to speak of."""
+"""Speed over the ground, m/s, below which the direction of travel is not measured."""
 
 
 class GaitSpread(NamedTuple):
@@ -41,7 +41,7 @@ def measure_gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SEC
     Step length is the mean of a piece's distances over the ground from one foot's touch-down to the next of the other
     foot; speed the hips' mean over the ground; turning the mean size of the turn rate of their travel, strides smoothed
     away. What is left of a clip after its last whole piece is not used, so clips shorter than `seconds` add nothing.
-    RequestError for no clips, a length that is none, and rigs whose hips or feet cannot be told.
+    RequestError for no clips, a length that is none, and rigs whose hips or feet are not found.
     """
     if not motions or not 0 < seconds < float("inf"):
         raise RequestError(f"a gait needs clips and a length in seconds, got {len(motions)} and {seconds:g} s")
@@ -55,10 +55,10 @@ def spread_ratios(made: Mapping[str, GaitSpread], data: Mapping[str, GaitSpread]
 
 
 def _summarise_pieces(values: Float[Tensor, "pieces"]) -> GaitSpread:
-    told = values[~values.isnan()]
-    if len(told) < 2:
-        return GaitSpread(float(values.nanmean()), float("nan"), len(told))
-    return GaitSpread(float(told.mean()), float(told.std()), len(told))
+    known = values[~values.isnan()]
+    if len(known) < 2:
+        return GaitSpread(float(values.nanmean()), float("nan"), len(known))
+    return GaitSpread(float(known.mean()), float(known.std()), len(known))
 
 
 def _measure_clip_gait(motion: Motion, seconds: float) -> dict[str, Float[Tensor, "pieces"]]:
@@ -86,8 +86,8 @@ def step_lengths(
 ) -> Float[Tensor, "frames"]:
     """Return the length of the step that a touch-down ends in its frame, metres; NaN where none does.
 
-    A touch-down is the first frame of a contact. Two of one foot on end make no step: it was set down again. Nor do two
-    that are `LONGEST_STEP` apart.
+    A touch-down is the first frame of a contact. Two in a row of one foot make no step, nor do two that are
+    `LONGEST_STEP` apart.
     """
     lengths = torch.full((len(planted),), float("nan"), dtype=toes_xz.dtype)
     downs = ((planted[1:] & ~planted[:-1]).nonzero() + planted.new_tensor([1, 0], dtype=torch.long)).tolist()

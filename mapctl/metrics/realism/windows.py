@@ -49,7 +49,7 @@ def transform_to_ground_frame(
     ground_xz: Float[Tensor, "*batch #frames 2"],
     angle: Float[Tensor, "*batch #frames"],
 ) -> Float[Tensor, "*batch frames joints 3"]:
-    """Transform world positions to ground positions that face by `angle` radians; height stays."""
+    """Transform world positions into frames on the ground that face by `angle` radians; height stays."""
     return rotations.rotate_about_y(positions - rotations.lift_ground(ground_xz).unsqueeze(-2), -angle.unsqueeze(-1))
 
 
@@ -58,8 +58,8 @@ def cut_windows(
 ) -> Float[Tensor, "windows frames channels"]:
     """Cut one clip into windows, float32: joint positions (m), then velocities (m/s) from the frame before each.
 
-    `positions` are those of `canonical_positions`. A window is seen from the hips' ground projection and the facing of
-    the frame before its first, which place the velocities. RequestError for a clip shorter than one window.
+    `positions` are those of `canonical_positions`. A window is relative to the hips' ground projection and facing in
+    the frame before its first. RequestError for a clip shorter than one window.
     """
     needed = settings.frames + 1
     if len(positions) < needed:
@@ -67,6 +67,6 @@ def cut_windows(
     starts = torch.arange(0, len(positions) - settings.frames, settings.step)
     pieces = positions[starts[:, None] + torch.arange(needed)]
     first = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
-    seen = transform_to_ground_frame(pieces, first[0].unsqueeze(1), first[1].unsqueeze(1))
-    velocity = seen.diff(dim=1) * PRIOR_FPS
-    return torch.cat([seen[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
+    relative = transform_to_ground_frame(pieces, first[0].unsqueeze(1), first[1].unsqueeze(1))
+    velocity = relative.diff(dim=1) * PRIOR_FPS
+    return torch.cat([relative[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
