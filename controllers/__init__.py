@@ -4,20 +4,30 @@
 from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.following.follow import FollowSettings, follow
 from controllers.generation.generate import GenerateSettings, generate
+from controllers.inbetweening.blend import blend
+from controllers.inbetweening.chain import chain
 from controllers.inbetweening.infill import InfillSettings, infill
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from controllers.inbetweening.tween import tween
+from controllers.steering import steer
 from mapctl.intent.keyframes import Key, Keys
 
 __all__ = [
+    "AutoInbetweener",
     "DenoiseSettings",
     "FollowSettings",
     "GenerateSettings",
     "InfillSettings",
     "Key",
     "Keys",
+    "RolloutInbetweener",
+    "SlerpInbetweener",
+    "blend",
+    "chain",
     "denoise",
     "follow",
     "generate",
     "infill",
+    "steer",
     "tween",
 ]
