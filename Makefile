@@ -31,6 +31,8 @@ demo: $(READY)
 test test-all bench: export OMP_NUM_THREADS = 1
 test test-all bench: export MKL_NUM_THREADS = 1
 test test-all bench: export OPENBLAS_NUM_THREADS = 1
+# Test files compiled anew cost each process 20 s.
+unexport PYTHONDONTWRITEBYTECODE
 
 # A file's tests stay together: they share what is costly to make. Tests run in as many processes as there are WORKERS.
 WORKERS := 2

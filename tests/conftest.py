@@ -7,7 +7,7 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[_name] = "1"
 
 from collections.abc import Iterator
-from functools import partial
+from functools import partial, wraps
 from inspect import isclass, isfunction, isgeneratorfunction
 from pathlib import Path
 from typing import ForwardRef, get_args
@@ -41,7 +41,7 @@ def _parts(hint) -> Iterator:
 def _jaxtyped(whole, function=None, *, typechecker):
     """jaxtyping's decorator at a fraction of its cost: it would check arguments before a call and again after it.
 
-    Here beartype checks once, in the scope that jaxtyping gives to dimensions, and alone where no shape is told. Two
+    Here beartype checks once, within a scope of jaxtyping for the dimensions, and alone where no shape is told. Two
     kinds are left to jaxtyping: names in quotes, since it passes over those that exist for type checkers alone, and
     generators, which beartype checks when they begin, outside of their scope.
     """
@@ -53,7 +53,18 @@ def _jaxtyped(whole, function=None, *, typechecker):
         return whole(function, typechecker=typechecker)
     once = typechecker(function)
     shapes = any(isclass(hint) and issubclass(hint, AbstractArray) for hint in hints)
-    return whole(once, typechecker=None) if shapes else once
+    return _scoped(whole, once) if shapes else once
+
+
+def _scoped(whole, function):
+    """The function within a scope for dimensions, without the binding of arguments that jaxtyping's wrapper does."""
+
+    @wraps(function)
+    def called(*positional, **named):
+        with whole("context"):
+            return function(*positional, **named)
+
+    return called
 
 
 def _annotated_modules() -> list[str]:

@@ -15,7 +15,6 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import llvmlite.binding
@@ -130,18 +129,14 @@ def kind_of_machine() -> str:
     return f"{processor}, {torch.backends.cpu.get_cpu_capability()}, {versions}"
 
 
-def outputs() -> Iterator[tuple[str, dict[str, dict]]]:
-    """For each command its name and a fingerprint by file; run in the working directory."""
-    known = _files()
-    for name, words in COMMANDS.items():
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said):
-            status = run(*words.split())
-        assert status in (0, 3), f"{name}: exit status {status}"
-        Path("said.txt").write_text(_without_times(said.getvalue()))
-        made = _files() - known | {Path("said.txt")}
-        yield name, {str(path): fingerprint(path) for path in sorted(made)}
-        known = _files()
+def run_command(name: str) -> dict[str, dict]:
+    """Run one of the commands in the working directory; return a fingerprint of each file that it makes."""
+    known, said = _files(), io.StringIO()
+    with contextlib.redirect_stdout(said):
+        status = run(*COMMANDS[name].split())
+    assert status in (0, 3), f"{name}: exit status {status}"
+    Path("said.txt").write_text(_without_times(said.getvalue()))
+    return {str(path): fingerprint(path) for path in sorted(_files() - known | {Path("said.txt")})}
 
 
 def _files() -> set[Path]:
@@ -229,8 +224,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         prepare(Path())
-        for name, found in outputs():
-            all_found[name] = found
+        for name in COMMANDS:
+            found = all_found[name] = run_command(name)
             faults = differences(found, golden["outputs"].get(name, {}), to_the_bit=to_the_bit)
             bad += len(faults)
             print(f"{name}: {len(found)} files, {'; '.join(faults) if faults else 'as they were'}"[:300], flush=True)

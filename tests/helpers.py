@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,13 @@ def quat_xyzw(rotation_vectors: Tensor) -> Tensor:
 
 def walk(frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, seed: int = 0, fps: int = 30) -> Motion:
     """A procedural walk: legs and arms swing, knees lift, the lower toe is on the floor."""
+    made = _walk(frames, turn_rate, cadence, seed, fps)
+    return replace(made, root_position=made.root_position.clone(), local_quat_xyzw=made.local_quat_xyzw.clone())
+
+
+@cache
+def _walk(frames: int, turn_rate: float, cadence: float, seed: int, fps: int) -> Motion:
+    """The walk that is copied to whoever asks for it."""
     time = torch.arange(frames, dtype=torch.float64) / fps
     phase = 2 * math.pi * cadence * time
     vectors = _swing(phase, seed)
@@ -156,9 +164,14 @@ def cmu_skeleton() -> Skeleton:
     return Skeleton(tuple(names), tuple(parents), offsets, {"lFoot": toe, "rFoot": toe, "head": (0.0, 0.2, 0.0)})
 
 
+@cache
+def _features_of_walks(count: int, frames: int) -> list[Tensor]:
+    return [encode(motion)[0].float() for motion in walks(count, frames)]
+
+
 def corpus(count: int = 5, frames: int = 100) -> Corpus:
     """The features of `walks`."""
-    clips = [encode(motion)[0].float() for motion in walks(count, frames)]
+    clips = _features_of_walks(count, frames)
     return Corpus(tuple(f"walk-{k}.bvh" for k in range(count)), tuple(len(c) for c in clips), torch.cat(clips))
 
 
@@ -192,14 +205,15 @@ def tiny_model(
 def tiny_density(
     *, width: int = 8, components: int = 3, seed: int = 0, starts: int = 4, dtype: torch.dtype = torch.float32
 ) -> LstmGmmDensity:
-    """The network as the solver takes it, on the reference path, with starts from the walks."""
+    """The network as the solver takes it, by the compiled kernels where it is float32, with starts from the walks."""
     model = tiny_model(width=width, components=components, seed=seed)
     data = corpus()
     found = select_initial_states(model, data, count=starts, generator=generator(seed))
     limits, names = measure_data_limits(data), {"starts": list(found.names)}
     shape, shown = model.config.as_card(), asdict(limits)
     card = Card("lstm-gmm", shape, licence="none", data=names, abilities=shown, **Card.layout_fields())
-    density = LstmGmmDensity("tiny", model.to(dtype), found, limits, card, use_fast=False)
+    fast = dtype is torch.float32
+    density = LstmGmmDensity("tiny", model.to(dtype), found, limits, card, use_fast=fast)
     if dtype is not torch.float32:
         for part in ("last_frame", "hidden", "cell"):
             object.__setattr__(found.state, part, getattr(found.state, part).to(dtype))

@@ -1,4 +1,4 @@
-"""How long the way from one pose to the next takes people: a regression over mocap, by which a timing is suggested.
+"""How long people take from one pose to the next: a regression over mocap, by which a timing is suggested.
 
 The logarithm of the seconds is linear in what two poses show (see mapctl.inbetweening.pose_pairs).
 """
@@ -44,7 +44,7 @@ class KeyframeTimingNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.register_buffer("weights", torch.zeros(len(config.features)))
-        # 10th and 90th percentile of true over suggested seconds, of pairs about in place and of pairs on their way.
+        # 10th and 90th percentile of true over suggested seconds, of pairs about in place and of pairs that travel.
         self.register_buffer("ratios", torch.ones(2, 2))
 
     def forward(

@@ -80,7 +80,7 @@ class Mixture:
     log_sigma: Float[Tensor, "*batch components continuous"]
     """Log standard deviations."""
     contact_logit: Float[Tensor, "*batch 2"]
-    """Log odds that the left and right toe are planted."""
+    """Contact logits of the left and right toe."""
 
     def log_prob(
         self,

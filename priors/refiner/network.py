@@ -37,7 +37,7 @@ END_EFFECTORS = (
 )
 """End effectors of the refiner and its critic: the limbs' ends of Wang et al. 2019, and joints that tremble too."""
 
-_CONTACT_LOGIT = 3.0  # log odds that a bit of the input is worth; the network may overrule it
+_CONTACT_LOGIT = 3.0  # logit that a contact bit of the input is worth; the network may overrule it
 _CHUNK_FRAMES = 600  # frames refined at once
 
 

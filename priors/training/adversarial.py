@@ -38,7 +38,7 @@ class Critic(nn.Module):
         self.last = nn.Linear(2 * width, 1)
 
     def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
-        """Log odds, frame by frame, that a window was captured; for the frames that have enough on either side."""
+        """Logits, frame by frame, that a window was captured; for the frames that have enough on either side."""
         ends = compute_end_effectors(features, self.joints)
         seen = [(ends - self.reach_mean) / self.reach_std, 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1]
         if self.magnified_columns:

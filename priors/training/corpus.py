@@ -221,7 +221,7 @@ def number_clip_folders(corpus: Corpus) -> Int[Tensor, " clips"]:
 
 
 def _compute_cache_key(data: Path, files: list[Path], skip_first: bool) -> str:
-    """Of everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
+    """Hash everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
     parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known_rigs()), repr(ContactSettings()), str(skip_first)]
     parts += [f"{f.relative_to(data)} {_read_file_stamp(f)}" for f in files]
     return sha256("\n".join(parts).encode(errors="surrogateescape")).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""What a density is worth on clips that it has not seen: likelihood, and whether, sampled for long, it stays a person
+"""What a density is worth on held-out clips: likelihood, and whether, sampled for long, it stays a person
 moving as the data do.
 """
 
@@ -40,7 +40,7 @@ def measure_free_runs(
 
 
 def measure_quality(model: LstmGmm, parts: Split) -> dict[str, Any]:
-    """Of a finished network, for its card."""
+    """Measure the quality of a finished network, for its card."""
     return {
         "test_nats_per_frame": compute_validation_nats(model, parts.test),
         "windows": compute_window_nats(model, (parts.validation, parts.test)),

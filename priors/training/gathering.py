@@ -31,7 +31,7 @@ class DataSource:
     strict: bool = False
     """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     seed: int = 1
-    """Of the split."""
+    """Seed of the split into training and validation clips."""
 
 
 def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:

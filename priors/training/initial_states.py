@@ -11,7 +11,7 @@ from priors.lstm_gmm.network import LstmGmm, LstmState
 from priors.training.corpus import Corpus
 
 _SECOND = PRIOR_FPS  # frames
-_WARM_UP_FRAMES = 40  # frames of a clip seen before a start; the memory has settled by then
+_WARM_UP_FRAMES = 40  # frames of a clip before a start; the memory has settled by then
 
 
 def select_initial_states(model: LstmGmm, corpus: Corpus, *, count: int, generator: torch.Generator) -> InitialStates:
@@ -84,7 +84,7 @@ def _compute_weights(corpus: Corpus, speeds: Float[Tensor, " starts"]) -> Float[
 
 
 def _state_after(model: LstmGmm, clip: Float[Tensor, "frames size"]) -> LstmState:
-    """The state after the whole clip was seen."""
+    """Return the state after the whole clip."""
     with torch.no_grad():
         state = model.start_after(clip[:1])
         return model.advance(state, clip[1:].unsqueeze(0))

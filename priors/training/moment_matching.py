@@ -30,7 +30,7 @@ class MatchingSettings:
     begin: float = 0.75
     """Share of the steps after which it sets in: before, the network cannot run free yet. 1 leaves it out."""
     every: int = 4
-    """Steps from one comparison to the next: at each step feet are stiller still, but samples are told from mocap."""
+    """Steps from one comparison to the next: at each step feet are stiller still, but samples differ from mocap."""
     batch: int = 32
     """Free runs of a comparison; the first windows of the step's batch."""
     context: int = 20

@@ -1,4 +1,4 @@
-"""What a training run is told: on what, and how. A model's own recipe says what is learnt, judged and described."""
+"""What a training run needs: data and settings. A model's own recipe says what is learnt, judged and described."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from priors.training.gathering import DataSource, describe_skipped
 from priors.training.trainer import Trainer
 
 Row = dict[str, Any]
-"""Losses of a step, or measures of held-out clips; in a curve None stands for what is not finite."""
+"""Losses of a step, or measures of held-out clips; in a curve None replaces what is not finite."""
 
 
 @runtime_checkable
@@ -28,7 +28,7 @@ class Settings(Protocol):
 
     @property
     def seed(self) -> int:
-        """Of everything random, the split of the clips among it."""
+        """Seed of everything random, including the split of the clips."""
         ...
 
 
@@ -74,12 +74,12 @@ class Recipe(ABC, Generic[C, S, T]):
     """What to train on, and how. A model's subclass gives `config` and `settings` their defaults."""
 
     kind: ClassVar[str]
-    """Of the model, in its card and on the command line."""
+    """Name of the kind of model, in its card and on the command line."""
     counter: ClassVar[str] = "step"
     """What one step of its trainer is called."""
     guards: ClassVar[tuple[str, ...]] = ()
     """Losses by which training may end by itself (see `find_stop_reason`). Where there are any, they are saved with the
-    checkpoints, and the best weights seen (see `score`) are exported instead of the last."""
+    checkpoints, and the best weights so far (see `score`) are exported instead of the last."""
 
     data: Path
     """Folder of BVH files, searched below."""
@@ -98,9 +98,9 @@ class Recipe(ABC, Generic[C, S, T]):
     report_steps: int = 100
     """Between lines of news."""
     validate_steps: int = 1000
-    """Between validations."""
+    """Steps between two validations."""
     licence: str = "that of the training data"
-    """Of the weights, for the card."""
+    """Licence of the weights, for the card."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     strict_data: bool = False
@@ -125,7 +125,7 @@ class Recipe(ABC, Generic[C, S, T]):
         )
 
     def find_shape(self, trainer: T) -> C:
-        """Of the network that is trained."""
+        """Return the configuration of the network that is trained."""
         return self.config
 
     def describe_data(self, corpus: Corpus) -> dict[str, str]:
@@ -188,7 +188,7 @@ class Recipe(ABC, Generic[C, S, T]):
 
 @dataclass(frozen=True)
 class NetworkRecipe(Recipe[C, S, T]):
-    """Of one network on the usual card, that may begin with another's weights."""
+    """Recipe of one network on the usual card, which may start from another network's weights."""
 
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""

@@ -18,7 +18,7 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.network import LstmRefiner, RefinerNetwork
 from priors.training.corpus import Corpus, Split
 
-_WARM_UP_FRAMES = 60  # frames of a clip that the density has seen before it is let go
+_WARM_UP_FRAMES = 60  # frames of a clip that condition the density before it runs freely
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class RefinerEvaluator:
     windows: list[Tensor]
     """Mocap's windows for the classifier."""
     settings: RealismSettings
-    """Of the classifier."""
+    """Settings of the realism classifier."""
 
     @staticmethod
     def of(raw: Corpus, parts: Split, settings: RealismSettings) -> "RefinerEvaluator":
@@ -43,7 +43,7 @@ class RefinerEvaluator:
         return RefinerEvaluator(torch.stack(raw.clips()), _average_measures(clips), windows, settings)
 
     def __call__(self, network: RefinerNetwork) -> dict[str, float]:
-        """Contact speed and jitter as ratios to mocap's, and the share told apart."""
+        """Contact speed and jitter as ratios to mocap's, and the classifier's accuracy."""
         refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
         refined = refiner.refine(self.raw)
         means = _average_measures(list(refined))
@@ -79,7 +79,7 @@ def sample_corpus(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int
 
 
 def compute_realism_gap(row: Mapping[str, float | None]) -> float:
-    """Less is better: how far feet and tremble are from mocap's (log ratios), and how much is told apart.
+    """Less is better: how far foot speed and jitter are from mocap's (log ratios), and the classifier's accuracy.
 
     Infinite where a measure cannot be had, as of feet that never touch the floor.
     """

@@ -71,7 +71,7 @@ def parse_curve(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:
 
 
 def read_last_step(run: Path) -> int | None:
-    """Of the run folder's checkpoint; None where there is none that can be read."""
+    """Read the step of the run folder's checkpoint; None where there is none that can be read."""
     try:
         return int(json.loads((run / _INDEX).read_text(encoding="utf-8"))["step"])
     except UNREADABLE_ERRORS:

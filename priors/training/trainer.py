@@ -34,7 +34,7 @@ class Trainer(ABC, Generic[Network]):
 
     @abstractmethod
     def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure the network on clips that it has not seen."""
+        """Measure the network on held-out clips."""
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
@@ -80,7 +80,7 @@ class GradientTrainer(Trainer[Network]):
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
-        """Of a batch drawn anew: `loss`, and in plain units what it is made of."""
+        """Compute the losses of a newly drawn batch: `loss`, and its parts in plain units."""
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """For the network's weights."""

@@ -79,7 +79,7 @@ class Window:
     quats: Float[Tensor, "batch frames joints 4"]
     """Local rotations, xyzw."""
     heading: Float[Tensor, "batch frames"]
-    """Of the hips, radians."""
+    """Heading of the hips, radians."""
     contacts: Float[Tensor, "batch frames 2"]
     """Left and right toe planted, 0 or 1."""
     present: Bool[Tensor, "batch frames"]
@@ -121,7 +121,7 @@ class PositionWindows:
         self.mirror_joints = CANONICAL.mirror_partners()
 
     def moments(self) -> tuple[Float[Tensor, "joints 3"], Float[Tensor, "joints 3"]]:
-        """Mean and standard deviation of each place, seen from its own root, of a motion and its mirror image."""
+        """Mean and standard deviation of each position relative to its own root, of a motion and its mirror image."""
         flip = self.local.new_tensor([-1.0, 1.0, 1.0])
         mean, square = self.local.mean(dim=0), self.local.square().mean(dim=0)
         mean, square = (mean + flip * mean[self.mirror_joints]) / 2, (square + square[self.mirror_joints]) / 2

@@ -1,11 +1,6 @@
-"""The command line: every command does its job and says so; `--help` imports nothing heavy."""
+"""The command line: every command does its job and says so."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from importlib import import_module
 from pathlib import Path
 
@@ -18,8 +13,6 @@ from mapctl.commands import COMMANDS
 from mapctl.commands.shared.options import parse_size
 from mapctl.commands.train.options import TrainOptions
 
-HEAVY = ("torch", "numpy", "scipy", "rich", "pydantic", "numba", "pyrender", "av", "matplotlib", "mapctl.formats")
-
 
 @pytest.fixture(scope="session")
 def walk(prior, tmp_path_factory) -> Path:
@@ -30,26 +23,9 @@ def walk(prior, tmp_path_factory) -> Path:
     return path
 
 
-def python(*words: object, **more) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, **more)
-
-
 def test_version_is_told(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"mapctl {mapctl.__version__}\n"
-
-
-def test_help_imports_nothing_heavy():
-    script = (
-        "import sys\nfrom mapctl import cli\n"
-        "try:\n    cli.main(['--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
-        f"print(sorted(set({HEAVY!r}) & sys.modules.keys()))"
-    )
-    done = python("-c", script)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "[]"
-    assert all(name in done.stdout for name in COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -72,24 +48,25 @@ def test_follow_writes_motion_and_report(walk, prior):
 
 def test_follow_tells_in_short(prior, tmp_path, capsys):
     out = tmp_path / "walk.bvh"
-    assert run("follow", "line:2", "-o", out, "--prior", prior) == 0
+    words = ("follow", "line:2", "-o", out, "--prior", prior, "--seconds", 0.4)
+    assert run(*words) == 0
     told = capsys.readouterr()
     assert told.err == ""
     for word in ("cm mean", "ms a frame", "status", str(out)):
         assert word in told.out
-    assert run("follow", "line:2", "-o", out, "--prior", prior, "--quiet") == 0
+    assert run(*words, "--quiet") == 0
     assert capsys.readouterr().out == ""
 
 
 def test_the_curve_is_walked_once_if_no_time_is_given(prior, tmp_path):
-    assert run("follow", "line:3", "-o", tmp_path / "a.npz", "--speed", 1, "--prior", prior) == 0
-    assert mapctl.load(tmp_path / "a.npz").seconds == pytest.approx(3, abs=0.1)
+    assert run("follow", "line:1", "-o", tmp_path / "a.npz", "--speed", 1, "--prior", prior) == 0
+    assert mapctl.load(tmp_path / "a.npz").seconds == pytest.approx(1, abs=0.1)
 
 
 def test_same_seed_same_bytes(prior, tmp_path):
     def written(name: str, seed: int) -> bytes:
         path = tmp_path / name
-        assert run("follow", "s:2", "-o", path, "--seconds", 1, "--seed", seed, "--prior", prior) == 0
+        assert run("follow", "s:2", "-o", path, "--seconds", 0.4, "--seed", seed, "--prior", prior) == 0
         return path.read_bytes()
 
     first = written("a.bvh", 5)
@@ -99,7 +76,7 @@ def test_same_seed_same_bytes(prior, tmp_path):
 
 def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
     """The made-up prior's data reach 2 m/s."""
-    words = ("follow", "line:4", "-o", tmp_path / "a.bvh", "--seconds", 1, "--prior", prior)
+    words = ("follow", "line:4", "-o", tmp_path / "a.bvh", "--seconds", 0.4, "--prior", prior)
     assert run(*words, "--speed", 6) == 0
     assert run(*words, "--speed", 6, "--strict") == 3
     assert "cannot all hold" in capsys.readouterr().out
@@ -236,44 +213,6 @@ def test_train_takes_its_options(tmp_path):
     assert paper.recipe().settings.optimiser == "rmsprop"
 
 
-def _started(words) -> subprocess.Popen[str]:
-    """mapctl in a process that heeds Ctrl-C, also where the tests run in the background and ignore it."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "mapctl.cli", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-
-
-def _ended(process: subprocess.Popen[str]) -> tuple[str, str]:
-    """What it said in the end; it is killed if it does not end."""
-    try:
-        return process.communicate(timeout=60)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        raise
-
-
-@pytest.mark.parametrize(
-    ("number", "said"),
-    [(signal.SIGINT, (130, "mapctl: interrupted\n")), (signal.SIGTERM, (143, "mapctl: terminated\n"))],
-)
-def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
-    """Ctrl-C or SIGTERM in the middle of hours of motion: no traceback, no file, no folder."""
-    words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
-    process = _started(words)
-    give_up = time.monotonic() + 100
-    while not list(tmp_path.glob("gen/.*")) and time.monotonic() < give_up:
-        time.sleep(0.05)
-    process.send_signal(number)
-    process.send_signal(number)  # `timeout` sends it twice
-    _, told = _ended(process)
-    assert (process.returncode, told) == said
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
     from mapctl.formats.bvh.stream import BvhStream
 
@@ -334,40 +273,6 @@ def test_an_interrupted_demo_and_scene_are_written_without_films(prior, tmp_path
     (tmp_path / "scene.toml").write_text(f"prior = '{prior}'\n{outputs}{actors}")
     assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "scene", "--quiet") == 130
     assert {file.name for file in (tmp_path / "scene").iterdir()} == {"scene-ann.bvh", "scene.json"}
-
-
-def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_path):
-    words = ("follow", "circle:4", "-o", tmp_path / "walk.bvh", "--seconds", 3000, "--prior", prior)
-    process = _started(words)
-    time.sleep(5)
-    process.send_signal(signal.SIGTERM)
-    _, told = _ended(process)
-    assert process.returncode == 143
-    assert "Traceback" not in told
-    assert told.startswith("mapctl: terminated")
-    written = (tmp_path / "walk.bvh").exists()
-    assert written == ("what was solved until then is written" in told)
-    assert not written or 2 < mapctl.load(tmp_path / "walk.bvh").num_frames < 90_000
-
-
-def test_a_closed_pipe_is_no_error():
-    """As in `mapctl measure walk.bvh | head -1`."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    done = subprocess.run(
-        [sys.executable, "-m", "mapctl.cli", "--version"], stdout=writer, stderr=subprocess.PIPE, timeout=120
-    )
-    os.close(writer)
-    assert b"Traceback" not in done.stderr
-    assert done.returncode == 1
-
-
-def test_a_full_disk_for_what_is_printed_is_one_line():
-    with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "mapctl.cli", "--version"], stdout=full, stderr=subprocess.PIPE, timeout=120
-        )
-    assert (done.returncode, done.stderr) == (2, b"mapctl: input or output: No space left on device\n")
 
 
 def test_sizes_are_read():

@@ -98,6 +98,7 @@ def test_a_missing_package_is_named(here, capsys, monkeypatch):
     assert "cannot write out.usda: USD needs the package usd-core: pip install 'mapctl[usd]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # another process starts in test_cli_errors.py and in test_cli_processes.py
 def test_as_installed(here):
     done = subprocess.run(
         [sys.executable, "-m", "mapctl.cli", "convert", "in.amc", "out.bvh"],

@@ -207,7 +207,10 @@ def test_missing_package_is_named(fails, monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "wait4"), reason="needs the memory of a child process")
-@pytest.mark.parametrize("words", [("convert", "deep.bvh", "a.npz"), ("follow", "circle:0", "-o", "a.bvh")])
+@pytest.mark.parametrize(
+    "words",
+    [("convert", "deep.bvh", "a.npz"), pytest.param(("follow", "circle:0", "-o", "a.bvh"), marks=pytest.mark.slow)],
+)
 def test_as_installed(tmp_path, words):
     """In a process of its own: no traceback, and far below 10 s and 1 GB."""
     (tmp_path / "deep.bvh").write_text(DEEP)

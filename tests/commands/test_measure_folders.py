@@ -80,6 +80,7 @@ def test_two_folders_are_compared(made, mocap, capsys):
     assert all(name in table for name in (*values["spread"], "told apart, %", "Frechet distance", "floor"))
 
 
+@pytest.mark.slow  # of what it decides: test_realism.py
 def test_the_seed_decides_alone(made, mocap, capsys):
     first, again, other = (told(capsys, made, "--reference", mocap, "--seed", seed) for seed in (1, 1, 2))
     assert first == again

@@ -13,7 +13,7 @@ from mapctl import cli
 from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics.travel import compute_low_pass_velocity, measure_commands
 
-SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
+SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.2,1.0,40\n0.5,1.0,40\n"
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def steer(prior, tmp_path):
 def test_a_script_gives_motion_report_and_plot(steer, tmp_path, capsys):
     report, plot = tmp_path / "r.json", tmp_path / "p.png"
     assert steer(SCRIPT, "--report", report, "--plot", plot, "--seed", 3) == 0
-    assert mapctl.load(tmp_path / "a.bvh").num_frames == 45
+    assert mapctl.load(tmp_path / "a.bvh").num_frames == 15
     assert plot.read_bytes().startswith(b"\x89PNG")
     told = json.loads(report.read_text())
     assert [row["heading_deg"] for row in told["commands"]] == pytest.approx([0, 40, 40])
@@ -62,11 +62,11 @@ def test_the_same_seed_gives_the_same_bytes(steer, tmp_path):
 
 def test_a_script_is_played_against_the_clock(steer, tmp_path):
     assert steer(SCRIPT, "--realtime", "--quiet") == 0
-    assert mapctl.load(tmp_path / "a.bvh").num_frames == 45
+    assert mapctl.load(tmp_path / "a.bvh").num_frames == 15
 
 
 def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused(steer, tmp_path, capsys):
-    script = "time_s,speed_mps,heading_deg,turn_deg_s,style\n0,1.2,0,30,{}\n3,1.2,0,,\n"
+    script = "time_s,speed_mps,heading_deg,turn_deg_s,style\n0,1.2,0,30,{}\n0.4,1.2,0,,\n"
     assert steer(script.format(""), "--report", tmp_path / "r.json") == 0
     row = json.loads((tmp_path / "r.json").read_text())["commands"][0]
     assert row["turn_deg_s"] == pytest.approx(30)
@@ -79,7 +79,7 @@ def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused
 
 
 def test_speeds_that_nobody_runs_are_lowered_and_said(steer, capsys):
-    fast = "time_s,speed_mps,heading_deg\n0,50,0\n0.5,50,0\n"
+    fast = "time_s,speed_mps,heading_deg\n0,50,0\n0.2,50,0\n"
     assert steer(fast) == 0
     assert "the speed of 50 m/s at 0 s was lowered to 2.20 m/s" in capsys.readouterr().out
     assert steer(fast, "--strict") == 3
@@ -135,7 +135,7 @@ def test_a_short_command_has_no_steady_part():
 
 
 def test_a_wanted_step_length_is_in_the_ledger_and_the_report(steer, tmp_path, capsys):
-    script = "time_s,speed_mps,heading_deg,step_m\n0,1.2,0,\n1,1.2,0,0.6\n3,1.2,0,\n"
+    script = "time_s,speed_mps,heading_deg,step_m\n0,1.2,0,\n0.2,1.2,0,0.6\n0.5,1.2,0,\n"
     assert steer(script, "--report", tmp_path / "r.json") == 0
     told = json.loads((tmp_path / "r.json").read_text())
     assert [row["step_m"] for row in told["commands"]] == [None, 0.6, None]

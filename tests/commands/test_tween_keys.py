@@ -52,9 +52,15 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def tween(tiny, prior):
+def models(tiny, prior):
+    """By method, the options that name what it needs."""
+    return {"map": ["--infiller", tiny, "--prior", prior], "infiller": ["--infiller", tiny], "slerp": []}
+
+
+@pytest.fixture
+def tween(models):
     """Runs the command; returns the exit status."""
-    return lambda *words: run("tween", *words, "--infiller", tiny, "--prior", prior)
+    return lambda *words: run("tween", *words, *models["map"])
 
 
 def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
@@ -104,11 +110,12 @@ def test_timing_is_suggested_for_frames_of_a_clip_too(folder, capsys):
     ]
 
 
-def test_the_same_bytes_come_twice_and_quiet_says_nothing(tween, folder, capsys):
+@pytest.mark.parametrize("method", [pytest.param("map", marks=pytest.mark.slow), "infiller", "slerp"])
+def test_the_same_bytes_come_twice_and_quiet_says_nothing(models, folder, capsys, method):
     found = set()
     for _ in range(2):
-        words = ["--suggest-timing", "--quiet"]
-        assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", *words) == 0
+        words = ["--suggest-timing", "--quiet", "--method", method, *models[method]]
+        assert run("tween", folder / "keys" / "keys.toml", "-o", "out.bvh", *words) == 0
         found.add(Path("out.bvh").read_bytes())
     assert len(found) == 1
     assert capsys.readouterr().out == ""
@@ -123,8 +130,8 @@ def test_a_file_that_keys_name_is_not_written_over(tween, folder, capsys, monkey
     assert (folder / "keys" / "walk.bvh").read_bytes() == before
 
 
-@pytest.mark.parametrize("bundled", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_example_runs_on_a_clip_of_its_name(tween, tiny, folder, bundled):
+@pytest.mark.parametrize("method", ["slerp", *(pytest.param(m, marks=pytest.mark.slow) for m in ("map", "bundled"))])
+def test_the_example_runs_on_a_clip_of_its_name(models, tiny, folder, method):
     """The clip that it names is made by the command that it tells; of the bundled densities the default ones roll."""
     text = (DOCS / "keys.toml").read_text()
     (named,) = set(re.findall(r'"([\w/]+\.bvh)"', text))
@@ -133,7 +140,8 @@ def test_the_example_runs_on_a_clip_of_its_name(tween, tiny, folder, bundled):
     walk(120).save(clip)
     (folder / "keys" / "example.toml").write_text(text)
     words = (folder / "keys" / "example.toml", "-o", "out.bvh", "--report", "r.json", "--quiet")
-    assert (run("tween", *words, "--infiller", tiny) if bundled else tween(*words)) == 0
+    more = ["--infiller", tiny] if method == "bundled" else ["--method", method, *models[method]]
+    assert run("tween", *words, *more) == 0
     told = json.loads(Path("r.json").read_text())
     assert {row["what"] for row in told["keys"]} == {"pose", "limbs", "root"}
 

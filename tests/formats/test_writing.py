@@ -23,7 +23,7 @@ from priors.tensor_files import write_tensors
 from priors.training import run_files
 from scenes.writers import gif_writer, mp4_writer, save_png
 
-MOTION = walk(300)
+MOTION = walk(150)
 PICTURE = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
 TENSORS = {"a": torch.zeros(200, 200)}
 
@@ -41,7 +41,7 @@ def _stream(path):
 def _film(writer):
     def write(path):
         with atomic_path(path) as scratch, writer(scratch, (320, 240), Fraction(30)) as add:
-            for _ in range(20):
+            for _ in range(4):
                 add(PICTURE)
 
     return write

@@ -74,7 +74,15 @@ def test_the_map_stage_keeps_what_is_known_too(rig):
     assert "footing" in done.ledger.summary()
 
 
-@pytest.mark.parametrize(("rig", "method"), [*((rig, "infiller") for rig in RIGS), ("daz", "auto"), ("daz", "slerp")])
+@pytest.mark.parametrize(
+    ("rig", "method"),
+    [
+        ("bandai", "infiller"),
+        ("daz", "slerp"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("canonical", "infiller"), ("daz", "infiller"))),
+        ("daz", "auto"),
+    ],
+)
 def test_what_stands_in_the_gap_does_not_matter(rig, method):
     motion = on_rig(rig, 45)
     masks = [Mask(ALL, 15, 25), Mask(motion.skeleton.names[8], 30, 40)]

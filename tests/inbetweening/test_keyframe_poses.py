@@ -100,7 +100,9 @@ def test_poses_of_another_rig_come_to_the_bodys(poses, body, other):
     assert turned.max() < 0.01
 
 
-@pytest.mark.parametrize("rig", [*RIGS, "zup"])
+@pytest.mark.parametrize(
+    "rig", ["daz", *(pytest.param(rig, marks=pytest.mark.slow) for rig in ("canonical", "bandai", "zup"))]
+)
 def test_every_kind_of_key_is_met_in_one_motion(poses, rig):
     rigmap = retarget.to_canonical(build_keyframe_clip(KeyRequest(first_and_last(poses[rig]))).motion)[1]
     hand, foot = (

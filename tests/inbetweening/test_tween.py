@@ -83,7 +83,10 @@ def test_by_every_method(rig, method):
 
 
 @pytest.mark.parametrize("told", [{}, {"limbs": True}, {"root_only": True}])
-@pytest.mark.parametrize(("rig", "method"), [("canonical", "infiller"), ("bandai", "auto"), ("daz", "slerp")])
+@pytest.mark.parametrize(
+    ("rig", "method"),
+    [("canonical", "infiller"), pytest.param("bandai", "auto", marks=pytest.mark.slow), ("daz", "slerp")],
+)
 def test_other_frames_change_nothing(rig, method, told):
     motion, frames = on_rig(rig, 45), frames_of(30)
     told = {"limbs": LIMBS[rig]} if "limbs" in told else told
@@ -92,7 +95,7 @@ def test_other_frames_change_nothing(rig, method, told):
     assert same(*(made_of(each, frames, method=method, **told).motion for each in (motion, other)))
 
 
-@pytest.mark.parametrize("method", ["infiller", "slerp"])
+@pytest.mark.parametrize("method", [pytest.param("infiller", marks=pytest.mark.slow), "slerp"])
 def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either(method):
     """Its T-pose is found from the keys; joints that only it has carry hands elsewhere, and these are met all the
     same.
@@ -106,7 +109,13 @@ def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either(method
     assert first.notes == ()
 
 
-@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "auto")])
+@pytest.mark.parametrize(
+    ("rig", "fps", "method"),
+    [
+        *(pytest.param(*case, "infiller", marks=pytest.mark.slow if case[0] != "daz" else ()) for case in ON_RIGS),
+        ("bandai", 30, "auto"),
+    ],
+)
 def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
     motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
     done = made_of(motion, frames, method=method, limbs=LIMBS[rig])
@@ -184,6 +193,7 @@ def test_keys_come_in_any_order_and_may_be_repeated():
     assert same(*(made_of(motion, keys).motion for keys in ((0, 16, 33, 44), (33, 0, 44, 16, 33, 0))))
 
 
+@pytest.mark.slow  # the command does: test_motion_commands.py
 def test_the_same_comes_twice():
     motion = on_rig("daz", 45)
     first, second = (made_of(motion, frames_of(30), method="auto", limbs=LIMBS["daz"]).motion for _ in range(2))

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -32,6 +33,7 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 
 FRAMES, KEYS = 45, (0, 20, 23, 44)
+SHORT, SHORT_KEYS = 25, (0, 10, 13, 24)
 FEW = InfillSettings(refinement=replace(INFILL_REFINEMENT, budget=Budget(evaluations=4)))
 QUICK = RolloutSettings(
     ahead=4,
@@ -57,7 +59,7 @@ def prior(prior_file):
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     path = tmp_path_factory.mktemp("source") / "in.bvh"
-    on_rig("bandai", FRAMES).save(path)
+    on_rig("bandai", SHORT).save(path)
     return path
 
 
@@ -82,7 +84,7 @@ def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
     return sample_variations(make, first, rollouts, count, generator=generator(seed), refinement=refinement)
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("daz", 60)])
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), pytest.param("daz", 60, marks=pytest.mark.slow)])
 def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior, rig, fps):
     motion = on_rig(rig, FRAMES * fps // 30, fps=fps)
     keys = [key * fps // 30 for key in KEYS]
@@ -98,23 +100,25 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
     assert all(torch.isfinite(torch.tensor(one.energy)) for one in found.each)
 
 
+@pytest.mark.slow
 def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prior):
-    motion = on_rig("canonical", FRAMES)
-    alone = tween(motion, Keys(KEYS), AutoInbetweener(INFILLER), settings=FEW).motion
-    two, three = (asked(motion, prior, count=count).each for count in (2, 3))
+    motion, of = on_rig("canonical", SHORT), partial(asked, prior=prior, keys=SHORT_KEYS)
+    alone = tween(motion, Keys(SHORT_KEYS), AutoInbetweener(INFILLER), settings=FEW).motion
+    two, three = (of(motion, count=count).each for count in (2, 3))
     assert torch.equal(two[0].solution.motion.local_quat_xyzw, alone.local_quat_xyzw)
     for one, other in zip(two, three[:2], strict=True):
         assert torch.equal(one.solution.motion.local_quat_xyzw, other.solution.motion.local_quat_xyzw)
         assert one.energy == other.energy
-    reseeded = asked(motion, prior, count=2, seed=1).each
+    reseeded = of(motion, count=2, seed=1).each
     assert not torch.equal(two[1].solution.motion.local_quat_xyzw, reseeded[1].solution.motion.local_quat_xyzw)
 
 
+@pytest.mark.slow  # of one motion: test_tween.py
 def test_limbs_are_still_where_they_are_wanted(prior):
-    motion = on_rig("bandai", FRAMES)
+    motion, keys = on_rig("bandai", SHORT), SHORT_KEYS
     hand = motion.skeleton.index("Hand_L")
-    for one in asked(motion, prior, limbs=("Hand_L",)).each:
-        away = (one.solution.motion.joint_positions() - motion.joint_positions())[list(KEYS), hand].norm(dim=-1)
+    for one in asked(motion, prior, keys=keys, limbs=("Hand_L",)).each:
+        away = (one.solution.motion.joint_positions() - motion.joint_positions())[list(keys), hand].norm(dim=-1)
         assert float(away.max()) < 1e-3
 
 
@@ -136,7 +140,7 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     assert float((made.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
 
 
-@pytest.mark.parametrize("frames", [(30, 45), (8, 45)])
+@pytest.mark.parametrize("frames", [(30, 45), pytest.param((8, 45), marks=pytest.mark.slow)])
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
     plain, made, again = (
@@ -184,9 +188,10 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
             asked(motion, prior, count=count)
 
 
-@pytest.mark.parametrize("keys", [KEYS, (0, 44)])
+@pytest.mark.slow
+@pytest.mark.parametrize("keys", [SHORT_KEYS, (0, 24)])
 def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
-    motion = on_rig("canonical", FRAMES)
+    motion = on_rig("canonical", SHORT)
     rollouts = RolloutInbetweener([prior], INFILLER, QUICK)
     make = making(motion, Keys(keys))
     made = lowest_energy(make, rollouts, 4, generator=generator(0), refinement=FEW.refinement)
@@ -214,7 +219,7 @@ def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
 def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys):
     found = set()
     for _ in range(2):
-        words = ["-o", tmp_path / "out.bvh", "--keyframes", "0,20,44", "--best-of", 2, "--report", tmp_path / "r.json"]
+        words = ["-o", tmp_path / "out.bvh", "--keyframes", "0,12,24", "--best-of", 2, "--report", tmp_path / "r.json"]
         assert command(source, *words) == 0
         found.add((tmp_path / "out.bvh").read_bytes())
     assert len(found) == 1
@@ -233,7 +238,7 @@ def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, 
     assert files[0] != files[1]
     assert not (tmp_path / "out.bvh").exists()
     lines = capsys.readouterr().out.splitlines()[:3]
-    assert lines[0].startswith(f"{tmp_path / 'out_000.bvh'}: 45 frames through 3 keys; energy ")
+    assert lines[0].startswith(f"{tmp_path / 'out_000.bvh'}: 25 frames through 3 keys; energy ")
     assert lines[1].startswith(f"{tmp_path / 'out_001.bvh'}: ")
     assert lines[2].startswith("2 variations, on average ")
     told = json.loads((tmp_path / "r.json").read_text())
@@ -245,7 +250,7 @@ def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, 
         assert {"likelihood", "footing", "clearance", "seam"} <= set(row["energy"])
         assert max(key["missed_cm"] for key in row["keys"]) < 1e-3
         assert "skate_cm_s" in row["measures"]
-        assert mapctl.load(row["file"]).num_frames == FRAMES
+        assert mapctl.load(row["file"]).num_frames == SHORT
 
 
 @pytest.mark.parametrize(
@@ -268,7 +273,7 @@ def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, 
 )
 def test_what_cannot_be_is_said_and_nothing_is_written(command, source, tmp_path, monkeypatch, capsys, words, said):
     monkeypatch.chdir(tmp_path)
-    assert command(source, "-o", "out.bvh", "--keyframes", "0,20,44", *words) == 2
+    assert command(source, "-o", "out.bvh", "--keyframes", "0,12,24", *words) == 2
     told = capsys.readouterr()
     assert (told.out, told.err.count("\n")) == ("", 1)
     assert said in told.err

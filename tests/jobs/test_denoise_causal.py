@@ -16,6 +16,7 @@ from mapctl.recording.masks import Mask
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 
+RATES = (("bandai", 24), ("bandai", 30), ("daz", 50), ("canonical", 60), ("daz", 120))
 FAST = replace(
     QUICK, refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=1), budget=Budget(evaluations=1))
 )
@@ -38,8 +39,15 @@ def pushed(motion: Motion, at_once: int = 1, causal=None):
     return given, rest
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("bandai", 24), ("bandai", 30), ("daz", 50), ("canonical", 60), ("daz", 120)])
-@pytest.mark.parametrize("delay", [0.1, 0.2])
+@pytest.mark.parametrize(
+    ("rig", "fps", "delay"),
+    [
+        ("bandai", 30, 0.1),
+        ("daz", 50, 0.2),
+        *(pytest.param(*case, 0.1, marks=pytest.mark.slow) for case in RATES if case != ("bandai", 30)),
+        *(pytest.param(*case, 0.2, marks=pytest.mark.slow) for case in RATES if case != ("daz", 50)),
+    ],
+)
 def test_all_frames_come_back_once_and_within_the_delay(rig, fps, delay):
     motion = noisy(on_rig(rig, round(0.8 * fps), fps=fps))
     given, rest = pushed(motion, causal=CausalSettings(delay=delay, past=0.3))

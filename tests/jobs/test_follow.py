@@ -70,9 +70,9 @@ def test_a_curve_is_walked_once_unless_seconds_say_otherwise():
 
 def test_the_same_seed_gives_the_same_bytes_and_other_seeds_other_walks(tmp_path):
     curve = curves.circle(radius=2)
-    for name, seed in (("a", 1), ("b", 1), ("c", 2), ("d", 3), ("e", 4)):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         follow(curve, seconds=0.5, seed=seed).motion.save(tmp_path / f"{name}.bvh")
-    written = {name: (tmp_path / f"{name}.bvh").read_bytes() for name in "abcde"}
+    written = {name: (tmp_path / f"{name}.bvh").read_bytes() for name in "abc"}
     assert written["a"] == written["b"]
     assert len(set(written.values())) > 1
 

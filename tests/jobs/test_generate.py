@@ -22,7 +22,7 @@ from mapctl.kinematics import heading
 from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
 
-DENSITY = tiny_density()
+DENSITY = replace(tiny_density(), use_fast=False)
 RAW = GenerateSettings(foot_cleanup=None)
 
 

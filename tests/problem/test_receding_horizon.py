@@ -144,7 +144,7 @@ def test_an_interrupt_keeps_whole_windows_and_goes_on_where_there_is_none():
 
 def interrupted():
     """A density in whose first rollout Ctrl-C is pressed."""
-    density = tiny_density()
+    density = replace(tiny_density(), use_fast=False)
     model = density.reference
 
     def press(state, noise, plan):
@@ -156,7 +156,7 @@ def interrupted():
 
 def broken(after):
     """A density that answers NaN from its window number `after` on."""
-    density = tiny_density()
+    density = replace(tiny_density(), use_fast=False)
     model = density.reference
     rollout, advance, windows = model.rollout, model.advance, [0]
 

@@ -123,7 +123,7 @@ def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
 
 
 def test_a_recording_can_be_a_film():
-    assert encode_motion(walk(8), "mp4")[4:8] == b"ftyp"
+    assert encode_motion(walk(3), "mp4")[4:8] == b"ftyp"
 
 
 def test_a_recording_begins_and_ends_with_the_button(show, actors):

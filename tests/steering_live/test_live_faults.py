@@ -113,6 +113,7 @@ def test_a_character_that_is_no_more_is_said_keeps_its_recording_and_comes_back(
     assert len(show._members[0].recording.pieces) == 6
 
 
+@pytest.mark.slow  # what is too slow: test_live_realtime.py
 def test_too_slow_is_said_in_the_page_and_on_the_console_and_so_is_its_end(show, actors, said, monkeypatch):
     monkeypatch.setattr(actors[1], "poll", lambda: [delivered(0, spare=-0.2)])
     monkeypatch.setattr(actors[0], "poll", lambda: [delivered(0, spare=0.02)])
@@ -222,6 +223,7 @@ def controls(show):
     ]
 
 
+@pytest.mark.slow  # without browsers: test_live_inputs.py
 def test_whatever_two_browsers_send_every_command_can_be_obeyed_and_the_recording_is_whole(show, actors, said):
     """As pages send it, past what their fields let through."""
     show.toggle_recording(None)

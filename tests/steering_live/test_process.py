@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import signal
 import time
 from itertools import pairwise
@@ -56,6 +57,7 @@ def test_it_is_a_live_character_that_walks_in_time(remote):
     assert pieces[-1].root[-1, 2] > pieces[0].root[0, 2], "it goes along +z"
 
 
+@pytest.mark.slow
 def test_it_turns_when_told_and_walks_a_path(remote):
     remote.command(Command(1.2, np.pi / 2))
     last = collected(remote, 2.5)[-1]
@@ -104,6 +106,7 @@ def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
     assert np.hypot(*collected(remote, 0.5)[-1].wish) == pytest.approx(1.0, abs=0.05), "the order before it holds"
 
 
+@pytest.mark.slow  # in this process: test_a_worker_says_what_ends_it
 def test_what_it_cannot_load_is_said():
     broken = CharacterProcess(CharacterRequest(functools.partial(priors.load, "nobody"), Command(1.0, 0.0)))
     with pytest.raises(RequestError, match="no prior 'nobody'"):
@@ -130,8 +133,8 @@ def test_who_is_gone_is_said_after_all_that_came_until_then_and_comes_back_by_a_
 class Trap:
     """A prior that ends all steps after the first few."""
 
-    def __init__(self, load):
-        self.prior, self.left = load(), 150
+    def __init__(self, load, left):
+        self.prior, self.left = load(), left
 
     def __getattr__(self, name):
         return getattr(self.prior, name)
@@ -141,10 +144,11 @@ class Trap:
         return self.prior.rollout(*given, **named) if self.left else 1 / 0
 
 
-def trapped(load):
-    return Trap(load)
+def trapped(load, left=150):
+    return Trap(load, left)
 
 
+@pytest.mark.slow  # in this process: test_a_worker_says_what_ends_it
 def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
     broken = CharacterProcess(CharacterRequest(functools.partial(trapped, load), Command(1.0, 0.0)))
     broken.wait()
@@ -154,6 +158,7 @@ def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
+@pytest.mark.slow  # it starts a process of its own, as test_who_is_gone does
 def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
     made = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
     for _ in range(20):  # while it imports
@@ -172,13 +177,33 @@ def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
+def sent_by(here, there, load):
+    """All messages of a worker in this process, until it ends."""
+    run_worker(there, CharacterRequest(load, Command(1.0, 0.0)))
+    messages = []
+    while here.poll():
+        messages.append(here.recv())
+    return messages
+
+
 def test_an_end_that_is_wanted_is_no_failure(load):
     """Else who is started anew after an end is taken for ended, too."""
     here, there = Pipe()
     here.send(("close",))
-    run_worker(there, CharacterRequest(load, Command(1.0, 0.0)))
-    words = []
-    while here.poll():
-        words.append(here.recv()[0])
+    words = [word for word, *_ in sent_by(here, there, load)]
     assert "ready" in words
     assert "failed" not in words
+
+
+@pytest.mark.parametrize(
+    ("breaking", "said"),
+    [
+        (lambda load: functools.partial(priors.load, "nobody"), r"no prior 'nobody'"),
+        (lambda load: functools.partial(trapped, load, 40), r"ZeroDivisionError: .*\(rollout, line \d+\)$"),
+    ],
+    ids=["no such prior", "an error that nobody thought of"],
+)
+def test_a_worker_says_what_ends_it(load, breaking, said):
+    word, text = sent_by(*Pipe(), breaking(load))[-1]
+    assert word == "failed"
+    assert re.search(said, text)

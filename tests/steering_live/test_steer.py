@@ -200,7 +200,9 @@ class Labouring(StreamClock):
         return AHEAD
 
 
-@pytest.mark.parametrize(("seconds", "rate"), [(0.08, 1.0), (0.13, 0.1 / 0.13), (0.5, 0.1 / 0.5)])
+@pytest.mark.parametrize(
+    ("seconds", "rate"), [(0.08, 1.0), pytest.param(0.13, 0.1 / 0.13, marks=pytest.mark.slow), (0.5, 0.1 / 0.5)]
+)
 def test_time_stretches_where_steps_take_longer_than_their_frames_last_and_no_frame_is_lost(seconds, rate):
     clock, shown = Labouring(seconds), Recorder()
     _, records = drive(begun()[0], clock, [shown], frames=120, clock=clock)

@@ -178,7 +178,11 @@ def test_the_command_leaves_out_lists_and_says_it_in_the_card(tmp_path, mixed, m
     assert not (refused / "checkpoint.json").exists()
 
 
-@pytest.mark.parametrize("lengths", [(80, 76), (160,), (160, 40), (90, 90, 90)], ids=str)
+@pytest.mark.parametrize(
+    "lengths",
+    [(80, 76), (160,), *(pytest.param(many, marks=pytest.mark.slow) for many in ((160, 40), (90, 90, 90)))],
+    ids=str,
+)
 def test_few_clips_are_enough(tmp_path, model, lengths, capsys):
     name, words, load = model
     data = write_walks(tmp_path / "data", *lengths)

@@ -106,15 +106,22 @@ def test_whatever_can_be_trained_is_ended_here():
     assert list(MODELS) == list(SUBCOMMANDS["train"])
 
 
-@pytest.fixture(params=MODELS)
+LONGEST = "denoiser"  # which the infiller's recipe is like; test_network_runs.py kills and resumes it quickly
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=pytest.mark.slow if name == LONGEST else ()) for name in MODELS]
+)
 def model(request):
     return MODELS[request.param]
 
 
-@pytest.fixture(autouse=True)
-def short_free_runs(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def short_free_runs():
     whole = density_quality.measure_free_runs
-    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+        yield
 
 
 @pytest.fixture
@@ -164,11 +171,12 @@ def ended(model, request, *, at, method=None, how=send):
 FILES = ("model.safetensors", "model.json", "step-6-checkpoint.safetensors", "checkpoint.json")
 
 
-@pytest.fixture
-def whole(tmp_path, model, request_in):
-    """The folder of an uninterrupted run."""
-    run.train(request_in(tmp_path / "whole"))
-    return tmp_path / "whole"
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, model, data, prior):
+    """The folder of an uninterrupted run, which tests only read."""
+    folder = tmp_path_factory.mktemp("whole") / "whole"
+    run.train(model.recipe(data, folder, prior))
+    return folder
 
 
 def assert_same(run_folder, other):
@@ -371,6 +379,7 @@ def test_a_full_disk_ends_it_with_its_last_checkpoint(tmp_path, data, monkeypatc
     assert mapctl_run(*words, "--resume") == 0
 
 
+@pytest.mark.slow  # another process is ended in test_cli_processes.py
 def test_a_process_ends_so(tmp_path, data):
     words = ["1000000" if word == 6 else str(word) for word in train_words(data, tmp_path / "run")]
     with subprocess.Popen(

@@ -17,7 +17,7 @@ def run(table: Infill) -> int:
     for name in filter(None, table.baselines.split(",")):
         other = priors.load_infiller(name)
         architecture = other.card.config["architecture"]
-        # Two of one kind are told apart by their names.
+        # Two of one kind differ by their names.
         networks[f"{architecture} {name}" if architecture in networks else architecture] = other
     kinds = load_canonical(table.data, infiller.card.data.get("held_out", {}), table.count)
     clips = [clip for found in kinds.values() for clip in found]

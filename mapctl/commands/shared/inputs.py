@@ -39,7 +39,7 @@ def read_rig(text: str | None) -> Rig | None:
 
 
 def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
-    """Whose skeleton a --rig option asks for: a clip; or somebody who stands on the joints of a preset or a TOML file,
+    """Whose skeleton a --rig option asks for: a clip; or a T-pose on the joints of a preset or a TOML file,
     and its rig."""
     if Path(text).suffix.lower() in formats.READERS:
         return formats.load(text), None

@@ -30,7 +30,7 @@ class Walk:
     prior: LstmGmmDensity
     """What moved the character."""
     seed: int
-    """Of everything random."""
+    """Seed of everything random."""
     solution: Solution
     """What came out."""
     person: Character | None = None
@@ -49,7 +49,7 @@ class Walk:
 
     @cached_property
     def measures(self) -> Mapping[str, float]:
-        """Of the motion, against the curve and the wanted way along it."""
+        """Measures of the motion, compared with the curve and the arcs wanted along it."""
         motion = self.solution.motion
         wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
         return report.measure_path(motion, self.request.curve, wanted_m=wanted)

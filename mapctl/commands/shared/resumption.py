@@ -19,7 +19,7 @@ def explain_end(describe: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
-    """Yield a function that is told how many are finished; Ctrl-C, SIGTERM and a full disk say it, and what to do
+    """Yield a function that takes how many are finished; Ctrl-C, SIGTERM and a full disk say it, and what to do
     `then`.
     """
     finished = 0

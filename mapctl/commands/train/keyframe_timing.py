@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainKeyframeTiming(TrainOptions):
-    """Fit how long the way from one pose to the next takes, which tween suggests."""
+    """Fit how long people take from one pose to the next, which tween suggests."""
 
     model = "keyframe-timing"
     used_by = "use it with mapctl tween --suggest-timing --timing"

@@ -21,7 +21,7 @@ _COUNTS = ("width", "components", "steps", "batch", "window", "pairs")
 
 @dataclass(frozen=True)
 class TrainOptions(ABC):
-    """Of any model. A model's own class adds its options, and says what recipe they make."""
+    """Options of `train` for any model. A model's own class adds its options and makes the recipe."""
 
     model: ClassVar[str]
     """As the command line calls it."""
@@ -39,7 +39,7 @@ class TrainOptions(ABC):
     steps: options.MaybeCount = None
     """Optimiser steps in all."""
     seed: options.MaybeCount = None
-    """Of weights, windows, noise and the split of the clips."""
+    """Seed of weights, windows, noise and the split of the clips."""
     resume: bool = False
     """Go on from the run folder's last checkpoint."""
     minutes_between_checkpoints: options.Number = 3.0
@@ -47,7 +47,7 @@ class TrainOptions(ABC):
     strict_data: bool = False
     """Refuse a folder with a file that cannot be used; if not given, such files are left out and listed."""
     licence: Annotated[str, arg(metavar="TEXT")] = "that of the training data"
-    """Of the weights, for their card."""
+    """Licence of the weights, for their card."""
     quiet: bool = False
     """No lines of news."""
 
@@ -133,7 +133,7 @@ class TrainOptions(ABC):
 
 @dataclass(frozen=True)
 class NetworkOptions(TrainOptions):
-    """Of any network that learns from windows of clips."""
+    """Options of any network that learns from windows of clips."""
 
     batch: options.MaybeCount = None
     """Windows a step."""
@@ -145,7 +145,7 @@ class NetworkOptions(TrainOptions):
 
 @dataclass(frozen=True)
 class TunableOptions(NetworkOptions):
-    """Of any network that may begin with another's weights."""
+    """Options of any network that may start from another network's weights."""
 
     learning_rate: options.MaybeNumber = None
     """At its highest; 0.001 from scratch, less to fine-tune."""

@@ -31,27 +31,27 @@ class CorruptionSettings:
     uneven: float = 0.5
     """Spread (of the logarithm) of the noise among joints, in half of the windows."""
     markers: float = 0.15
-    """Share of windows whose noise is that of the joints' places: the shorter a bone, the more it turns."""
+    """Share of windows whose noise is that of the joints' positions: the shorter a bone, the more it turns."""
     marker_cm: tuple[float, float] = (0.5, 6.0)
-    """That noise, log-uniform."""
+    """Noise of the joints' positions, log-uniform."""
     correlated: float = 0.2
     """Share of windows whose noise lasts beyond a frame."""
     spikes: float = 0.02
-    """Of an angle's frames, at most, in half of the windows."""
+    """Largest share of an angle's frames that are spikes, in half of the windows."""
     spike_deg: tuple[float, float] = (15.0, 60.0)
-    """How high they are."""
+    """Height of the spikes."""
     found: float = 0.8
     """Share of the spikes that are taken for what they are, and masked."""
     dropout: float = 0.4
-    """Of a joint's frames, at most, in a quarter of the windows."""
+    """Largest share of a joint's frames that are lost, in a quarter of the windows."""
     limb: float = 0.25
     """Share of windows that lose a limb for a while."""
     gap: float = 0.1
     """Share of windows that lose everything for a while."""
     told: float = 0.2
-    """Error (of the logarithm) of the noise that the network is told."""
+    """Error (of the logarithm) of the noise level that the network is given."""
     size: float = 0.05
-    """Spread of a performer's size: of the logarithm of the way of the hips."""
+    """Spread of a performer's size: of the logarithm of the distance that the hips travel."""
 
 
 def make_clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
@@ -103,7 +103,7 @@ def _bone_lengths() -> Float[Tensor, " joints"]:
 
 
 def _sample_sigmas(settings: CorruptionSettings, draw: Draws) -> tuple[Tensor, Tensor]:
-    """By joint, radians (batch, joints), and of the hips' place, metres (batch,)."""
+    """By joint, radians (batch, joints), and of the hips' position, metres (batch,)."""
     angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, 1)) * (draw.uniform(1) > settings.clean)
     uneven = torch.where(draw.uniform(1) < 0.5, settings.uneven, 0.0) * draw.normal(_JOINTS)
     root = draw.log_uniform(*settings.root_cm) / 100 * (draw.uniform() > settings.clean)

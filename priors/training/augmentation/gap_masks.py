@@ -40,7 +40,7 @@ class GapSettings:
     """Share of windows with lost joints that drop them frame by frame, half of them at most."""
 
     def interpolate_mean_length(self, progress: float) -> float:
-        """Of a gap, frames, `progress` of the way through training."""
+        """Return the mean length of a gap, frames, at a `progress` of training from 0 to 1."""
         return self.shortest + (self.longest - self.shortest) * min(1.0, progress / self.grown)
 
 

@@ -38,7 +38,7 @@ class DenoiserSettings:
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
     pace: float = 0.5
-    """Weight of the joints' error in velocity, cm a frame, beside 1 for that in place, cm."""
+    """Weight of the joints' velocity error, cm a frame; that of the position error, cm, is 1."""
     feet: float = 0.5
     """Weight of the planted toes' error in velocity, cm a frame."""
     angles: float = 10.0
@@ -46,7 +46,7 @@ class DenoiserSettings:
     contacts: float = 0.5
     """Weight of the contacts' cross entropy, nats."""
     evenness: float = 0.5
-    """Of windows among the data's top folders: 0 draws by their frames, 1 the same number from each."""
+    """How evenly windows are drawn from the data's top folders: 0 by their frames, 1 the same number from each."""
     calibration_deg: float = 5.0
     """Spread of a rig's joint frames about the canonical ones, in half of the windows: other rigs find theirs in
     other ways."""
@@ -55,7 +55,7 @@ class DenoiserSettings:
     bfloat16: bool = False
     """The network computes in bfloat16; weights and loss stay in float32."""
     seed: int = 1
-    """Of weights, windows and noise."""
+    """Seed of weights, windows and noise."""
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch")
@@ -78,12 +78,12 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         )
 
     def losses(self) -> dict[str, Tensor]:
-        """Of a batch drawn anew."""
+        """Compute the losses of a newly drawn batch."""
         windows = draw_performers(self.windows, self.settings, self.generator)
         return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """The errors on 6 batches of unseen windows, spoilt in the same way each time."""
+        """Measure the errors on 6 batches of held-out windows, corrupted identically each time."""
         settings, generator, rows = self.settings, torch.Generator().manual_seed(0), []
         # What is held out may have no clip as long as a window; that must not end a run after an hour.
         drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=settings.evenness)

@@ -23,7 +23,7 @@ VALIDATED_GAPS = (15, 30, 60)
 _MARGIN_FRAMES = 8  # frames of a window that a gap must leave
 _ERROR_OFFSET_CM = 0.5  # cm that the guess may be off by before a window's weight falls
 _MAX_ERROR_CM = 4.0  # cm beyond which it falls no more
-_MIN_STD = 0.05  # metres: of a place that hardly moves, as the hips' over their own reference
+_MIN_STD = 0.05  # metres: of a position that hardly moves, as the hips' over their own reference
 
 
 @dataclass(frozen=True)
@@ -39,19 +39,19 @@ class InfillerSettings:
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
     pace: float = 1.0
-    """Weight of the joints' error in velocity, cm a frame, beside 1 for that in place, cm."""
+    """Weight of the joints' velocity error, cm a frame; that of the position error, cm, is 1."""
     feet: float = 0.05
     """Weight of the planted toes' error in velocity, cm a frame."""
     contacts: float = 0.1
     """Weight of the contacts' cross entropy, nats."""
     evenness: float = 0.5
-    """Of windows among the data's top folders: 0 draws by their frames, 1 the same number from each."""
+    """How evenly windows are drawn from the data's top folders: 0 by their frames, 1 the same number from each."""
     gaps: GapSettings = field(default_factory=GapSettings)
     """What is cut out."""
     bfloat16: bool = False
     """The network computes in bfloat16; weights and loss stay in float32."""
     seed: int = 1
-    """Of weights, windows and gaps."""
+    """Seed of weights, windows and gaps."""
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch")
@@ -76,7 +76,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
         self.network.std.copy_(std.clamp_min(_MIN_STD))
 
     def losses(self) -> dict[str, Tensor]:
-        """Of a batch drawn anew."""
+        """Compute the losses of a newly drawn batch."""
         window, progress = self.windows.draw(self.settings.batch, self.generator), self.step / self.settings.steps
         known = sample_observation_mask(window.present, self.settings.gaps, progress=progress, generator=self.generator)
         return compute_infiller_losses(self.network, window, known, self.settings)
@@ -159,6 +159,6 @@ def compute_infiller_losses(
 
 
 def _weigh_windows(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
-    """Of windows: the less, the more the guess is off (mean over coordinates, cm); 1 at 2 cm."""
+    """Weigh windows: the farther off the initial guess (mean over coordinates, cm), the less; 1 at 2 cm."""
     off = (100 * (guess - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
     return (2 + _ERROR_OFFSET_CM) / (off.clamp(max=_MAX_ERROR_CM) + _ERROR_OFFSET_CM)

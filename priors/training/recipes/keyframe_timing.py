@@ -31,9 +31,9 @@ class KeyframeTimingSettings:
     ridge: float = 1.0
     """Weight of the squared weights, of features of about unit spread."""
     min_deviation: float = 0.15
-    """Of the logarithm of seconds, below which all deviations count alike."""
+    """Standard deviation of the logarithm of seconds below which all deviations weigh the same."""
     seed: int = 1
-    """Of the pairs and of the split of the clips."""
+    """Seed of the pose pairs and of the split of the clips."""
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "pairs")
@@ -92,14 +92,14 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
         return KeyframeTimingTrainer(self.config, self.settings, parts.train)
 
     def export(self, trainer: KeyframeTimingTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """In float32: it is no kilobyte."""
+        """Export the weights in float32: they are less than a kilobyte."""
         made = super().export(trainer, gathered, curve)
         tensors = {name: value.float() for name, value in made.tensors.items()}
         return replace(made, tensors=tensors, data={**made.data, "pairs": len(trainer.pairs.seconds)}, half=False)
 
 
 def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, count: int, generator: torch.Generator) -> PosePairs:
-    """Of every clip of a corpus; RequestError where no clip is long enough."""
+    """Draw pose pairs from every clip of a corpus; RequestError where no clip is long enough."""
     origin = GroundPose.origin(torch.float64)
     bodies = (decode(clip.double(), origin) for clip in corpus.clips())
     return sample_pose_pairs(bodies, generator, count=count, shortest=config.shortest, longest=config.longest)
@@ -108,9 +108,10 @@ def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, count: int, generat
 def solve_weights(
     pairs: PosePairs, before: Float[Tensor, " features"] | None, settings: KeyframeTimingSettings
 ) -> Float[Tensor, " features"]:
-    """Of the regression: least squares of the logarithm of seconds with a ridge over features of about unit spread,
-    every pair weighted by one over how far the weights `before` are off there. So, repeated, deviations count by their
-    size and not by its square.
+    """Solve the regression: least squares of the logarithm of seconds with a ridge over features of about unit spread.
+
+    Each pair is weighted by one over the absolute residual of the weights `before`, so that repeated calls minimise
+    absolute instead of squared deviations.
     """
     mean, spread = pairs.features.mean(dim=0), pairs.features.std(dim=0) + 1e-9
     mean[0], spread[0] = 0.0, 1.0
@@ -126,7 +127,7 @@ def solve_weights(
 
 
 def _split_by_distance(pairs: PosePairs) -> tuple[Tensor, Tensor]:
-    """Which pairs are about in place, and which are on their way."""
+    """Return two masks of the pairs: those that stay about in place, and those that travel."""
     going = pairs.metres >= TRAVELLING_DISTANCE
     return ~going, going
 

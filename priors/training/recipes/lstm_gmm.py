@@ -60,11 +60,11 @@ class TrainingSettings:
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     """Free runs held to the data's moments."""
     untold: float = 0.5
-    """Share of the windows of which no label is told; of the others each group (gait, style) is told with 0.7."""
+    """Share of the windows without labels; the others show each group (gait, style) with probability 0.7."""
     bfloat16: bool = False
     """The network computes in bfloat16, weights and loss stay in float32: faster where the processor has it."""
     seed: int = 1
-    """Of weights, windows and noise."""
+    """Seed of weights, windows and noise."""
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch", "window")
@@ -140,7 +140,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         return {"model": self.network}
 
     def losses(self) -> dict[str, Tensor]:
-        """Of a batch drawn anew, nats a frame."""
+        """Compute the losses of a newly drawn batch, nats a frame."""
         self._latest, condition = self._draw_windows()
         return {"loss": -self._log_prob(self._latest, condition).mean()}
 
@@ -192,14 +192,14 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             parameter.grad = share * gradient if parameter.grad is None else parameter.grad + share * gradient
 
     def _draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
-        """Windows of clips and the labels that are told of them."""
+        """Windows of clips with the labels that the network is shown."""
         drawn = self.windows.draw(self.settings.batch, self.generator, mirror=self.settings.mirror)
         labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
         labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
         return drawn.features.to(self.device), self._tell_some(labels).to(self.device)
 
     def _tell_some(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
-        """Most often nothing is told, or one group only, so that the network does well with whatever it is told."""
+        """Mostly show no label or one group only, so that the network works with any subset of labels."""
         if not self.labels.names:
             return labels
         groups = self.labels.groups
@@ -250,7 +250,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     starts: int = 64
     """Moments of mocap that the finished prior carries."""
     labels: str = ""
-    """Regular expression whose named groups read labels from a clip's path, which the density can then be told."""
+    """Regular expression whose named groups read labels from a clip's path, to condition the density on."""
     init: str | None = None
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
@@ -264,7 +264,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         super().check()
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
-        """Of a new network for the clips' labels, or of the one to begin with and its own labels."""
+        """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
         device, known = _select_device(self.device), labels.read(parts.train.names, self.labels)
         if self.init is None:
             config = replace(self.config, labels=known.names)
@@ -274,7 +274,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         return DensityTrainer(before.config, self.settings, parts.train, device, labels=known, init=before.state_dict())
 
     def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
-        """Of the network that is trained."""
+        """Return the configuration of the network that is trained."""
         return trainer.network.config
 
     def describe_data(self, corpus: Corpus) -> dict[str, str]:

@@ -50,9 +50,9 @@ class AdversarialSettings:
     """Updates of the critic before anything else (the paper's 0): a refiner led by a critic that knows nothing spoils
     samples that were nearly good."""
     critic_updates: int = 2
-    """Of the critic in each round (the paper's 1)."""
+    """Updates of the critic in each round (the paper's 1)."""
     refiner_updates: int = 1
-    """Of the refiner in each round (the paper's 5), to begin with; doubled and halved as either wins."""
+    """Initial updates of the refiner in each round (the paper's 5); doubled and halved as either wins."""
     strong: float = 0.01
     """Critic's loss below which the refiner's updates are doubled."""
     weak: float = 1.0
@@ -83,7 +83,7 @@ class AdversarialSettings:
     bfloat16: bool = False
     """The networks compute in bfloat16; weights and losses stay in float32."""
     seed: int = 1
-    """Of weights, windows and noise."""
+    """Seed of weights, windows and noise."""
 
     def __post_init__(self):
         require_at_least(self, 1, "rounds", "batch", "refiner_updates", "critic_updates", "most_updates")
@@ -278,11 +278,11 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
     samples: int = 300
     """Motions of `seconds` drawn from the density to train on."""
     seconds: float = 10.0
-    """Of each."""
+    """Duration of each sampled motion, s."""
     judged: int = 24
     """Motions drawn to be measured, and held-out clips at least, if there are as many."""
     realism: RealismSettings = field(default_factory=RealismSettings)
-    """How samples are told from mocap."""
+    """Settings of the classifier that separates samples from mocap."""
 
     @cached_property
     def prior(self) -> LstmGmmDensity:
@@ -290,7 +290,7 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         return density.load(self.density)
 
     def source(self) -> DataSource:
-        """Where motion comes from: split as the density's, so that what it has not seen stays unseen."""
+        """Gather the data, split as the density's, so that its held-out clips stay held out."""
         seed = self.prior.card.data.get("split_seed", self.settings.seed)
         return replace(super().source(), match=self._find_match(), seed=seed)
 
@@ -320,11 +320,11 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         return None
 
     def score(self, row: Row) -> float:
-        """How far feet, tremble and what is told apart are from mocap's."""
+        """Measure how far foot speed, jitter and classifier accuracy are from mocap's."""
         return compute_realism_gap(row)
 
     def export(self, trainer: AdversarialTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """The best refiner seen."""
+        """Return the best refiner so far."""
         data = {
             "density_config": self.prior.reference.config.as_card(),
             "samples": self.samples,
