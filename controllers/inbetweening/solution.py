@@ -30,11 +30,6 @@ class InbetweenSolution(Solution):
     """A line on each of these: who, how sure, and what nobody knows."""
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """All that the user should know: the status's sentences, then those on the gaps."""
-        return (*self.status.notes, *self.gap_notes)
-
-    @property
     def frame_ms(self) -> float:
         """Compute of each filled frame, milliseconds."""
         return 1000 * self.seconds / max(1, int(self.missing.frames.sum()))

@@ -196,10 +196,10 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     make = making(motion, Keys(keys))
     made = lowest_energy(make, rollouts, 4, generator=generator(0), refinement=FEW.refinement)
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
-    told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.status.notes[-1].split(": ", 1)[1]))
+    told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
     assert list(told) == ["infiller", "slerp", "rollout 1", "rollout 2"]
     winner = min(told, key=lambda name: float(told[name]))
-    assert made.status.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
+    assert made.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
     # Its own energy, found anew, is that told; the answers that variations have as well have the same.
     others = asked(motion, prior, keys=keys).each
     for name, one in zip(("infiller", "rollout 1", "rollout 2"), others, strict=True):

@@ -37,7 +37,7 @@ def run(command: Chain) -> int:
             f"{command.out}: {done.motion.num_frames} frames, {filled} of them filled in between {len(command.clips)}"
             f" clips; {done.frame_ms:.1f} ms a filled frame"
         )
-        for note in done.notes:
+        for note in (*done.notes, *done.gap_notes):
             print(note)
     return 0
 

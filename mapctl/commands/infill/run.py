@@ -69,5 +69,5 @@ def _tell(command: Infill, done: InbetweenSolution) -> None:
         f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
         f" {done.frame_ms:.1f} ms a filled frame"
     )
-    for note in done.notes:
+    for note in (*done.notes, *done.gap_notes):
         print(note)

@@ -53,7 +53,7 @@ def run(command: Tween) -> int:
 def _tell(command: Tween, done: InbetweenSolution, asked: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:
     ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
     print(f"{command.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
-    for note in done.notes:
+    for note in (*done.notes, *done.gap_notes):
         print(note)
     if intervals:
         rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]

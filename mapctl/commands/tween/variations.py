@@ -90,7 +90,9 @@ def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:
         f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
         f" {found.diversity.root_aligned_cm:.1f} cm seen from the hips"
     )
-    print("\n".join(found.each[0].solution.notes))
+    first = found.each[0].solution
+    for note in (*first.notes, *first.gap_notes):
+        print(note)
 
 
 def _report_variations(
