@@ -14,6 +14,19 @@ COMMANDS = Path("mapctl/commands")  # one file a sub-command: the rest of the co
 UNPICKLERS = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal", "joblib"}
 PROCESSES = {"joblib", "joblib.Parallel", "joblib.delayed"}  # of an unpickler, what reads no files
 MAX_LINES = 400
+FLOORS = {
+    "mapctl": (
+        "mesh numerics solver",
+        "formats kinematics",
+        "curves retarget",
+        "intent recording terms",
+        "inbetweening problem runtime",
+        "metrics",
+        "commands",
+    ),
+    "controllers": ("common", "denoising following generation inbetweening steering", "benchmarks"),
+}
+"""Rooms from the ground up: each imports only from those on lower floors, and its own."""
 
 
 def direction_faults(file: Path, tree: ast.Module) -> set[str]:
@@ -84,6 +97,43 @@ def test_wrong_imports_are_seen(file, source):
 )
 def test_right_imports_pass(file, source):
     assert direction_faults(Path(file), ast.parse(source)) == set()
+
+
+def floor_of(package: str, name: str) -> int | None:
+    """Of a module's room; None where it is in none."""
+    parts = name.split(".")
+    room = parts[1] if parts[0] == package and len(parts) > 1 else ""
+    return next((floor for floor, rooms in enumerate(FLOORS[package]) if room in rooms.split()), None)
+
+
+def floor_faults(package: str, file: Path, tree: ast.Module) -> list[str]:
+    """What a module imports from a room on its own floor or above."""
+    own, room = floor_of(package, ".".join(file.with_suffix("").parts)), file.parts[1]
+    return [
+        name
+        for name in imports(file, tree)
+        if own is not None and (floor := floor_of(package, name)) is not None
+        if name.split(".")[1] != room and floor >= own
+    ]
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_rooms_stand_on_those_below(package):
+    files = [file for file in PACKAGE_FILES if file.parts[0] == package]
+    assert {file.parts[1] for file in files if len(file.parts) > 2} == set(" ".join(FLOORS[package]).split())
+    assert [f"{file}: {name}" for file in files for name in floor_faults(package, file, tree_of(file))] == []
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("mapctl/kinematics/inverse.py", "from mapctl.problem import objective"),
+        ("mapctl/terms/path.py", "from mapctl.recording import masks"),
+        ("controllers/common/score.py", "def late():\n    from controllers.steering import steer"),
+    ],
+)
+def test_a_room_that_reaches_up_is_seen(file, source):
+    assert floor_faults(file.split("/")[0], Path(file), ast.parse(source))
 
 
 def test_unsafe_lines_are_seen():

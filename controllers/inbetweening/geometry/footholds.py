@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.kinematics.whole_body import bend_limbs
+from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets

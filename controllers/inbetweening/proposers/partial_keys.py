@@ -3,7 +3,7 @@
 An in-betweener that sees the position of one hand in one frame keeps it there in that frame and goes on beside it as if
 it had seen nothing. So it does not see it. It is asked twice: first without the part, which shows how the trajectory
 must lead for the part to come about; then along that trajectory. What is left at the key's frame is done by as little
-of the whole body as possible (see `mapctl.kinematics.whole_body`), which goes there and back at a usual acceleration.
+of the whole body as possible (see `mapctl.inbetweening.whole_body`), which goes there and back at a usual acceleration.
 """
 
 import math
@@ -18,8 +18,8 @@ from mapctl import rotations
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.whole_body import bend_limbs, reach_targets
 from mapctl.kinematics import heading
-from mapctl.kinematics.whole_body import bend_limbs, reach_targets
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets

@@ -7,7 +7,7 @@ from helpers import generator, walk
 
 from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.kinematics.whole_body import reach_targets
+from mapctl.inbetweening.whole_body import reach_targets
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 
