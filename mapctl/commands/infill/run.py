@@ -9,7 +9,7 @@ from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, i
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import formats, report
 from mapctl.commands.infill import Infill
-from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.frame_syntax import parse_ranges
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
@@ -35,8 +35,9 @@ def run(command: Infill) -> int:
 
 
 def _check(command: Infill) -> None:
-    if command.curve is not None and command.method == "slerp":
-        raise RequestError("--curve needs a network's steps; leave --method slerp out")
+    options.check_seed(command.seed)
+    if command.curve is not None and command.method in ("slerp", "rollouts"):
+        raise RequestError(f"--curve needs the infiller's steps; leave --method {command.method} out")
     results.check_method(command.method, finish=not command.no_finish, prior=command.prior, infiller=command.infiller)
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
 
