@@ -82,6 +82,12 @@ def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
     assert "cannot all hold" in capsys.readouterr().out
     assert run(*words, "--strict") == 0
     assert (tmp_path / "a.bvh").exists()
+    scene = (
+        f'prior = "{prior}"\noutputs = ["a.bvh"]\n[[actors]]\nname = "a"\ncurve = "line:4"\nseconds = 0.4\nspeed = 6\n'
+    )
+    (tmp_path / "fast.toml").write_text(scene)
+    for strict, status in (((), 0), (("--strict",), 3)):
+        assert run("run", tmp_path / "fast.toml", "-o", tmp_path / "scene", "--quiet", *strict) == status
 
 
 def test_generate_writes_different_clips(prior, tmp_path):

@@ -21,5 +21,7 @@ class RunScene(Command):
     rig: options.OutRig = "canonical"
     """Whose body the actors have: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
+    strict: bool = False
+    """Exit with status 3 where not all that was asked of every actor holds."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -10,7 +10,7 @@ import scenes
 from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.run import RunScene
-from mapctl.commands.shared import exit_status, options, outputs
+from mapctl.commands.shared import exit_status, options, outputs, results
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
@@ -36,7 +36,9 @@ def run(command: RunScene) -> int:
     walks, interrupted = _walk(command, scene, requests, priors.load(scene.prior), read_character(command.rig))
     with outputs.make_folder(command.out):
         _write(command, scene, walks, films=() if interrupted else scene.films(command.out))
-    return exit_status.INTERRUPTED if interrupted else 0
+    if interrupted:
+        return exit_status.INTERRUPTED
+    return max(results.conclude(done.solution.status, strict=command.strict) for done in walks)
 
 
 def _walk(
