@@ -117,7 +117,7 @@ def test_a_folder_becomes_a_folder_of_the_same_names(denoise, folder, tmp_path, 
     assert denoise(folder, "-o", out, "--report", reports) == 0
     assert sorted(str(f.relative_to(out)) for f in out.rglob("*.*")) == ["a.bvh", "deep/b.bvh"]
     assert sorted(str(f.relative_to(reports)) for f in reports.rglob("*.*")) == ["a.json", "deep/b.json"]
-    assert json.loads((reports / "a.json").read_text())["frames"] == 20
+    assert json.loads((reports / "a.json").read_text())["motion"]["frames"] == 20
     assert "2 denoised" in capsys.readouterr().out
 
 

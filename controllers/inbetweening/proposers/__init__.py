@@ -9,7 +9,15 @@ from controllers.inbetweening.proposers.slerp import SlerpInbetweener
 from mapctl.errors import RequestError
 from mapctl.protocols import Density, Inbetweener
 
-__all__ = ["METHODS", "AutoInbetweener", "ModelLoaders", "RolloutInbetweener", "SlerpInbetweener", "build_inbetweener"]
+__all__ = [
+    "METHODS",
+    "AutoInbetweener",
+    "ModelLoaders",
+    "RolloutInbetweener",
+    "SlerpInbetweener",
+    "build_inbetweener",
+    "check_method",
+]
 
 
 @dataclass(frozen=True)
@@ -32,9 +40,14 @@ METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
 _RENAMED = {"map": "--method auto", "linear": "--method slerp --no-finish"}
 
 
-def build_inbetweener(method: str, models: ModelLoaders) -> Inbetweener:
-    """Build the in-betweener of a method; RequestError for one that there is not."""
+def check_method(method: str) -> None:
+    """RequestError for a method that there is not."""
     if method not in METHODS:
         known = f"{method} is now {_RENAMED[method]}" if method in _RENAMED else f"there are {', '.join(METHODS)}"
-        raise RequestError(f"no method {method!r}; {known}")
+        raise RequestError(f"there is no --method {method}; {known}")
+
+
+def build_inbetweener(method: str, models: ModelLoaders) -> Inbetweener:
+    """Build the in-betweener of a method; RequestError for one that there is not."""
+    check_method(method)
     return METHODS[method](models)

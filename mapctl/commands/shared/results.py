@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import priors
+from controllers.inbetweening import proposers
 from controllers.inbetweening.proposers import ModelLoaders
 from mapctl import formats, metrics
 from mapctl import report as reports
@@ -32,7 +33,8 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
 
 
 def check_method(method: str, *, finish: bool, prior: str | None = None, infiller: str | None) -> None:
-    """RequestError for a density or a network that is asked for by a method that has no use for it."""
+    """RequestError for a method that there is not, and for a density or a network that it has no use for."""
+    proposers.check_method(method)
     if prior is not None and not finish and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
     if infiller is not None and method == "slerp":
