@@ -12,6 +12,7 @@ from controllers.benchmarks import infilling
 from controllers.benchmarks.infilling import TASKS, Task, benchmark_infilling, scale_to_canonical_bones, slice_middle
 from mapctl import retarget
 from mapctl.inbetweening import ProposedPositions
+from mapctl.protocols import PositionInfiller
 from priors import checkpoints
 from priors.infiller.network import ConvInfiller
 
@@ -94,7 +95,7 @@ def test_an_untrained_network_is_interpolation_and_no_better(clips, monkeypatch)
     assert found["skips, raw"]["error_cm"] == pytest.approx(found["interpolation"]["error_cm"], rel=1e-5)
 
 
-class Keeping:
+class Keeping(PositionInfiller):
     """Keeps the images that it is shown."""
 
     def __init__(self):

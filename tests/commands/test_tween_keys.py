@@ -83,7 +83,7 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
     hand = canonical.joint_positions()[15, canonical.skeleton.index("leftHand")]
     assert hand.tolist() == pytest.approx([0.4, 1.2, 0.8], abs=2e-3)
     assert canonical.root_position[40, ::2].tolist() == pytest.approx([0.3, 1.5], abs=1e-4)
-    assert "timing" not in told
+    assert "key_timing" not in told
 
 
 def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
@@ -93,7 +93,7 @@ def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     words = [*words_of("slerp"), "--suggest-timing", "--report", "r.json"]
     assert run("tween", keys, "-o", "out.bvh", *words) == 0
     assert Path("out.bvh").read_bytes() == Path("plain.bvh").read_bytes()
-    (row,) = json.loads(Path("r.json").read_text())["timing"]
+    (row,) = json.loads(Path("r.json").read_text())["key_timing"]
     assert (row["from"], row["to"], row["given"]) == (0, 40, 40)
     assert row["usual"][0] <= row["suggested"] <= row["usual"][1]
     told = capsys.readouterr().out
