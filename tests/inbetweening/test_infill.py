@@ -166,6 +166,13 @@ def test_a_lost_arm_comes_back_from_its_true_places():
     assert (made.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.01
 
 
+def test_what_is_known_keeps_even_the_signs_of_its_quaternions():
+    motion = on_rig("bandai", 45)
+    motion.local_quat_xyzw[30:] *= -1
+    made = filled(motion, Mask(ALL, 15, 25)).motion
+    assert torch.equal(made.local_quat_xyzw[25:], motion.local_quat_xyzw[25:])
+
+
 def test_the_place_of_the_body_can_be_lost_alone():
     motion = on_rig("bandai", 45)
     made = filled(motion, Mask(ROOT, 15, 25))

@@ -147,6 +147,30 @@ def test_the_view_of_a_trial_at_another_size_is_to_scale():
     torch.testing.assert_close(large.before, character.scale * small.before)
 
 
+@dataclass(frozen=True)
+class FarFromOrigin:
+    """Asks nothing; its residual is the hips' distance from the world's origin over the ground."""
+
+    name: str = "far"
+    unit: str = "m"
+
+    def __call__(self, trial):
+        return 0.0 * trial.features[..., 0]
+
+    def residual(self, trial):
+        return trial.root_xz_world.norm(dim=-1)
+
+
+@pytest.mark.parametrize("start", [None, WALKER], ids=["origin", "clip"])
+def test_terms_of_a_generated_motion_see_where_it_is_in_the_world(start):
+    """Its windows are solved near their own origin, for precision."""
+    done = generate(TOY, seconds=2.0, generator=generator(), start_clip=start, terms=[FarFromOrigin()])
+    (entry,) = [entry for entry in done.ledger.entries if entry.name == "far"]
+    away = done.motion.root_position[:, ::2].norm(dim=-1)
+    assert float(away[-1]) > 0.5
+    torch.testing.assert_close(entry.residual.double(), away, atol=2e-3, rtol=0)
+
+
 def test_terms_without_a_clean_up_to_join_are_refused():
     with pytest.raises(RequestError, match="terms are wishes to the foot clean-up"):
         generate(
