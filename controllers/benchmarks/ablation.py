@@ -1,4 +1,4 @@
-"""Which of the solver's choices pay: starts and unknowns compared on the same curves."""
+"""Ablation of the solver: warm starts and unknowns compared on the same curves."""
 
 import time
 from collections.abc import Sequence
@@ -21,9 +21,11 @@ from mapctl.protocols import Density
 from mapctl.solver.budget import Budget
 from mapctl.terms import LatentPrior, Likelihood, Term
 
+_MEASURES = ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")
+
 
 def benchmark_ablation(prior: Density, *, seconds: float = 5.0, seed: int = 0) -> list[Row]:
-    """Energy, path error and time by start and unknowns, on three smooth curves and a corner."""
+    """Measure energy, path error and time by warm start and unknowns, on three smooth curves and a corner."""
     shapes = {
         "circle:4": curves.circle(radius=4.0),
         "figure8:2": curves.figure8(radius=2.0),
@@ -62,14 +64,11 @@ def _evaluate_variant(
     return {
         "method": label,
         "energy_nats": _target_energy(solution),
-        "path_error_mean_cm": found["path_error_mean_cm"],
-        "path_error_max_cm": found["path_error_max_cm"],
-        "contact_speed_cm_s": found["contact_speed_cm_s"],
-        "jitter_m_s3": found["jitter_m_s3"],
+        **{name: found[name] for name in _MEASURES},
         "ms_per_frame": 1000 * spent / solution.motion.num_frames,
     }
 
 
 def _target_energy(solution: Solution) -> float:
-    """Nats of the wishes, which all variants share (the prior's part is measured in different spaces)."""
+    """Sum the energy of the terms that all variants share, nats (the prior's is measured in different spaces)."""
     return float(sum(e.energy.sum() for e in solution.ledger.entries if e.name in ("path", "footing")))

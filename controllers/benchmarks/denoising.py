@@ -1,4 +1,4 @@
-"""What denoising is worth: clips that no training saw, spoilt in known ways, beside filters tuned on the truth."""
+"""Benchmark of denoising: held-out clips with known corruptions, beside filters tuned on the truth."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording.inspection import Inspection, inspect_recording
 
 STANDARD_CONDITION = "5 degrees, 2 cm, 1 % spikes"
-"""The condition of the table by kind."""
+"""Condition of the table by kind of clip."""
 _CUTOFFS = (1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12)  # Hz
 _SPANS = (0.1, 0.17, 0.23, 0.3, 0.4, 0.5, 0.7, 1.0)  # seconds of a Savitzky-Golay window
 
@@ -36,19 +36,19 @@ def benchmark_denoising(
     densities: Sequence[Density] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """By condition over all clips, then by kind of clip in the standard condition, then clean clips."""
-    rows, done, conditions = [], 0, list(CONDITIONS)
+    """Measure each condition over all clips, then each kind of clip in the standard condition, then clean clips."""
+    rows, done, total = [], 0, len(clips) * (len(CONDITIONS) + 1)
     by_kind: dict[str, list[Row]] = {}
-    for name in conditions:
+    for name, corrupt in CONDITIONS.items():
         found = []
         for number, clip in enumerate(clips):
-            spoilt = CONDITIONS[name](clip.motion, torch.Generator().manual_seed(number))
-            found.append(evaluate_clip(clip.motion, spoilt, denoiser, densities, infiller))
+            corrupted = corrupt(clip.motion, torch.Generator().manual_seed(number))
+            found.append(evaluate_clip(clip.motion, corrupted, denoiser, densities, infiller))
             if name == STANDARD_CONDITION:
                 by_kind.setdefault(clip.kind, []).append(found[-1])
             done += 1
             if progress is not None:
-                progress(done, len(clips) * (len(conditions) + 1))
+                progress(done, total)
         rows.append({"what": name, "clips": len(clips), **average_rows(found)})
     rows += [
         {"what": f"{kind}, {STANDARD_CONDITION}", "clips": len(found), **average_rows(found)}
@@ -56,36 +56,35 @@ def benchmark_denoising(
     ]
     clean = []
     for clip in clips:
-        clean.append(
-            {"out_cm": _mean_joint_error_cm(clip.motion, denoise(clip.motion, denoiser, densities=densities).motion)}
-        )
+        denoised = denoise(clip.motion, denoiser, densities=densities).motion
+        clean.append({"out_cm": _mean_joint_error_cm(clip.motion, denoised)})
         done += 1
         if progress is not None:
-            progress(done, len(clips) * (len(conditions) + 1))
+            progress(done, total)
     return [*rows, {"what": "clean, change", "clips": len(clips), **average_rows(clean)}]
 
 
 def evaluate_clip(
     truth: Motion,
-    spoilt: CorruptedClip,
+    corrupted: CorruptedClip,
     denoiser: Denoiser,
     densities: Sequence[Density] = (),
     infiller: Inbetweener | None = None,
 ) -> Row:
-    """Mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside mocap's,
-    milliseconds a frame; where joints are masked and there is an infiller, its error too.
+    """Measure the mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside
+    mocap's, milliseconds a frame; where joints are masked and there is an infiller, its error too.
     """
     filled = float("nan")
-    if infiller is not None and spoilt.masks:
-        filled = _mean_joint_error_cm(truth, infill(spoilt.motion, infiller, spoilt.masks).motion)
+    if infiller is not None and corrupted.masks:
+        filled = _mean_joint_error_cm(truth, infill(corrupted.motion, infiller, corrupted.masks).motion)
     began = time.perf_counter()
-    done = denoise(spoilt.motion, denoiser, masks=spoilt.masks, densities=densities)
+    done = denoise(corrupted.motion, denoiser, masks=corrupted.masks, densities=densities)
     seconds = time.perf_counter() - began
-    butterworth, savgol = tune_filters(truth, inspect_recording(spoilt.motion, spoilt.masks))
+    butterworth, savgol = tune_filters(truth, inspect_recording(corrupted.motion, corrupted.masks))
     ours, mocap = metrics.measure(done.motion), metrics.measure(truth)
     out = _mean_joint_error_cm(truth, done.motion)
     return {
-        "in_cm": _mean_joint_error_cm(truth, spoilt.motion),
+        "in_cm": _mean_joint_error_cm(truth, corrupted.motion),
         "out_cm": out,
         "butterworth_cm": butterworth,
         "savgol_cm": savgol,
@@ -100,32 +99,28 @@ def evaluate_clip(
     }
 
 
-def tune_filters(truth: Motion, examined: Inspection) -> tuple[float, float]:
-    """Lowest joint error (cm) of a Butterworth and of a Savitzky-Golay filter over the root's place and the joints'
-    quaternions, tuned on the truth; what is masked is filled in first, spikes are not told to them.
+def tune_filters(truth: Motion, inspection: Inspection) -> tuple[float, float]:
+    """Compute the lowest joint error (cm) of a Butterworth and of a Savitzky-Golay filter over the root position and
+    the joints' quaternions, tuned on the truth; masked values are filled in first, spikes are not.
     """
-    known = replace(
-        examined, spikes=torch.zeros_like(examined.spikes), spikes_root=torch.zeros_like(examined.spikes_root)
-    )
-    motion, fps = known.repaired(), float(truth.fps)
+    none, none_root = torch.zeros_like(inspection.spikes), torch.zeros_like(inspection.spikes_root)
+    motion, fps = replace(inspection, spikes=none, spikes_root=none_root).repaired(), float(truth.fps)
     butterworth, savgol = [], []
     for cutoff in _CUTOFFS:
         if cutoff < fps / 2:
-            sections = butter(2, cutoff / (fps / 2), output="sos")  # forth and back: fourth order
-            butterworth.append(
-                _mean_joint_error_cm(truth, _apply_filter(motion, lambda v, s=sections: sosfiltfilt(s, v, axis=0)))
-            )
+            sections = butter(2, cutoff / (fps / 2), output="sos")  # forward and backward: fourth order
+            filtered = _apply_filter(motion, lambda v, s=sections: sosfiltfilt(s, v, axis=0))
+            butterworth.append(_mean_joint_error_cm(truth, filtered))
     for span in _SPANS:
         width = 2 * round(span * fps / 2) + 1
         if 5 <= width <= motion.num_frames:
-            savgol.append(
-                _mean_joint_error_cm(truth, _apply_filter(motion, lambda v, w=width: savgol_filter(v, w, 3, axis=0)))
-            )
+            filtered = _apply_filter(motion, lambda v, w=width: savgol_filter(v, w, 3, axis=0))
+            savgol.append(_mean_joint_error_cm(truth, filtered))
     return min(butterworth), min(savgol)
 
 
 def contact_f1(truth: Motion, done: DenoiseSolution) -> float:
-    """Of planted toes in frames, against the thresholds' own answer on the clean clip; NaN where none is planted."""
+    """Compute the F1 score of contacts by frame against those detected on the clean clip; NaN where it has none."""
     wanted, found = detect_true_contacts(truth), done.contacts
     at = (torch.arange(len(found)) * float(truth.fps) / PRIOR_FPS).round().long().clamp(max=len(wanted) - 1)
     wanted = wanted[at]
@@ -135,19 +130,19 @@ def contact_f1(truth: Motion, done: DenoiseSolution) -> float:
 
 
 def _apply_filter(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion:
-    def over(values: Tensor) -> Tensor:
+    def smooth_tensor(values: Tensor) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(np.asarray(smooth(values.numpy()))))
 
-    quats = over(rotations.make_sign_continuous(motion.local_quat_xyzw))
-    moving = {joint: over(values) for joint, values in motion.moving_offsets.items()}
+    quats = smooth_tensor(rotations.make_sign_continuous(motion.local_quat_xyzw))
+    moving = {joint: smooth_tensor(values) for joint, values in motion.moving_offsets.items()}
     return replace(
         motion,
-        root_position=over(motion.root_position),
+        root_position=smooth_tensor(motion.root_position),
         moving_offsets=moving,
         local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1),
     )
 
 
 def _mean_joint_error_cm(truth: Motion, other: Motion) -> float:
-    """Mean distance of the joints, cm."""
+    """Compute the mean distance of the joints, cm."""
     return 100 * float((truth.joint_positions() - other.joint_positions()).norm(dim=-1).mean())

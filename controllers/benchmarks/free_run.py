@@ -1,4 +1,4 @@
-"""Long free runs of a density: whether a character stops or comes apart."""
+"""Benchmark of long free runs of a density: whether a character stops or diverges."""
 
 from collections.abc import Mapping
 
@@ -15,9 +15,9 @@ from mapctl.protocols import Density
 def benchmark_free_run(
     prior: Density, data: Mapping[str, float], *, runs: int = 8, frames: int = 10_000, seed: int = 0
 ) -> list[Row]:
-    """Long free runs at temperature 1: a row each, and one of their means beside the training `data`'s own values.
+    """Measure long free runs at temperature 1: a row each, and one of their means beside the training `data`'s values.
 
-    A character that had stopped would show in its slowest second; one that came apart in its largest feature, in
+    A character that had stopped would show in its slowest second; one that had diverged in its largest feature, in
     standard deviations.
     """
     rows, everything = [], []
@@ -40,8 +40,8 @@ def benchmark_free_run(
 
 def _sample_free_run(prior: Density, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    told, state, _ = initialise_generation(prior, GenerateSettings(), None, generator)
-    return told.sample(state, frames, generator)[0][0]
+    conditioned, state, _ = initialise_generation(prior, GenerateSettings(), None, generator)
+    return conditioned.sample(state, frames, generator)[0][0]
 
 
 def _standardise_features(prior: Density, features: Tensor) -> Tensor:

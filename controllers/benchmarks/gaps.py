@@ -1,4 +1,4 @@
-"""How far answers for gaps are from the truth, by who gave them and how long the gap was: what notes on gaps tell."""
+"""Benchmark of gaps: errors of proposals by in-betweener and length of the gap, from which notes on gaps are made."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -27,56 +27,57 @@ def benchmark_gaps(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Fill gaps of so many frames in the middle of clips (canonical, at PRIOR_FPS): quantiles over clips of the mean
-    error of all joints in the world, by who answered and whether the body is travelling; and the longest time
-    unsupported beside mocap's.
+    """Fill gaps in the middle of clips (canonical, at PRIOR_FPS): quantiles over clips of the mean error of all joints
+    in the world, by in-betweener and by whether the body is travelling; and the longest unsupported time beside
+    mocap's.
     """
     found: dict[tuple[str, str, int, int], list[Row]] = {}
     clips = [clip for each in kinds.values() for clip in each]
     for number, clip in enumerate(clips):
         for length in GAP_LENGTHS:
-            for beside in _CONTEXT_LENGTHS:
-                row = _evaluate_gap(clip, length, beside, infiller, densities)
+            for context in _CONTEXT_LENGTHS:
+                row = _evaluate_gap(clip, length, context, infiller, densities)
                 if row is not None:
                     by = row.pop("by").split(" ")[0]
-                    found.setdefault((by, row.pop("what"), beside, length), []).append(row)
+                    found.setdefault((by, row.pop("what"), context, length), []).append(row)
         if progress is not None:
             progress(number + 1, len(clips))
     return [
-        {"by": by, "what": what, "beside": beside, "frames": length, "gaps": len(rows), **_summarise_gaps(rows)}
-        for (by, what, beside, length), rows in sorted(found.items())
+        {"by": by, "what": what, "beside": context, "frames": length, "gaps": len(rows), **_summarise_gaps(rows)}
+        for (by, what, context, length), rows in sorted(found.items())
     ]
 
 
 def _evaluate_gap(
-    clip: Motion, length: int, beside: int, infiller: Inbetweener, densities: Sequence[Density]
+    clip: Motion, length: int, context: int, infiller: Inbetweener, densities: Sequence[Density]
 ) -> Row | None:
-    """None for a clip that is too short."""
-    if clip.num_frames < length + 2 * beside:
+    """Measure one gap of a clip; None for a clip that is too short."""
+    if clip.num_frames < length + 2 * context:
         return None
-    first = (clip.num_frames - length) // 2 - beside
-    part = clip.slice(first, first + length + 2 * beside)
+    first = (clip.num_frames - length) // 2 - context
+    part = clip.slice(first, first + length + 2 * context)
     free = torch.zeros(part.num_frames, dtype=torch.bool)
-    free[beside : beside + length] = True
-    lost = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
-    done = fill(part, lost, AutoInbetweener(infiller, densities))
-    off = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
+    free[context : context + length] = True
+    missing = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
+    done = fill(part, missing, AutoInbetweener(infiller, densities))
+    errors = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = CANONICAL.indices(TOES)
-    slid, mocap = (
+    unsupported, mocap = (
         worst_frame.measure_longest_unsupported(each.joint_positions()[:, toes], each.root_position, PRIOR_FPS)
         for each in (done.motion, part)
     )
-    what = "going" if is_travelling(part, beside - 1, beside + length) else "in place"
-    return {"by": done.sources[0].by, "what": what, "error": 100 * float(off.mean()), "slid": slid, "mocap": mocap}
+    what = "going" if is_travelling(part, context - 1, context + length) else "in place"
+    error = 100 * float(errors.mean())
+    return {"by": done.sources[0].by, "what": what, "error": error, "unsupported": unsupported, "mocap": mocap}
 
 
 def _summarise_gaps(rows: Sequence[Row]) -> Row:
     error = torch.tensor([row["error"] for row in rows], dtype=torch.float64)
-    slid, mocap = (torch.tensor([row[name] for row in rows]) for name in ("slid", "mocap"))
+    unsupported, mocap = (torch.tensor([row[name] for row in rows]) for name in ("unsupported", "mocap"))
     return {
         "half_cm": float(error.median()),
         "nine_in_ten_cm": float(error.quantile(0.9)),
-        "unsupported_s": float(slid.mean()),
-        "worst_s": float(slid.max()),
+        "unsupported_s": float(unsupported.mean()),
+        "worst_s": float(unsupported.max()),
         "mocap_worst_s": float(mocap.max()),
     }

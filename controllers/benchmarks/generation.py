@@ -1,4 +1,4 @@
-"""What the refiner and the finishing pass are worth: the rnn paper's figure 12, measured instead of voted."""
+"""Benchmark of the refiner and the foot clean-up: Wang et al. 2019, figure 12, by measures instead of votes."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -27,22 +27,22 @@ _MEASURES = ("contact_speed_cm_s", "skate_cm_s", "jitter_m_s3", "penetration_cm"
 
 @dataclass(frozen=True)
 class GenerationBenchmarkSettings:
-    """How much is drawn."""
+    """Size of the benchmark."""
 
     count: int = 48
-    """Clips of each variant."""
+    """Number of clips of each variant."""
     seconds: float = 10.0
-    """Of each clip."""
+    """Length of each clip, seconds."""
     samples_per_start: int = 8
-    """Samples from one start, whose distance is the diversity."""
+    """Number of samples from one initial state, whose pairwise distance is the diversity."""
     sample_seconds: float = 4.0
-    """Of each of them."""
+    """Length of each of these samples, seconds."""
     running: float = 1.9
     """Mean speed from which a clip counts as a run, m/s."""
     seed: int = 0
-    """Of starts and draws; every variant draws the same."""
+    """Seed of initial states and samples, the same for every variant."""
     realism: RealismSettings = field(default_factory=RealismSettings)
-    """Of the classifier."""
+    """Settings of the classifier."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ def benchmark_generation(
     mocap: Sequence[Motion],
     settings: GenerationBenchmarkSettings | None = None,
 ) -> list[Row]:
-    """A row for mocap and one for each variant, walking and running apart, then all together.
+    """Measure a row for mocap and one for each variant, walks and runs apart, then both together.
 
-    `mocap` is canonical motion that no training saw. RequestError where it holds no walk or no run.
+    `mocap` is canonical motion held out from training. RequestError where it holds no walk or no run.
     """
     settings = settings or GenerationBenchmarkSettings()
     kinds = _split_by_kind(mocap, settings)
@@ -73,8 +73,10 @@ def benchmark_generation(
     spread = measure_gait_spread(mocap)
     for variant in _list_variants(refiner):
         clips, cost = _generate_clips(prior, variant, settings)
-        for kind, some in _split_by_kind(clips, settings).items():
-            rows.append({"motion": kind, "variant": variant.name, "clips": len(some), **_mean_measures(some)})
+        for kind, kind_clips in _split_by_kind(clips, settings).items():
+            rows.append(
+                {"motion": kind, "variant": variant.name, "clips": len(kind_clips), **_mean_measures(kind_clips)}
+            )
         rows.append(
             {
                 "motion": "both",
@@ -90,48 +92,48 @@ def benchmark_generation(
 
 
 def _list_variants(refiner: Refiner | None) -> list[_Variant]:
-    refined = (
-        []
-        if refiner is None
-        else [
-            _Variant("density, refiner", refiner, None),
-            _Variant("density, refiner, footing", refiner, FootCleanupSettings()),
-        ]
-    )
-    return [_Variant("density", None, None), _Variant("density, footing", None, FootCleanupSettings()), *refined]
+    variants = [_Variant("density", None, None), _Variant("density, footing", None, FootCleanupSettings())]
+    if refiner is not None:
+        variants.append(_Variant("density, refiner", refiner, None))
+        variants.append(_Variant("density, refiner, footing", refiner, FootCleanupSettings()))
+    return variants
 
 
 def _generate_clips(
     prior: Density, variant: _Variant, settings: GenerationBenchmarkSettings
 ) -> tuple[list[Motion], float]:
-    """Clips, and milliseconds of processor time a frame."""
-    wishes, clips = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
+    """Generate clips, and measure milliseconds of processor time a frame."""
+    variant_settings, clips = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
     starts = sample_stratified_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
     began = time.process_time()
     for number, start in enumerate(starts):
-        own = replace(wishes, start=start)
+        own = replace(variant_settings, start=start)
         clips.append(_generate_clip(prior, variant, own, settings.seconds, settings.seed + number))
     spent = time.process_time() - began
     return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
 
 
-def _generate_clip(prior: Density, variant: _Variant, wishes: GenerateSettings, seconds: float, seed: int) -> Motion:
+def _generate_clip(
+    prior: Density, variant: _Variant, variant_settings: GenerateSettings, seconds: float, seed: int
+) -> Motion:
     generator = torch.Generator().manual_seed(seed)
-    return generate(prior, seconds=seconds, generator=generator, settings=wishes, refiner=variant.refiner).motion
+    return generate(
+        prior, seconds=seconds, generator=generator, settings=variant_settings, refiner=variant.refiner
+    ).motion
 
 
 def _compare_gait_spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread]) -> Row:
-    """How widely step length, speed and turning spread, as shares of the data's spread."""
+    """Compute the standard deviations of step length, speed and turning as ratios to the data's."""
     return {f"{name}_spread": ratio for name, ratio in spread_ratios(measure_gait_spread(clips), data).items()}
 
 
 def _measure_diversity(prior: Density, variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
-    """Average pairwise distance of samples from one start, mean over a few starts."""
+    """Measure the average pairwise distance of samples from one initial state, mean over a few."""
     found = []
     for start in range(0, len(prior.initial_states.speed), max(1, len(prior.initial_states.speed) // 4)):
-        wishes = replace(GenerateSettings(foot_cleanup=variant.foot_cleanup), start=start)
+        variant_settings = replace(GenerateSettings(foot_cleanup=variant.foot_cleanup), start=start)
         samples = [
-            _generate_clip(prior, variant, wishes, settings.sample_seconds, settings.seed + k)
+            _generate_clip(prior, variant, variant_settings, settings.sample_seconds, settings.seed + k)
             for k in range(settings.samples_per_start)
         ]
         found.append(measure_diversity(samples).root_aligned_cm)

@@ -1,5 +1,5 @@
-"""What infilling is worth (infilling paper, tables 1 and 2, figure 5, and its study of gap and context): clips that no
-training saw, with pieces taken out, filled by networks as they are, on rigid bones, by MAP, and by interpolation.
+"""Benchmark of infilling (Kaufmann et al. 2020, tables 1 and 2, figure 5, and its study of gap and context): gaps in
+held-out clips, filled by raw networks, on rigid bones, by MAP, and by interpolation.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ from mapctl.recording.masks import ALL, Mask
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
 WINDOW_FRAMES = 120
-"""Frames of a clip that are looked at: the paper's 4 s."""
+"""Frames of a clip that are used: 4 s as in Kaufmann et al. 2020."""
 _GAP_CONTEXT_FRAMES = 40  # frames on either side while the gap's length is varied
 _UNFINISHED = InfillSettings(finish=False)
 _MEASURED_BONES = tuple(
@@ -34,18 +34,18 @@ _MEASURED_BONES = tuple(
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is taken out of a clip."""
+    """A corruption of a clip that is to be undone."""
 
     name: str
-    """In the table."""
+    """Name in the table."""
     frames: int
-    """Of the piece of a clip that is shown, from its middle."""
+    """Frames of the clip that are used, from its middle."""
     gap: int = 0
-    """Frames that are taken out of its middle."""
+    """Frames of the gap in their middle."""
     noise: float = 0.0
-    """Of every coordinate of every joint, metres."""
+    """Sigma of the noise of every coordinate of every joint, metres."""
     dropout: float = 0.0
-    """Share of joints taken out of every frame."""
+    """Share of joints that are missing in every frame."""
 
 
 TASKS: tuple[Task, ...] = (
@@ -63,7 +63,7 @@ TASKS: tuple[Task, ...] = (
     ),
     *(Task(f"gap of 40 frames, {context} around it", 40 + 2 * context, 40) for context in (1, 3, 5, 13, 25)),
 )
-"""The paper's, at 30 frames a second in place of its 60; its noise is said in no unit, ours is."""
+"""Tasks of Kaufmann et al. 2020, at 30 frames/s instead of 60; the paper gives its noise without a unit."""
 
 
 def benchmark_infilling(
@@ -73,8 +73,8 @@ def benchmark_infilling(
     ours: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Every task for every method, over all clips that are long enough, if there are any; `ours` is the network that
-    MAP finishes.
+    """Measure every task for every method, over all clips that are long enough, if there are any; `ours` is the network
+    that MAP refines.
 
     Root-aligned joint error over what was missing (over everything where nothing was), cm, mean and standard deviation
     over joints and frames; deviation of six bones' lengths, mm. Clips are on canonical joints.
@@ -91,17 +91,14 @@ def benchmark_infilling(
 
 
 def benchmark_infilling_by_kind(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
-    """Gaps of 0.5, 1 and 2 s by kind of clip: error of slerp and of MAP, cm, and their ratio. A longer and more lively
-    clip counts no more than another: the ratio is the mean of the clips' own.
+    """Measure gaps of 0.5, 1 and 2 s by kind of clip: error of slerp and of MAP, cm, and their ratio, which is the mean
+    of the clips' own, so that all clips count alike.
     """
     rows = []
     for kind, clips in kinds.items():
         for task in TASKS[1:4]:
-            shown = [
-                slice_middle(scale_to_canonical_bones(clip), WINDOW_FRAMES)
-                for clip in clips
-                if clip.seconds * PRIOR_FPS > WINDOW_FRAMES
-            ]
+            long = [clip for clip in clips if clip.seconds * PRIOR_FPS > WINDOW_FRAMES]
+            shown = [slice_middle(scale_to_canonical_bones(clip), WINDOW_FRAMES) for clip in long]
             masks = [Mask(ALL, (WINDOW_FRAMES - task.gap) // 2, (WINDOW_FRAMES + task.gap) // 2)]
             pairs = [
                 [
@@ -113,23 +110,16 @@ def benchmark_infilling_by_kind(kinds: Mapping[str, Sequence[Motion]], infiller:
             if pairs:
                 errors = 100 * torch.tensor(pairs)
                 slerp, ours = errors.mean(dim=0).tolist()
-                rows.append(
-                    {
-                        "task": task.name,
-                        "clips": len(pairs),
-                        "method": f"MAP on {kind}",
-                        "error_cm": ours,
-                        "slerp_cm": slerp,
-                        "ratio": float((errors[:, 1] / errors[:, 0]).mean()),
-                    }
-                )
+                row = {"task": task.name, "clips": len(pairs), "method": f"MAP on {kind}"}
+                ratio = float((errors[:, 1] / errors[:, 0]).mean())
+                rows.append({**row, "error_cm": ours, "slerp_cm": slerp, "ratio": ratio})
     return rows
 
 
 def _evaluate_task(
     task: Task, clips: Sequence[Motion], networks: Mapping[str, PositionInfiller], ours: str
 ) -> list[Row]:
-    """One row a method."""
+    """Measure one row for each method."""
     rows = []
     for name, network in networks.items():
         done = [
@@ -151,50 +141,50 @@ def _evaluate_task(
 
 @dataclass(frozen=True, eq=False)
 class _ClipErrors:
-    """Of one clip."""
+    """Errors of one clip."""
 
     errors: Float[Tensor, " missing"]
-    """Of every joint and frame that counts, metres."""
+    """Errors of every joint and frame that counts, metres."""
     bones: Float[Tensor, " lengths"]
     """Deviations of bones from their lengths, metres."""
 
 
 def _evaluate_network(clip: Motion, task: Task, network: PositionInfiller, generator: torch.Generator) -> _ClipErrors:
-    """A network's places as they are."""
+    """Measure a network's raw positions."""
     truth = clip.joint_positions().float()
     known = _sample_observation_mask(task, generator)
-    seen = truth + task.noise * torch.randn(truth.shape, generator=generator)
+    observed = truth + task.noise * torch.randn(truth.shape, generator=generator)
     facing = heading(clip.local_quat_xyzw[:, 0]).float()
-    stands = contacts.detect_contacts(truth[:, list(TOE_JOINTS)], PRIOR_FPS).float()
-    guess = interpolate_positions(seen[None], clip.local_quat_xyzw.float()[None], known[None])
+    planted = contacts.detect_contacts(truth[:, list(TOE_JOINTS)], PRIOR_FPS).float()
+    interpolated = interpolate_positions(observed[None], clip.local_quat_xyzw.float()[None], known[None])
     image = PositionImage.of_world(
-        guess,
+        interpolated,
         interpolate_heading(facing[None], known[None]),
-        stands[None],
+        planted[None],
         known=known[None],
         present=torch.ones(1, len(truth), dtype=torch.bool),
         toes=TOE_JOINTS,
     )
-    places = image.to_world(network.complete(image).places)[0]
-    return _measure_errors(places, truth, ~known if bool((~known).any()) else torch.ones_like(known))
+    positions = image.to_world(network.complete(image).places)[0]
+    return _measure_errors(positions, truth, ~known if bool((~known).any()) else torch.ones_like(known))
 
 
 def _evaluate_infill(
     clip: Motion, masks: Sequence[Mask], inbetweener: Inbetweener, settings: InfillSettings | None
 ) -> _ClipErrors:
-    """A whole motion of rigid bones."""
-    places = infill(clip, inbetweener, masks, settings=settings).motion.joint_positions()
-    missing = torch.zeros(places.shape[:2], dtype=torch.bool)
+    """Measure an infilled motion on rigid bones."""
+    positions = infill(clip, inbetweener, masks, settings=settings).motion.joint_positions()
+    missing = torch.zeros(positions.shape[:2], dtype=torch.bool)
     missing[masks[0].start : masks[0].stop] = True
-    return _measure_errors(places, clip.joint_positions(), missing)
+    return _measure_errors(positions, clip.joint_positions(), missing)
 
 
-def _measure_errors(places: Tensor, truth: Tensor, missing: Bool[Tensor, "frames joints"]) -> _ClipErrors:
-    wrong = (places - places[:, :1]) - (truth - truth[:, :1])
+def _measure_errors(positions: Tensor, truth: Tensor, missing: Bool[Tensor, "frames joints"]) -> _ClipErrors:
+    difference = (positions - positions[:, :1]) - (truth - truth[:, :1])
     above = [CANONICAL.parents[bone] for bone in _MEASURED_BONES]
-    lengths = (places[:, list(_MEASURED_BONES)] - places[:, above]).norm(dim=-1)
-    away = lengths - CANONICAL.offsets[list(_MEASURED_BONES)].norm(dim=-1).to(lengths)
-    return _ClipErrors(wrong.norm(dim=-1)[missing], away[missing.any(dim=1)].flatten().abs())
+    lengths = (positions[:, list(_MEASURED_BONES)] - positions[:, above]).norm(dim=-1)
+    length_errors = lengths - CANONICAL.offsets[list(_MEASURED_BONES)].norm(dim=-1).to(lengths)
+    return _ClipErrors(difference.norm(dim=-1)[missing], length_errors[missing.any(dim=1)].flatten().abs())
 
 
 def _sample_observation_mask(task: Task, generator: torch.Generator) -> Bool[Tensor, "frames joints"]:
@@ -214,13 +204,13 @@ def _summarise_clip_errors(results: Sequence[_ClipErrors]) -> Row:
 
 
 def scale_to_canonical_bones(motion: Motion) -> Motion:
-    """A canonical motion at the prior's rate, on the canonical skeleton, in scale."""
+    """Return a canonical motion at the prior's rate on the canonical skeleton, scaled by leg length."""
     motion = motion.resample(PRIOR_FPS)
     scale = leg_length(motion.skeleton) / leg_length(CANONICAL)
     return Motion(CANONICAL, motion.fps, motion.root_position / scale, motion.local_quat_xyzw)
 
 
 def slice_middle(motion: Motion, frames: int) -> Motion:
-    """So many frames from the middle of a motion that has them."""
+    """Return so many frames from the middle of a motion that has them."""
     start = (motion.num_frames - frames) // 2
     return motion.slice(start, start + frames)

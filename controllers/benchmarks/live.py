@@ -1,4 +1,4 @@
-"""Characters steered live by random commands against the wall clock: late frames, cost, memory, and who got stuck."""
+"""Benchmark of live steering by random commands against the wall clock: late frames, cost, memory, missed commands."""
 
 import math
 import time
@@ -16,17 +16,14 @@ from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import FrameChunk
 
 _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
-_COMMAND_SECONDS = (4.5, 7.0)  # seconds for which a command holds
+_COMMAND_SECONDS = (4.5, 7.0)  # range of the time for which a command holds
 _EVALUATED_FRAMES = 60  # frames before the next command in which it must be obeyed
-_VELOCITY_TOLERANCE, _VELOCITY_TOLERANCE_SHARE = (
-    0.3,
-    0.25,
-)  # m/s, or share of the speed, by which the mean velocity may miss it
+_VELOCITY_TOLERANCE, _VELOCITY_TOLERANCE_SHARE = 0.3, 0.25  # m/s or share of the speed, the larger of the two
 
 
 @dataclass
 class _CharacterLog:
-    """What one character did."""
+    """Log of one character."""
 
     command: Command
     until: float
@@ -37,29 +34,28 @@ class _CharacterLog:
     missed: int = 0
     cost: list[float] = field(default_factory=list)
     evaluations: list[int] = field(default_factory=list)
-    places: list[np.ndarray] = field(default_factory=list)
+    positions: list[np.ndarray] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
 
     def add(self, delivered: FrameChunk) -> None:
         count = len(delivered.root)
         self.frames += count
         self.nonfinite_chunks += not (np.isfinite(delivered.root).all() and np.isfinite(delivered.quats).all())
-        self.places = [*self.places[-_EVALUATED_FRAMES:], *delivered.root[:, ::2]]
+        self.positions = [*self.positions[-_EVALUATED_FRAMES:], *delivered.root[:, ::2]]
         if delivered.seconds > 1.0:
             self.late += sum(delivered.spare + k / PRIOR_FPS < 0 for k in range(count))
             self.cost.append(1000 * delivered.compute_seconds / count)
             self.evaluations.append(delivered.evaluations)
 
-    def judge(self) -> None:
-        """Whether the command was obeyed in its last two seconds."""
-        way = np.array(self.places[-_EVALUATED_FRAMES:])
-        velocity = (way[-1] - way[0]) * PRIOR_FPS / (len(way) - 1)
+    def check_command(self) -> None:
+        """Count the command, and count it as missed unless it was obeyed in its last two seconds."""
+        positions = np.array(self.positions[-_EVALUATED_FRAMES:])
+        velocity = (positions[-1] - positions[0]) * PRIOR_FPS / (len(positions) - 1)
         speed, heading = self.command.speed, self.command.heading
         wanted = speed * np.array([math.sin(heading), math.cos(heading)])
         self.commands += 1
-        self.missed += bool(
-            np.linalg.norm(velocity - wanted) > max(_VELOCITY_TOLERANCE, _VELOCITY_TOLERANCE_SHARE * speed)
-        )
+        tolerance = max(_VELOCITY_TOLERANCE, _VELOCITY_TOLERANCE_SHARE * speed)
+        self.missed += bool(np.linalg.norm(velocity - wanted) > tolerance)
 
 
 def benchmark_live(
@@ -70,27 +66,28 @@ def benchmark_live(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Row:
-    """So many characters for so long, together in one row; `load` as in RemoteRequest."""
-    draws = torch.Generator().manual_seed(seed)
-    remotes = [CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), seed + k)) for k in range(characters)]
-    logs = [_CharacterLog(Command(1.2, 0.0), _COMMAND_SECONDS[0]) for _ in remotes]
+    """Steer so many characters for so long and sum them up in one row; `load` as in CharacterRequest."""
+    generator = torch.Generator().manual_seed(seed)
+    processes = [CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), seed + k)) for k in range(characters)]
+    logs = [_CharacterLog(Command(1.2, 0.0), _COMMAND_SECONDS[0]) for _ in processes]
     try:
-        for remote in remotes:
-            remote.wait()
+        for process in processes:
+            process.wait()
         for now in _iterate_ticks(60 * minutes):
-            for remote, log in zip(remotes, logs, strict=True):
-                for delivered in remote.poll():
+            for process, log in zip(processes, logs, strict=True):
+                for delivered in process.poll():
                     log.add(delivered)
                 if now > log.until:
-                    log.judge()
-                    log.memory.append(remote.memory_mb())
-                    log.command, log.until = _sample_command(draws), now + _sample_uniform(draws, *_COMMAND_SECONDS)
-                    remote.command(log.command)
+                    log.check_command()
+                    log.memory.append(process.memory_mb())
+                    log.command = _sample_command(generator)
+                    log.until = now + _sample_uniform(generator, *_COMMAND_SECONDS)
+                    process.command(log.command)
             if progress is not None:
                 progress(round(now), round(60 * minutes))
     finally:
-        for remote in remotes:
-            remote.close()
+        for process in processes:
+            process.close()
     return _summarise_logs(logs, minutes)
 
 
@@ -101,13 +98,13 @@ def _iterate_ticks(seconds: float) -> Iterator[float]:
         time.sleep(0.02)
 
 
-def _sample_command(draws: torch.Generator) -> Command:
-    speed = _SPEEDS[int(torch.randint(len(_SPEEDS), (1,), generator=draws))]
-    return Command(speed, _sample_uniform(draws, -math.pi, math.pi))
+def _sample_command(generator: torch.Generator) -> Command:
+    speed = _SPEEDS[int(torch.randint(len(_SPEEDS), (1,), generator=generator))]
+    return Command(speed, _sample_uniform(generator, -math.pi, math.pi))
 
 
-def _sample_uniform(draws: torch.Generator, low: float, high: float) -> float:
-    return low + (high - low) * float(torch.rand((), generator=draws, dtype=torch.float64))
+def _sample_uniform(generator: torch.Generator, low: float, high: float) -> float:
+    return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
 
 def _summarise_logs(logs: list[_CharacterLog], minutes: float) -> Row:

@@ -1,4 +1,4 @@
-"""What infilling is worth where joints are lost throughout (infilling paper, figure 8), beside their mean pose."""
+"""Benchmark of joints that are missing throughout (Kaufmann et al. 2020, figure 8), beside their mean pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,43 +20,32 @@ MISSING_LIMBS = {
     "elbow and hand": ("leftLowerArm", "leftHand"),
     "knee, foot and toes": ("rightLowerLeg", "rightFoot", "rightToes"),
 }
-"""As in figure 8 of the paper."""
+"""Missing joints by name, as in Kaufmann et al. 2020, figure 8."""
 
 
 def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
-    """Joints that are lost throughout up to 240 frames, by kind of clip: their mean error in the world, cm, by MAP and
-    by two mean poses in the joints above them: that of all these clips, and the clip's own, which no user knows.
+    """Measure joints that are missing throughout up to 240 frames, by kind of clip: their mean error in the world, cm,
+    by MAP and by two mean poses: that of all these clips, and the clip's own, which no user knows.
     """
     shown = {kind: _select_clips(clips) for kind, clips in kinds.items()}
     every = [clip for clips in shown.values() for clip in clips]
     if not every:
         return []
-    usual_pose, rows = mean_rotations(every), []
+    mean_pose, rows = mean_rotations(every), []
     for kind, clips in shown.items():
         for name, joints in MISSING_LIMBS.items():
             found = []
             for clip in clips:
-                made = infill(
-                    clip, AutoInbetweener(infiller), [Mask(joint, 0, clip.num_frames) for joint in joints]
-                ).motion
-                tried = [
-                    *(replace_joint_rotations(clip, joints, pose) for pose in (usual_pose, mean_rotations([clip]))),
-                    made,
-                ]
-                found.append([_mean_joint_distance(motion, clip, joints) for motion in tried])
+                masks = [Mask(joint, 0, clip.num_frames) for joint in joints]
+                made = infill(clip, AutoInbetweener(infiller), masks).motion
+                poses = (mean_pose, mean_rotations([clip]))
+                candidates = [*(replace_joint_rotations(clip, joints, pose) for pose in poses), made]
+                found.append([_mean_joint_distance(motion, clip, joints) for motion in candidates])
             if found:
-                usual, own, ours = (100 * torch.tensor(found)).mean(dim=0).tolist()
-                rows.append(
-                    {
-                        "task": f"{name} lost",
-                        "clips": len(found),
-                        "method": f"MAP on {kind}",
-                        "error_cm": ours,
-                        "mean_pose_cm": usual,
-                        "own_mean_pose_cm": own,
-                        "ratio": ours / usual,
-                    }
-                )
+                mean_cm, own_mean_cm, map_cm = (100 * torch.tensor(found)).mean(dim=0).tolist()
+                row = {"task": f"{name} lost", "clips": len(found), "method": f"MAP on {kind}", "error_cm": map_cm}
+                row |= {"mean_pose_cm": mean_cm, "own_mean_pose_cm": own_mean_cm, "ratio": map_cm / mean_cm}
+                rows.append(row)
     return rows
 
 
@@ -64,17 +53,13 @@ def mean_rotations(motions: Sequence[Motion]) -> Float[Tensor, "joints 4"]:
     """Compute the mean rotation of every joint over all frames, every motion counting alike: the eigenvector of the
     largest eigenvalue of the summed outer products (Markley et al. 2007).
     """
-    outer = torch.stack(
-        [
-            torch.einsum("tji,tjk->jik", quats, quats) / len(quats)
-            for quats in (motion.local_quat_xyzw for motion in motions)
-        ]
-    ).sum(dim=0)
-    return torch.linalg.eigh(outer)[1][..., -1]
+    rotations = (motion.local_quat_xyzw for motion in motions)
+    outer = torch.stack([torch.einsum("tji,tjk->jik", quats, quats) / len(quats) for quats in rotations])
+    return torch.linalg.eigh(outer.sum(dim=0))[1][..., -1]
 
 
 def replace_joint_rotations(motion: Motion, joints: Sequence[str], pose: Float[Tensor, "joints 4"]) -> Motion:
-    """With the joints, and the one above the first of them, at rest in a pose."""
+    """Replace the rotations of joints, and of the parent of the first of them, by those of a pose."""
     indices = [CANONICAL.index(name) for name in joints]
     quats = motion.local_quat_xyzw.clone()
     for joint in {CANONICAL.parents[indices[0]], *indices}:
@@ -83,12 +68,12 @@ def replace_joint_rotations(motion: Motion, joints: Sequence[str], pose: Float[T
 
 
 def _select_clips(clips: Sequence[Motion]) -> list[Motion]:
-    """Up to 240 frames of those that have 120."""
+    """Return up to 240 frames of the clips that have at least 120."""
     long = [clip for clip in map(scale_to_canonical_bones, clips) if clip.num_frames >= WINDOW_FRAMES]
     return [slice_middle(clip, min(clip.num_frames, 2 * WINDOW_FRAMES)) for clip in long]
 
 
 def _mean_joint_distance(motion: Motion, truth: Motion, joints: Sequence[str]) -> float:
-    """Mean distance of the joints, metres."""
+    """Compute the mean distance of the joints, metres."""
     indices = [CANONICAL.index(name) for name in joints]
     return float((motion.joint_positions() - truth.joint_positions())[:, indices].norm(dim=-1).mean())

@@ -1,4 +1,4 @@
-"""What the solver costs: milliseconds of an evaluation and of whole solves. Ratios within one run."""
+"""Benchmark of the solver: milliseconds of an evaluation and of whole solves, as ratios within one run."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -23,22 +23,22 @@ from mapctl.terms import Term
 
 @dataclass(frozen=True)
 class SpeedBenchmarkSettings:
-    """How long to measure."""
+    """Size of the benchmark."""
 
     repeats: int = 40
-    """Evaluations timed; the fastest counts, since other work on the machine only adds."""
+    """Number of timed evaluations; the fastest counts, since other work on the machine only adds."""
     particles: tuple[int, ...] = (1, 4, 16, 32)
     """Batch sizes."""
     lengths: tuple[float, ...] = (4.0, 8.0, 16.0)
-    """Seconds of motion, to show that cost grows linearly."""
+    """Lengths of motion, seconds, to show that cost grows linearly."""
     seed: int = 0
-    """Of starts and draws."""
+    """Seed of initial states and samples."""
 
 
 def benchmark_speed(
     prior: Density, reference: Density, settings: SpeedBenchmarkSettings = SpeedBenchmarkSettings()
 ) -> list[Row]:
-    """Energy and gradient of one window on the fast path and on the torch `reference`, then whole solves."""
+    """Time energy and gradient of one window on the fast path and on the torch `reference`, then whole solves."""
     rows = [_benchmark_evaluation(prior, reference, count, settings) for count in settings.particles]
     return rows + [_benchmark_follow(prior, seconds, settings) for seconds in settings.lengths]
 
@@ -55,10 +55,10 @@ def _benchmark_evaluation(prior: Density, reference: Density, count: int, settin
 
 
 def _time_evaluation(prior: Density, count: int, settings: SpeedBenchmarkSettings) -> float:
-    curve, wishes = curves.circle(radius=4.0), FollowSettings()
-    frames = wishes.window.frames
+    curve, follow_settings = curves.circle(radius=4.0), FollowSettings()
+    frames = follow_settings.window.frames
     arcs = torch.arange(2 * frames, dtype=torch.float64) * 1.2 / PRIOR_FPS
-    terms_of = build_follow_terms(curve, arcs, wishes)
+    terms_of = build_follow_terms(curve, arcs, follow_settings)
     generator = torch.Generator().manual_seed(settings.seed)
     start = select_initial_state(
         prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator
@@ -84,7 +84,7 @@ def _benchmark_follow(prior: Density, seconds: float, settings: SpeedBenchmarkSe
 def follow_to_end(
     prior: Density, curve: Curve, seconds: float, seed: int, settings: FollowSettings, terms: Sequence[Term] = ()
 ) -> Solution:
-    """Follow to the end: half a walk has no place in a table, so Ctrl-C ends the benchmark."""
+    """Follow a curve to its end; Ctrl-C ends the benchmark, since half a walk belongs in no table."""
     generator = torch.Generator().manual_seed(seed)
     solution = follow(prior, curve, seconds=seconds, settings=settings, terms=terms, generator=generator)
     if solution.status.outcome is Outcome.INTERRUPTED:

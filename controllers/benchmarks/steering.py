@@ -1,4 +1,4 @@
-"""Random commands one after the other: which are reached, how soon, and what a frame costs."""
+"""Benchmark of steering: random commands one after the other, which are reached, how soon, and the cost of a frame."""
 
 import math
 import statistics
@@ -23,20 +23,20 @@ _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
 
 @dataclass(frozen=True)
 class SteeringBenchmarkSettings:
-    """How much is asked."""
+    """Size of the benchmark."""
 
     commands: int = 48
-    """Of a random speed and direction each."""
+    """Number of commands, each of a random speed and direction."""
     shortest: float = 3.5
-    """Seconds for which a command holds, at least."""
+    """Shortest time for which a command holds, seconds."""
     longest: float = 6.0
-    """At most."""
+    """Longest time for which a command holds, seconds."""
     seed: int = 0
-    """Of the commands and the first pose."""
+    """Seed of the commands and the first pose."""
 
 
 def benchmark_steering(prior: Density, settings: SteeringBenchmarkSettings | None = None) -> list[Row]:
-    """A row for each kind of change, and one for all with cost and feet."""
+    """Measure a row for each kind of change, and one for all with cost and feet."""
     settings = settings or SteeringBenchmarkSettings()
     generator = torch.Generator().manual_seed(settings.seed)
     track = _sample_command_track(settings, generator)
@@ -51,20 +51,17 @@ def benchmark_steering(prior: Density, settings: SteeringBenchmarkSettings | Non
     for (before, after), row in zip(pairwise(track.commands), rows[1:], strict=False):
         kinds.setdefault(_classify_change(before, after), []).append(row)
     cost, feet = summarise_step_timing(records), measure(motion)
-    whole = {
-        "frame_ms_p50": cost["frame_ms_p50"],
-        "frame_ms_p99": cost["frame_ms_p99"],
-        "contact_speed_cm_s": feet["contact_speed_cm_s"],
-        "jitter_m_s3": feet["jitter_m_s3"],
-    }
+    whole = {name: cost[name] for name in ("frame_ms_p50", "frame_ms_p99")}
+    whole |= {name: feet[name] for name in ("contact_speed_cm_s", "jitter_m_s3")}
     return [
-        *({"change": kind, **_summarise_commands(some)} for kind, some in sorted(kinds.items())),
+        *({"change": kind, **_summarise_commands(kind_rows)} for kind, kind_rows in sorted(kinds.items())),
         {"change": "all", **_summarise_commands(rows[1:]), **whole},
     ]
 
 
 def benchmark_pursuit(prior: Density, seed: int = 0) -> list[Row]:
-    """Curves walked live at 1 m/s by looking half a metre ahead."""
+    """Measure curves walked live at 1 m/s by pure pursuit half a metre ahead."""
+    columns = ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")
     rows = []
     for name, seconds in (("circle:2", 13.0), ("wave:1x8", 8.5)):
         curve = curves.read(name)
@@ -74,15 +71,7 @@ def benchmark_pursuit(prior: Density, seed: int = 0) -> list[Row]:
         recorder.show(first, 0.0)
         drive(state, pursuit, [recorder, pursuit], frames=round(seconds * PRIOR_FPS))
         found = measure(recorder.motion(), curve)
-        rows.append(
-            {
-                "change": f"live along {name}",
-                **{
-                    key: found[key]
-                    for key in ("path_error_mean_cm", "path_error_max_cm", "contact_speed_cm_s", "jitter_m_s3")
-                },
-            }
-        )
+        rows.append({"change": f"live along {name}", **{key: found[key] for key in columns}})
     return rows
 
 
@@ -102,18 +91,18 @@ def _sample_command_track(settings: SteeringBenchmarkSettings, generator: torch.
 def _classify_change(before: Command, after: Command) -> str:
     if after.speed == 0:
         return "to a stand"
-    side = abs(math.remainder(after.heading - before.heading, 2 * math.pi)) > math.pi / 2
+    sharp = abs(math.remainder(after.heading - before.heading, 2 * math.pi)) > math.pi / 2
     came = "from a stand" if before.speed == 0 else "moving"
-    return f"{came}, turning by more than 90 degrees" if side else f"{came}, turning by less"
+    return f"{came}, turning by more than 90 degrees" if sharp else f"{came}, turning by less"
 
 
 def _summarise_commands(rows: list[Row]) -> Row:
     reached = [row["reached_s"] for row in rows if row["reached_s"] is not None]
-    off = [abs(row["steady_heading_error_deg"]) for row in rows if row["steady_heading_error_deg"] is not None]
+    errors = [abs(row["steady_heading_error_deg"]) for row in rows if row["steady_heading_error_deg"] is not None]
     return {
         "commands": len(rows),
         "reached": len(reached),
         "seconds_mean": statistics.mean(reached) if reached else None,
         "seconds_max": max(reached, default=None),
-        "direction_off_deg_median": statistics.median(off) if off else None,
+        "direction_off_deg_median": statistics.median(errors) if errors else None,
     }

@@ -1,4 +1,4 @@
-"""What in-betweening is worth: clips that no training saw, of which a few keys are left; and their ends, extended."""
+"""Benchmark of in-betweening: held-out clips of which a few keyframes are left; and extrapolation of their ends."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -23,9 +23,9 @@ from mapctl.retarget import to_canonical
 from mapctl.skeleton import TOES
 
 TWEEN_FRAMES = 6 * PRIOR_FPS
-"""Of a clip that are looked at."""
-_INNER_KEYS = 5  # keys, beside the first and the last
-_END_SOURCE_FRAMES = 4 * PRIOR_FPS  # of a clip, the end of which is taken away
+"""Frames of a clip that are used."""
+_INNER_KEYS = 5  # keyframes besides the first and the last
+_END_SOURCE_FRAMES = 4 * PRIOR_FPS  # frames of a clip whose end is removed
 _END_LENGTHS = (30, 60)  # frames
 _NUM_ALTERNATIVES = 4  # answers
 
@@ -37,21 +37,23 @@ def benchmark_tweening(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """By kind of clip (canonical, at the prior's rate): means over those of 6 s of tweens as they are by default, of a
-    rolled variation and of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
+    """Measure by kind of clip (canonical, at the prior's rate): means over 6 s of the default tween, of a rollout and
+    of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
     """
     rows, draws = [], torch.Generator().manual_seed(0)
     for number, (kind, clips) in enumerate(kinds.items()):
         shown = [clip.slice(0, TWEEN_FRAMES) for clip in clips if clip.num_frames >= TWEEN_FRAMES]
-        told: dict[str, list[Row]] = {"chosen": [], "rolled": [], f"best of {_NUM_ALTERNATIVES}": []}
+        by_method: dict[str, list[Row]] = {"chosen": [], "rolled": [], f"best of {_NUM_ALTERNATIVES}": []}
         for clip in shown:
             inner = (1 + torch.randperm(TWEEN_FRAMES - 2, generator=draws)[:_INNER_KEYS]).tolist()
             keys = Keys((0, *inner, TWEEN_FRAMES - 1))
-            for method, made in zip(told, _tween_all_ways(clip, keys, infiller, densities, draws), strict=True):
-                told[method].append(_evaluate_tween(made.motion, clip, keys.frames, made.seconds))
+            for method, made in zip(
+                by_method, _tween_by_all_methods(clip, keys, infiller, densities, draws), strict=True
+            ):
+                by_method[method].append(_evaluate_tween(made.motion, clip, keys.frames, made.seconds))
         rows += [
             {"kind": kind, "what": "keys", "by": method, "clips": len(each), **average_rows(each)}
-            for method, each in told.items()
+            for method, each in by_method.items()
             if each
         ]
         shown = [clip.slice(0, _END_SOURCE_FRAMES) for clip in clips if clip.num_frames >= _END_SOURCE_FRAMES]
@@ -66,10 +68,10 @@ def benchmark_tweening(
     return rows
 
 
-def _tween_all_ways(
+def _tween_by_all_methods(
     clip: Motion, keys: Keys, infiller: Inbetweener, densities: Sequence[Density], draws: torch.Generator
 ) -> Iterator[InbetweenSolution]:
-    """Tween as by default, by a rollout, and as the likeliest of several answers."""
+    """Tween by the default method, by a rollout, and by the lowest energy of several answers."""
 
     def make(inbetweener: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
         return tween(clip, keys, inbetweener, generator=generator)
@@ -81,11 +83,11 @@ def _tween_all_ways(
 
 
 def _evaluate_tween(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:
-    """Errors at keys and between them; jerk over the keys as a share of the clip's own 95th percentile."""
-    places, truth = made.joint_positions(), clip.joint_positions()
-    jerk, usual = (torch.diff(each, n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (places, truth))
+    """Measure errors at keyframes and between them; jerk at keyframes as a share of the clip's own 95th percentile."""
+    positions, truth = made.joint_positions(), clip.joint_positions()
+    jerk, usual = (torch.diff(each, n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (positions, truth))
     at_keys = max(float(jerk[max(0, key - 3) : key + 1].max()) for key in keys)
-    away = (places - truth).norm(dim=-1)
+    away = (positions - truth).norm(dim=-1)
     ends, toes = ([made.skeleton.index(name) for name in names] for names in (("leftHand", "rightHand", *TOES), TOES))
     worst_ours, worst_mocap = (_measure_worst_frames(each.joint_positions(), ends, toes) for each in (made, clip))
     return {
@@ -99,13 +101,13 @@ def _evaluate_tween(made: Motion, clip: Motion, keys: Sequence[int], seconds: fl
     }
 
 
-def _measure_worst_frames(places: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
-    """Largest step (cm in a thirtieth of a second) and acceleration of hands and toes; longest time on no foot."""
-    peaks = worst_frame.measure_peaks(places[:, ends], places[:, 0], PRIOR_FPS)
+def _measure_worst_frames(positions: Tensor, ends: Sequence[int], toes: Sequence[int]) -> Row:
+    """Measure the largest step (cm in 1/30 s) and acceleration of hands and toes, and the longest unsupported time."""
+    peaks = worst_frame.measure_peaks(positions[:, ends], positions[:, 0], PRIOR_FPS)
     return {
         "step_cm": 100 * peaks.step,
         "acceleration_m_s2": peaks.acceleration,
-        "unsupported_s": worst_frame.measure_longest_unsupported(places[:, toes], places[:, 0], PRIOR_FPS),
+        "unsupported_s": worst_frame.measure_longest_unsupported(positions[:, toes], positions[:, 0], PRIOR_FPS),
     }
 
 

@@ -1,4 +1,4 @@
-"""The one door of a clip on any rig: it becomes canonical and, as a query, 30 fps with a mask; and it goes home."""
+"""A clip on any rig as a canonical one: resampled with its mask to a query at 30 fps, and the answer put on its rig."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,27 +28,27 @@ class CanonicalClip:
     """A clip with missing values, on its own rig and on canonical joints."""
 
     original: Motion
-    """The clip as it came; its missing values may be anything."""
+    """The clip as given; its missing values may be anything."""
     missing: MissingMask
-    """What is missing, by joint of the rig."""
+    """Missing values, by joint of the rig."""
     interpolated: Motion
     """The clip with its missing values interpolated."""
     canonical: Motion
     """The interpolated clip on canonical joints and the performer's bones, at its own rate."""
     rigmap: RigMap
-    """How the rig maps to canonical joints."""
+    """Map from the rig to canonical joints."""
 
     @staticmethod
     def of(motion: Motion, missing: MissingMask, rig: Rig | None = None) -> "CanonicalClip":
-        """Take a clip in; `rig` wins over what would be recognised. RequestError for a rig that is not understood."""
+        """Make a clip canonical; `rig` overrides recognition. RequestError for a rig that is not recognised."""
         interpolated = interpolate_missing(motion, missing)
         return CanonicalClip(motion, missing, interpolated, *to_canonical(interpolated, rig))
 
     def query(self, *, effector_targets: EffectorTargets | None = None, keep_trajectory: bool = False) -> GapQuery:
         """Build the query for in-betweeners, at PRIOR_FPS; targets are by frame of the clip.
 
-        A frame of the query that lies between two of the clip shows the one near it that lacks least, if they lack
-        more.
+        A frame of the query between two of the clip is the nearby frame with the fewest missing values, if that has
+        fewer than the two.
         """
         canonical, missing = self.canonical, self.missing
         whole = _resample_to_end(canonical)
@@ -56,9 +56,9 @@ class CanonicalClip:
         at = at.clamp(max=canonical.num_frames - 1)
         low = (at + 1e-9).floor().long()
         high = torch.where(at - low > _TIE_FRAMES, low + 1, low).clamp(max=canonical.num_frames - 1)
-        lacking = torch.cat([missing.joints, missing.root[:, None]], dim=1)
-        best = _find_most_complete_frames(at, lacking.sum(dim=1))
-        snapped = lacking[best].sum(dim=1) < (lacking[low] | lacking[high]).sum(dim=1)
+        missing_values = torch.cat([missing.joints, missing.root[:, None]], dim=1)
+        best = _find_most_complete_frames(at, missing_values.sum(dim=1))
+        snapped = missing_values[best].sum(dim=1) < (missing_values[low] | missing_values[high]).sum(dim=1)
         at = torch.where(snapped, best.to(at), at)
         low, high = torch.where(snapped, best, low), torch.where(snapped, best, high)
         quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[best], whole.local_quat_xyzw)
@@ -67,12 +67,12 @@ class CanonicalClip:
         joints, seconds = self._missing_canonical_joints(), at / float(canonical.fps)
         if effector_targets is not None:
             effector_targets = effector_targets.shown(seconds, fps=float(canonical.fps))
-        lost = MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
-        return GapQuery(shown, lost, seconds, effector_targets, keep_trajectory)
+        mask = MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
+        return GapQuery(shown, mask, seconds, effector_targets, keep_trajectory)
 
     def back(self, made: Motion, query: GapQuery) -> Motion:
-        """Return an answer to the query on the rig, at the clip's rate, with seams that run on and what is known to
-        the bit. An answer that is the interpolation itself is the one on the rig, at every frame of its own.
+        """Return an answer to the query on the rig, at the clip's rate, with blended seams and what is known to the
+        bit. If the answer is the query's own interpolation, return the interpolation on the rig.
         """
         filled = self.interpolated
         if made is not query.motion or query.keep_trajectory:
@@ -82,11 +82,11 @@ class CanonicalClip:
         return self.restore_observed(filled)
 
     def restore_observed(self, motion: Motion) -> Motion:
-        """Return the original with what it lacks from a motion on its rig."""
+        """Return the original with its missing values from a motion on its rig."""
         return restore_observed(motion, self.original, self.missing)
 
     def _missing_canonical_joints(self) -> Bool[Tensor, "frames joints"]:
-        """Find the canonical joints whose rotation is missing; an End Site turns with its parent."""
+        """Find the canonical joints whose rotation is missing; an End Site rotates with its parent."""
         columns = []
         for joint, own in enumerate(self.rigmap.joint_of):
             columns.append(columns[CANONICAL.parents[joint]] if own is None else self.missing.joints[:, own])
@@ -131,18 +131,20 @@ def _resample_to_end(canonical: Motion) -> Motion:
     return held.resample(PRIOR_FPS).slice(0, moments + 1)
 
 
-def _find_most_complete_frames(at: Float[Tensor, " shown"], lacking: Int[Tensor, " frames"]) -> Int[Tensor, " shown"]:
-    """Find for each time, in frames of the clip, the frame that lacks least of those nearer to it than to another time;
-    the nearest of several; any other frame if there is none.
+def _find_most_complete_frames(
+    at: Float[Tensor, " shown"], missing_counts: Int[Tensor, " frames"]
+) -> Int[Tensor, " shown"]:
+    """Find for each time, in frames of the clip, the frame with the fewest missing values of those nearer to it than to
+    another time; the nearest of several; any other frame if there is none.
     """
-    edges = (at[1:] + at[:-1]) / 2 + _TIE_FRAMES  # a frame in the middle of two is the earlier one's
+    edges = (at[1:] + at[:-1]) / 2 + _TIE_FRAMES  # a frame midway between two times belongs to the earlier one
     beyond = at.new_full((1,), torch.inf)
-    own, last = at.round().long(), len(lacking) - 1
+    own, last = at.round().long(), len(missing_counts) - 1
     reach = math.ceil(float(torch.diff(at).max()) / 2) + 1 if len(at) > 1 else last
     frames = own[:, None] + torch.arange(-reach, reach + 1)
     near = (frames > torch.cat([-beyond, edges])[:, None]) & (frames <= torch.cat([edges, beyond])[:, None])
     inside = near & (frames >= 0) & (frames <= last)
     frames = frames.clamp(0, last)
-    cost = lacking[frames] + (frames - at[:, None]).abs() / (2 * reach + 2)
+    cost = missing_counts[frames] + (frames - at[:, None]).abs() / (2 * reach + 2)
     best = torch.where(inside, cost, torch.inf).argmin(dim=1, keepdim=True)
-    return torch.where(inside.any(dim=1), frames.gather(1, best)[:, 0], lacking.argmax())
+    return torch.where(inside.any(dim=1), frames.gather(1, best)[:, 0], missing_counts.argmax())

@@ -1,4 +1,4 @@
-"""Wishes that cannot hold, named with numbers: before the solve from the data, after it from what was missed."""
+"""Infeasible requests, named with numbers: before the solve by the data's limits, after it by the path error."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,12 +12,12 @@ from mapctl.motion import Motion
 from mapctl.protocols import DataLimits
 
 _PATH_TOLERANCE_CM = 15.0
-_OVERSHOOT = 0.15  # metres: the last frame of a walk may lie a step of one frame beyond the end
+_OVERSHOOT = 0.15  # metres: the last frame of a walk may lie one frame's step beyond the end
 _CORNER_SECONDS = 1.0
 
 
 def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], limits: DataLimits) -> list[str]:
-    """Sentences about speeds and corners beyond the prior's data, and about a curve that ends too soon."""
+    """Note speeds and corners beyond the prior's data, and a curve that ends too soon."""
     notes = []
     speeds = torch.diff(arcs) * PRIOR_FPS
     fastest, slowest = round(float(speeds.max()), 3), round(float(speeds.min()), 3)
@@ -35,28 +35,26 @@ def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], limits: Dat
 
 
 def check_tracking(motion: Motion, curve: Curve, joint: str) -> list[str]:
-    """The stretch around the worst frame that leaves the curve by more than 15 cm, if there is one."""
+    """Note the interval around the worst frame in which the path error exceeds 15 cm, if there is one."""
     walked = motion.joint_positions()[:, motion.skeleton.index(joint)]
-    places = walked[:, ::2] if curve.dims == 2 else walked
-    error = (places - curve.point(track_arcs(curve, walked, start=0.0))).norm(dim=-1)
+    positions = walked[:, ::2] if curve.dims == 2 else walked
+    error = (positions - curve.point(track_arcs(curve, walked, start=0.0))).norm(dim=-1)
     if float(error.max()) * 100 <= _PATH_TOLERANCE_CM:
         return []
-    first, last = (
-        float(frame / motion.fps)
-        for frame in _find_interval_around(error * 100 > _PATH_TOLERANCE_CM, int(error.argmax()))
-    )
+    interval = _find_interval_around(error * 100 > _PATH_TOLERANCE_CM, int(error.argmax()))
+    first, last = (float(frame / motion.fps) for frame in interval)
     return [f"the curve is left by up to {100 * float(error.max()):.0f} cm between {first:.1f} and {last:.1f} s"]
 
 
 def _find_interval_around(off: Bool[Tensor, " frames"], worst: int) -> tuple[int, int]:
-    """First and last frame of the unbroken stretch around the worst one."""
+    """Find the first and the last frame of the unbroken interval around the worst one."""
     inside = (~off).nonzero()[:, 0]
     before, after = inside[inside < worst], inside[inside > worst]
     return int(before[-1]) + 1 if len(before) else 0, int(after[0]) - 1 if len(after) else len(off) - 1
 
 
 def _check_corners(request: PathRequest, arcs: Tensor, limits: DataLimits) -> list[str]:
-    """The sharpest turn over one second of the walk (or all of a shorter one), if it is beyond the data."""
+    """Note the sharpest turn over one second of the walk (or all of a shorter one), if it is beyond the data."""
     step = min(round(_CORNER_SECONDS * PRIOR_FPS), len(arcs) - 1)
     samples = request.curve.curvature(arcs) * torch.gradient(arcs)[0]
     turned = torch.nn.functional.pad(samples.cumsum(0), (1, 0))

@@ -1,4 +1,4 @@
-"""Choose the moment of mocap that a motion begins from, and how it stands on the curve."""
+"""Select the initial state of a motion along a curve, and its ground pose on the curve."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ from mapctl.terms import Term
 _CANDIDATES = 24
 _BEST_CANDIDATES = 4
 _LOOK_AHEAD = 34
-_ROLLOUT_FRAMES = 120  # frames of plain rollout that show how a candidate walks when nobody asks for anything
+_ROLLOUT_FRAMES = 120  # frames of plain rollout that show how a candidate walks without terms
 _SPEED_SIGMA = 0.1  # m/s between a candidate's own speed and the wanted one that count as one standard deviation
 _SWAY_SECONDS = 0.35
-_TYPICAL_SWAY_QUANTILE = 0.65  # quantile among candidates; over the median, since plain rollouts sway less than people
+_TYPICAL_SWAY_QUANTILE = 0.65  # quantile among candidates; over the median, since plain rollouts sway less than mocap
 
 
 @dataclass(frozen=True, eq=False)
 class MotionStart:
-    """Where a motion begins."""
+    """Beginning of a motion."""
 
     committed: CommittedFrames
-    """The first frame, as the window solver wants it."""
+    """First frame, as the receding-horizon solver takes it."""
     before_first: GroundPose
-    """The place from which `features.decode` leads to the first frame."""
+    """Ground pose before the first frame, from which `mapctl.pose.decode` integrates."""
 
 
 def select_initial_state(
@@ -49,12 +49,12 @@ def select_initial_state(
     fps: float,
     generator: torch.Generator,
 ) -> MotionStart:
-    """Of the prior's starts near the wanted speed, one of those that fit the wishes best with nobody steering.
+    """Select, among the prior's initial states near the requested speed, one whose plain rollout fits the terms best.
 
-    Each candidate stands on the curve's first point and is turned so that the first half second of its plain rollout
-    goes along the curve. It is scored by the energy of the first window, by how far the speed it falls into is from
-    the wanted one, and by how unusual its sway is among the candidates. The generator picks among the best few, so that
-    seeds give different walks.
+    Each candidate begins at the curve's first point, with the heading at which the first half second of its plain
+    rollout is parallel to the curve. It is scored by the energy of the first window, by the difference of the speed
+    that it settles at from the requested one, and by how unusual its sway is among the candidates. The generator picks
+    among the best few, so that seeds give different walks.
     """
     wanted = float(arcs[1] - arcs[0]) * fps
     ahead = min(_LOOK_AHEAD, len(arcs) - 1)
@@ -63,23 +63,25 @@ def select_initial_state(
     noise = torch.zeros(len(near), _ROLLOUT_FRAMES, LAYOUT.continuous)
     with torch.no_grad():
         features, _ = prior.rollout(state, noise, prior.plan(state, noise))
-    places = GroundPose(_first_point(curve).expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs))
+    ground_poses = GroundPose(
+        _first_point(curve).expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs)
+    )
     before, planted = torch.zeros(0, skeleton.num_joints, 3), LAYOUT.pick(state.last_frame, "contacts") > 0.5
-    context = WindowContext(prior, state, places, before, ahead, skeleton, fps, planted, first_frame=1)
+    context = WindowContext(prior, state, ground_poses, before, ahead, skeleton, fps, planted, first_frame=1)
     flat = noise[:, :ahead].flatten(1)
     with torch.no_grad():
         energy = Objective(LatentNoise.from_unknowns(context, flat).build, terms_of(1, ahead)).energy(flat) / ahead
     # The plain rollout soon leaves the curve, and its energy then says little: it counts for a tenth.
     best = (0.1 * energy + _candidate_energy(features, wanted, fps)).argsort()[:_BEST_CANDIDATES]
     pick = int(best[torch.randint(len(best), (1,), generator=generator)])
-    place = GroundPose(places.position_xz[pick], places.heading[pick])
-    return start_from_state(state.pick(torch.tensor([pick])), place, skeleton)
+    ground_pose = GroundPose(ground_poses.position_xz[pick], ground_poses.heading[pick])
+    return start_from_state(state.pick(torch.tensor([pick])), ground_pose, skeleton)
 
 
 def _candidate_energy(
     features: Float[Tensor, "starts frames size"], wanted: float, fps: float
 ) -> Float[Tensor, " starts"]:
-    """Nats: how far each candidate's own speed is from the wanted one, and its sway from the usual one."""
+    """Compute each candidate's energy of speed and sway, nats: deviation from the requested and from the typical."""
     speed = ground_speed(features).mean(-1)
     sway = _sway(features, fps)
     spread = (sway.quantile(0.75) - sway.quantile(0.25)).clamp_min(1e-4) / 2
@@ -88,24 +90,23 @@ def _candidate_energy(
 
 
 def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:
-    """Sway without a curve: rms of the root's sideways departure from its own smoothed trajectory, metres."""
+    """Compute the sway without a curve: rms sideways departure of the root from its smoothed trajectory, metres."""
     ground, _ = integrate_root(features, GroundPose.origin())
     smooth = gaussian.averaging_matrix(ground.shape[1], _SWAY_SECONDS * fps, ground.dtype) @ ground
-    way = torch.nn.functional.normalize(torch.gradient(smooth, dim=1)[0], dim=-1)
-    apart = ground - smooth
-    sideways = apart[..., 0] * way[..., 1] - apart[..., 1] * way[..., 0]
+    direction = torch.nn.functional.normalize(torch.gradient(smooth, dim=1)[0], dim=-1)
+    departure = ground - smooth
+    sideways = departure[..., 0] * direction[..., 1] - departure[..., 1] * direction[..., 0]
     edge = min(round(2 * _SWAY_SECONDS * fps), ground.shape[1] // 4)
     return sideways[:, edge:-edge].square().mean(-1).sqrt()
 
 
-def start_from_state(state: DensityState, place: GroundPose, skeleton: Skeleton) -> MotionStart:
-    """A density's state (batch of one) as the beginning of a motion whose first frame stands at a place."""
+def start_from_state(state: DensityState, ground_pose: GroundPose, skeleton: Skeleton) -> MotionStart:
+    """Begin a motion in a density's state (batch of one) with its first frame at a ground pose."""
     first = state.last_frame
-    before = place.before(
-        LAYOUT.pick(first[0], "root_displacement_heading"), LAYOUT.pick(first[0], "heading_change")[0]
-    )
+    displacement, turn = (LAYOUT.pick(first[0], name) for name in ("root_displacement_heading", "heading_change"))
+    before = ground_pose.before(displacement, turn[0])
     joints = decode(first, before, skeleton=skeleton).joint_positions().to(first.dtype)
-    return MotionStart(CommittedFrames(state, place, first, joints), before)
+    return MotionStart(CommittedFrames(state, ground_pose, first, joints), before)
 
 
 def _first_point(curve: Curve) -> Float[Tensor, "2"]:
@@ -113,10 +114,10 @@ def _first_point(curve: Curve) -> Float[Tensor, "2"]:
 
 
 def _align_headings(features: Tensor, curve: Curve, arcs: Tensor) -> Float[Tensor, " starts"]:
-    """Heading of each start's frame that makes the rollout's way over the first half second parallel to the curve's."""
+    """Compute each initial state's heading at which the first half second of its rollout is parallel to the curve."""
     half = features.shape[1] // 2
     ground, _ = integrate_root(features, GroundPose.origin())
-    way = curve.point(arcs[half]) - curve.point(0.0)
-    wanted = torch.atan2(way[0], way[-1]).float()
+    direction = curve.point(arcs[half]) - curve.point(0.0)
+    wanted = torch.atan2(direction[0], direction[-1]).float()
     walked = torch.atan2(ground[:, half - 1, 0], ground[:, half - 1, 1])
     return wrap_angle(wanted - walked)

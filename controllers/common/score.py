@@ -1,4 +1,4 @@
-"""The energy of a finished motion: what it would cost the MAP problem as it stands, whoever proposed it."""
+"""Energy of a finished motion under the MAP problem, whoever proposed it."""
 
 from dataclasses import replace
 
@@ -19,44 +19,44 @@ from mapctl.retarget.rigs import Rig
 from mapctl.terms import Clearance, Jerk, Likelihood, Support, Term
 from mapctl.terms.trial import Trial
 
-_PRECEDING_FRAMES = 3  # frames that the others are seen after
+_PRECEDING_FRAMES = 3  # frames before those that are scored, on which terms look back
 
 
 def score(
     motion: Motion,
-    stands: Bool[Tensor, "frames 2"],
+    contacts: Bool[Tensor, "frames 2"],
     density: Density,
     settings: RefinementSettings,
     rig: Rig | None = None,
 ) -> Ledger:
-    """By term: the likelihood under a density, footing, clearance, what the body stands on, and jerk, of a motion on
-    any rig of more than three frames at the prior's rate; `stands` are its contacts at that rate.
+    """Compute the energy by term (likelihood under a density, contact, clearance, support, jerk) of a motion on any rig
+    of more than three frames at the prior's rate; `contacts` are its contacts at that rate.
     """
     canonical = to_canonical(motion, rig)[0].resample(PRIOR_FPS)
-    bits = stands[: canonical.num_frames]
+    bits = contacts[: canonical.num_frames]
     features, before = encode(canonical)
     features[: len(bits), LAYOUT.slices["contacts"]] = bits.to(features)
     features = features.float()
     ground, heading = integrate_root(features.double(), before)
-    place = GroundPose(ground[_PRECEDING_FRAMES - 1].float(), heading[_PRECEDING_FRAMES - 1].float())
+    ground_pose = GroundPose(ground[_PRECEDING_FRAMES - 1].float(), heading[_PRECEDING_FRAMES - 1].float())
     shown = features[None, _PRECEDING_FRAMES:]
-    judge = density.with_observation_noise(density_selection.proposal_sigma())
-    state = replay(judge, features[:_PRECEDING_FRAMES], judge.infer_state(features))
+    blurred = density.with_observation_noise(density_selection.proposal_sigma())
+    state = replay(blurred, features[:_PRECEDING_FRAMES], blurred.infer_state(features))
     with torch.no_grad():
-        log_density = judge.log_prob(shown, state)
+        log_density = blurred.log_prob(shown, state)
     height = estimate_rest_height(canonical, bits)
     terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, rest_height=height)]
     terms.append(replace(settings.clearance or Clearance(), rest_height=height))
     terms.append(Support(rest_height=height))
     terms.append(settings.jerk or Jerk(sigma=50.0, frames=len(features)))
-    contacts = features[:, LAYOUT.slices["contacts"]] > 0.5
+    planted = features[:, LAYOUT.slices["contacts"]] > 0.5
     trial = Trial(
         shown,
-        place,
-        contacts=contacts[None, _PRECEDING_FRAMES:],
+        ground_pose,
+        contacts=planted[None, _PRECEDING_FRAMES:],
         log_density=log_density,
         before=canonical.joint_positions()[:_PRECEDING_FRAMES].float(),
-        contacts_before=contacts[_PRECEDING_FRAMES - 1],
+        contacts_before=planted[_PRECEDING_FRAMES - 1],
         skeleton=canonical.skeleton,
         first_frame=_PRECEDING_FRAMES,
     )

@@ -1,5 +1,5 @@
-"""Denoise many files, over processes (joblib) or over a cluster (ray). No file's failure stops another, but a full disk
-stops all.
+"""Denoise many files, in processes (joblib) or on a cluster (ray). No file's failure stops another; a full disk stops
+all.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,45 +22,43 @@ from mapctl.retarget.rigs import Rig
 
 @dataclass(frozen=True)
 class FileJob:
-    """One file."""
+    """One file to denoise."""
 
     source: Path
-    """A motion file."""
+    """Motion file of the capture."""
     out: Path
-    """Where the clean motion goes; its folder is made."""
+    """File of the clean motion; its folder is made."""
 
 
 @dataclass(frozen=True)
 class FileResult:
-    """What became of a job."""
+    """Outcome of a job."""
 
     job: FileJob
-    """It."""
+    """The job."""
     error: str = ""
-    """Why there is no result; empty where there is one."""
+    """Why there is no result; empty if there is one."""
     frames: int = 0
-    """Of the motion."""
+    """Frames of the motion."""
     seconds: float = 0.0
-    """Compute."""
+    """Compute, seconds."""
 
 
 @dataclass(frozen=True)
 class FileDenoiser:
-    """Loads the denoiser on first use, in the process that uses it; what is sent to a process is small."""
+    """Denoiser of single files, cheap to send to a process, which loads the network on first use."""
 
     load: Callable[[], Denoiser]
-    """Makes the denoiser: `functools.partial(priors.load_denoiser, "denoiser")`."""
+    """Loader of the network: `functools.partial(priors.load_denoiser, "denoiser")`."""
     settings: DenoiseSettings
-    """What is known of the captures."""
+    """Settings for all files."""
     rig: Rig | None = None
-    """Of all files, where it is not the one that would be recognised."""
+    """Rig of all files, where it is not the one that would be recognised."""
     after: Callable[[FileJob, DenoiseSolution], None] | None = None
-    """Called with each result, in that process: to write a report."""
+    """Function called with each result, in that process: to write a report."""
 
     def __call__(self, job: FileJob) -> FileResult:
-        """Denoise one file and write the result; what goes wrong with it is said in what is returned, but for a full
-        disk, which is a DiskFullError.
-        """
+        """Denoise one file and write the result; errors are in what is returned, except DiskFullError."""
         torch.set_num_threads(1)
         try:
             unit = None if self.rig is None else self.rig.metres_per_unit
@@ -70,10 +68,10 @@ class FileDenoiser:
             job.out.parent.mkdir(parents=True, exist_ok=True)
             if self.after is not None:
                 self.after(job, done)
-            # Last, so that a file which is there is a file which is done.
+            # Last, so that a file that exists is complete.
             formats.save(done.motion, job.out)
         except DiskFullError:
-            raise  # no other file would find room
+            raise  # no other file could be written
         except (MapctlError, OSError) as error:
             return FileResult(job, error=" ".join(str(error).split()))
         except Exception as error:
@@ -81,7 +79,7 @@ class FileDenoiser:
         return FileResult(job, "", done.motion.num_frames, done.seconds)
 
 
-_LOADED_DENOISERS: dict[str, Any] = {}  # by process: what was loaded last
+_LOADED_DENOISERS: dict[str, Any] = {}  # the denoiser that this process loaded last
 
 
 def _load_once(load: Callable[[], Denoiser]) -> Denoiser:
@@ -92,20 +90,22 @@ def _load_once(load: Callable[[], Denoiser]) -> Denoiser:
     return _LOADED_DENOISERS[key]
 
 
-def run_over_processes(jobs: Sequence[FileJob], cleaner: FileDenoiser, *, processes: int) -> Iterator[FileResult]:
-    """As they end, over so many processes of this machine; one works in this process."""
+def run_over_processes(jobs: Sequence[FileJob], file_denoiser: FileDenoiser, *, processes: int) -> Iterator[FileResult]:
+    """Yield results as jobs end, in so many processes of this machine; a single one is this process."""
     if processes == 1:
-        yield from map(cleaner, jobs)
+        yield from map(file_denoiser, jobs)
         return
-    ended: Any = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(cleaner)(job) for job in jobs)
-    yield from ended
+    results: Any = Parallel(n_jobs=processes, return_as="generator_unordered")(
+        delayed(file_denoiser)(job) for job in jobs
+    )
+    yield from results
 
 
 def run_over_cluster(
-    jobs: Sequence[FileJob], cleaner: FileDenoiser, *, address: str, workers: int
+    jobs: Sequence[FileJob], file_denoiser: FileDenoiser, *, address: str, workers: int
 ) -> Iterator[FileResult]:
-    """As they end, over a ray cluster; `local` starts one of so many workers on this machine. All machines must see the
-    files under the same paths. RequestError where ray is not installed or the cluster does not answer.
+    """Yield results as jobs end, on a ray cluster; `local` starts one of so many workers on this machine. All machines
+    must see the files under the same paths. RequestError where ray is not installed or the cluster does not answer.
     """
     try:
         import ray
@@ -121,7 +121,7 @@ def run_over_cluster(
     try:
 
         def clean(job: FileJob) -> FileResult:
-            return cleaner(job)
+            return file_denoiser(job)
 
         task = ray.remote(num_cpus=1, max_retries=2)(clean)
         waiting = {task.remote(job): job for job in jobs}

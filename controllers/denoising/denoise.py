@@ -1,8 +1,8 @@
 """Denoise a capture on any rig (Wang et al. 2019, section 5.4): inspection, a proposal, and the MAP stage about it.
 
-A network that has seen all kinds of motion proposes; what it leaves out and noise does not explain goes back in, so
-that out of its depth it is no worse than a low-pass filter; the MAP stage puts the feet down. The result is on the
-capture's own rig, at its own rate, with all of its frames.
+A network trained on all kinds of motion proposes; residual motion that noise does not explain is restored, so that out
+of its depth it is no worse than a low-pass filter; the MAP stage plants the feet. The result is on the capture's own
+rig, at its own rate, with all of its frames.
 """
 
 import time
@@ -37,12 +37,10 @@ from mapctl.terms import Term
 __all__ = ["DenoiseSettings", "DenoiseSolution", "begins_with_tpose", "denoise"]
 
 MIN_DENOISE_FRAMES = 8
-"""Frames of a capture that noise can be told in."""
-_RIG_FRAMES = 3000  # frames that show what rig a capture is on
-_SEGMENT_SECONDS, _OVERLAP_SECONDS = (
-    60.0,
-    2.0,
-)  # seconds of a long capture that are cleaned at once, and that two pieces share
+"""Fewest frames of a capture whose noise can be estimated."""
+_RIG_FRAMES = 3000  # frames from which the rig is identified
+_SEGMENT_SECONDS = 60.0  # seconds of a long capture that are cleaned at once
+_OVERLAP_SECONDS = 2.0  # seconds that two segments share
 
 
 def denoise(
@@ -56,53 +54,53 @@ def denoise(
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> DenoiseSolution:
-    """Denoise a motion on any rig that `mapctl.retarget.rigs` can tell, or on a given one; RequestError for others and
-    for masks that do not fit.
+    """Denoise a motion on any rig that `mapctl.retarget.rigs` identifies, or on a given one; RequestError for others
+    and for masks that do not fit.
 
     `denoiser` proposes (see priors.load_denoiser). Of `densities` the likeliest adds its likelihood to each window of
     the MAP stage; `terms` are the caller's own, which see the time since the capture's first frame. A T-pose in frame
-    0, as many captures begin with, stays. A long capture is cleaned in pieces that fade into each other, so memory
-    beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
+    0, as many captures begin with, stays. A long capture is cleaned in segments that crossfade, so memory beyond the
+    capture's own does not grow with it. `progress` is called with frames done and all frames.
     """
     settings = settings or DenoiseSettings()
     masks = resolve_joint_names(motion, masks, rig)
-    expand_valid_masks(motion, masks)  # whole: of a piece they are cut to its frames
-    # Told once: a piece may lack what shows the rig's T-pose.
+    expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
+    # Identified once: a segment may lack the frames that show the rig's T-pose.
     beginning, rigmap = to_canonical(_slice_beginning(motion), rig)
     rig = as_rig(rigmap)
     lead = 1 if has_lead_pose(_slice_beginning(motion), beginning, rigmap) else 0
-    mixed = find_lead_transition(motion, rigmap) if lead else None
-    wanted = (*masks, *(mixed.masks(motion.skeleton.names) if mixed else ()))
+    transition = find_lead_transition(motion, rigmap) if lead else None
+    all_masks = (*masks, *(transition.masks(motion.skeleton.names) if transition else ()))
     frames, fps = motion.num_frames - lead, float(motion.fps)
     long, shared = (max(MIN_DENOISE_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
     pieces: list[tuple[DenoiseSolution, int]] = []
     start = stop = 0
     while stop < frames:
         before, stop = stop, frames if frames - start <= long + shared else start + long
-        part, hidden = motion.slice(lead + start, lead + stop), slice_masks(wanted, lead + start, lead + stop)
-        if pieces:  # what the piece before made of lost joints is all that is known of them
+        part, part_masks = motion.slice(lead + start, lead + stop), slice_masks(all_masks, lead + start, lead + stop)
+        if pieces:  # missing joints are known only from the segment before
             last, first = pieces[-1]
-            part = write_back_masked(part, last.motion.slice(start - first, before - first), hidden)
-            hidden = trim_masks_before(hidden, before - start)
+            part = write_back_masked(part, last.motion.slice(start - first, before - first), part_masks)
+            part_masks = trim_masks_before(part_masks, before - start)
         denoised = _denoise_segment(
-            part, denoiser, hidden, settings, densities, terms, rig, seconds=(lead + start) / fps
+            part, denoiser, part_masks, settings, densities, terms, rig, seconds=(lead + start) / fps
         )
         pieces.append((denoised, start))
         start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
     done = replace(join_segments(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
-    return (restore_lead_pose(motion, done, rigmap, mixed, masks) if mixed else done).assess()
+    return (restore_lead_pose(motion, done, rigmap, transition, masks) if transition else done).assess()
 
 
 def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:
-    """Whether frame 0 is a T-pose, or the rig's rest pose, that the motion does not begin with."""
+    """Return whether frame 0 is a T-pose, or the rig's rest pose, that does not belong to the motion."""
     beginning = _slice_beginning(motion)
     return has_lead_pose(beginning, *to_canonical(beginning, rig))
 
 
 def _slice_beginning(motion: Motion) -> Motion:
-    """As much as is looked at to tell a rig."""
+    """Slice the frames from which the rig is identified."""
     return motion.slice(0, min(motion.num_frames, _RIG_FRAMES))
 
 
@@ -117,9 +115,9 @@ def _denoise_segment(
     *,
     seconds: float,
 ) -> DenoiseSolution:
-    """Denoise a piece that begins so many seconds after the capture."""
+    """Denoise a segment that begins so many seconds after the capture."""
     began = time.perf_counter()
-    examined = inspect_recording(motion, masks)
+    inspection = inspect_recording(motion, masks)
     if motion.num_frames < MIN_DENOISE_FRAMES:
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
         return DenoiseSolution(
@@ -127,11 +125,11 @@ def _denoise_segment(
             Status(Outcome.DONE, (note,)),
             Ledger(),
             capture=motion,
-            noise=examined.noise,
-            noise_root=examined.noise_root,
+            noise=inspection.noise,
+            noise_root=inspection.noise_root,
             faults=(),
             contacts=torch.zeros(motion.num_frames, 2, dtype=torch.bool),
             proposal_share=torch.zeros(motion.num_frames, CANONICAL.num_joints),
         )
-    done = SegmentDenoiser(examined, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
+    done = SegmentDenoiser(inspection, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
     return replace(done, seconds=time.perf_counter() - began)

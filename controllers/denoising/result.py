@@ -1,4 +1,4 @@
-"""What denoising returns: the clean motion, what was found wrong, what was changed, and how sure it is."""
+"""Result of denoising: the clean motion, the artefacts found, the corrections, and their reliability."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,33 +25,34 @@ _FALLBACK_SHARE = 0.5  # share of a joint's frames from which the network counts
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DenoiseSolution(Solution):
-    """A clean motion on the capture's rig, at its rate, and what was found and changed."""
+    """Clean motion on the capture's rig, at its rate, with artefacts and corrections."""
 
     capture: Motion
-    """The capture as it came."""
+    """The capture as given."""
     noise: Float[Tensor, " joints"]
     """Estimated noise of each of a joint's angles, by joint of the rig, radians."""
     noise_root: float
     """Estimated noise of each coordinate of the root position, metres."""
     faults: tuple[Artefact, ...]
-    """Everything that was found wrong."""
+    """All artefacts found."""
     contacts: Bool[Tensor, "frames 2"]
-    """Left and right toe planted, at PRIOR_FPS."""
+    """Contacts of the left and the right toe, at PRIOR_FPS."""
     proposal_share: Float[Tensor, "frames canonical"]
-    """By frame at PRIOR_FPS and canonical joint: 1 where the proposal was followed, 0 where the capture itself,
-    smoothed, took its place."""
+    """By frame at PRIOR_FPS and canonical joint: 1 where the proposal was used, 0 where the smoothed capture was."""
     rig: Rig | None = None
     """The rig as it was identified."""
     density_intervals: tuple[DensityInterval, ...] = ()
-    """In frames of the capture, which density counted in each window and how much; none where none was given."""
+    """Density and its weight in each window, in frames of the capture; empty where none was given."""
 
     def assess(self) -> "DenoiseSolution":
         """Return the solution whose status says whether the network was out of its depth in more than half of it."""
-        lost = float(self.proposal_share.mean()) < _FALLBACK_SHARE and bool(self.noise.max() > 0)
-        return replace(self, status=replace(self.status, outcome=Outcome.OUT_OF_DEPTH if lost else Outcome.DONE))
+        out_of_depth = float(self.proposal_share.mean()) < _FALLBACK_SHARE and bool(self.noise.max() > 0)
+        return replace(
+            self, status=replace(self.status, outcome=Outcome.OUT_OF_DEPTH if out_of_depth else Outcome.DONE)
+        )
 
     def slice(self, start: int, stop: int) -> "DenoiseSolution":
-        """Return frames start to stop, with what was wrong in them; the noise stays that of the whole."""
+        """Return frames start to stop with their artefacts; the noise stays that of the whole."""
         ratio = PRIOR_FPS / float(self.motion.fps)
         part = slice(round(start * ratio), round(stop * ratio))
         faults = shift_frames(_clip_to_frames(self.faults, start, stop), -start)
@@ -91,8 +92,8 @@ class DenoiseSolution(Solution):
     def correction(self) -> tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]]:
         """Compute by joint of the rig the mean distance it was moved by, cm, and the mean angle in its parent, deg."""
         moved = (self.motion.joint_positions() - self.capture.joint_positions()).norm(dim=-1)
-        turn = rotations.multiply(rotations.inverse(self.capture.local_quat_xyzw), self.motion.local_quat_xyzw)
-        angle = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
+        rotation = rotations.multiply(rotations.inverse(self.capture.local_quat_xyzw), self.motion.local_quat_xyzw)
+        angle = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         return 100 * moved.mean(dim=0), angle.mean(dim=0)
 
     def list_contact_frames(self) -> dict[str, list[list[int]]]:
@@ -124,9 +125,8 @@ def join_segments(pieces: Sequence[tuple[DenoiseSolution, int]]) -> DenoiseSolut
     if len(pieces) == 1:
         return pieces[0][0]
     middle = len(pieces) // 2
-    return _append_segment(
-        join_segments(pieces[:middle]), join_segments(pieces[middle:]), pieces[middle][1] - pieces[0][1]
-    )
+    first, second = join_segments(pieces[:middle]), join_segments(pieces[middle:])
+    return _append_segment(first, second, pieces[middle][1] - pieces[0][1])
 
 
 def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) -> DenoiseSolution:
@@ -192,17 +192,14 @@ def crossfade(before: Motion, after: Motion, shared: int) -> Motion:
     first = before.num_frames - shared
     weight = torch.linspace(0, 1, shared, dtype=torch.float64)
     tail, head = before.slice(first, before.num_frames), after.slice(0, shared)
-    place = torch.lerp(tail.root_position, head.root_position, weight[:, None])
+    root = torch.lerp(tail.root_position, head.root_position, weight[:, None])
     moving = {
         joint: torch.lerp(values, head.moving_offsets[joint], weight[:, None])
         for joint, values in tail.moving_offsets.items()
     }
-    turns = weight[:, None].expand(shared, before.num_joints)
-    quats = rotations.slerp(tail.local_quat_xyzw, head.local_quat_xyzw, turns)
-    mixed = replace(tail, root_position=place, local_quat_xyzw=quats, moving_offsets=moving)
-    parts = [mixed]
-    if first > 0:
-        parts.insert(0, before.slice(0, first))
-    if shared < after.num_frames:
-        parts.append(after.slice(shared, after.num_frames))
+    weights = weight[:, None].expand(shared, before.num_joints)
+    quats = rotations.slerp(tail.local_quat_xyzw, head.local_quat_xyzw, weights)
+    mixed = replace(tail, root_position=root, local_quat_xyzw=quats, moving_offsets=moving)
+    parts = [before.slice(0, first)] if first > 0 else []
+    parts += [mixed, after.slice(shared, after.num_frames)] if shared < after.num_frames else [mixed]
     return reduce(Motion.join, parts)

@@ -1,4 +1,4 @@
-"""One piece of a capture: proposal, what goes back, feet, and the way back to its rig."""
+"""Denoising of one segment of a capture: proposal, residual motion, MAP stage, and retargeting to its rig."""
 
 import math
 from collections.abc import Sequence
@@ -38,16 +38,16 @@ from mapctl.terms import Term
 
 @dataclass(frozen=True)
 class DenoiseSettings:
-    """What is known of the capture, and how the search is done."""
+    """Noise of the capture, and settings of the search."""
 
     sigma_deg: float | None = None
-    """Noise of each of a joint's angles; told from the capture, joint by joint, if None."""
+    """Noise of each of a joint's angles, degrees; estimated from the capture, joint by joint, if None."""
     sigma_cm: float | None = None
-    """Noise of each coordinate of the hips; told from the capture if None."""
+    """Noise of each coordinate of the hips, centimetres; estimated from the capture if None."""
     anchor: bool = False
-    """Let the body go where its planted feet say, for captures that drift against them."""
+    """Whether the trajectory is corrected so that planted feet do not travel, for captures that drift."""
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
-    """The MAP stage."""
+    """Settings of the MAP stage."""
 
     def __post_init__(self):
         for name in ("sigma_deg", "sigma_cm"):
@@ -57,26 +57,26 @@ class DenoiseSettings:
 
 
 class SegmentDenoiser:
-    """From an examined capture to a clean motion."""
+    """Denoiser of one inspected segment."""
 
-    def __init__(self, examined: Inspection, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
-        self.examined, self.denoiser, self.settings = examined, denoiser, settings
-        self.repaired = _smooth_noncanonical_joints(examined, rig)
+    def __init__(self, inspection: Inspection, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
+        self.inspection, self.denoiser, self.settings = inspection, denoiser, settings
+        self.repaired = _smooth_noncanonical_joints(inspection, rig)
         canonical, self.rigmap = to_canonical(self.repaired, rig)
-        seen = _map_mask_to_canonical(examined.seen, self.rigmap)
-        self.hidden_root = examined.dropouts_root | ~_are_hip_ancestors_observed(~examined.dropouts, self.rigmap)
-        self.seen_root = examined.seen_root & _are_hip_ancestors_observed(examined.seen, self.rigmap)
-        self.sigma, self.sigma_root = self._estimate_noise(canonical, seen)
+        observed = _map_mask_to_canonical(inspection.seen, self.rigmap)
+        self.hidden_root = inspection.dropouts_root | ~_are_hip_ancestors_observed(~inspection.dropouts, self.rigmap)
+        self.observed_root = inspection.seen_root & _are_hip_ancestors_observed(inspection.seen, self.rigmap)
+        self.sigma, self.sigma_root = self._estimate_noise(canonical, observed)
         self.bands = split_bands(canonical)
         if self.bands.exact:
-            # Nothing is filtered: the network is shown the frames as they came, and told which not to look at.
-            self.bands = split_bands(_match_quaternion_signs(to_canonical(examined.motion, rig)[0], canonical))
+            # Nothing is filtered: the network gets the raw frames, and a mask of those to ignore.
+            self.bands = split_bands(_match_quaternion_signs(to_canonical(inspection.motion, rig)[0], canonical))
         self.shown = self.bands.at_prior_rate()
-        self.capture = self._build_capture(seen)
+        self.capture = self._build_capture(observed)
 
     def run(self, densities: Sequence[Density], terms: Sequence[Term], first_frame: int) -> DenoiseSolution:
-        """Propose, give back, put the feet down, return to the rig. The piece begins at frame `first_frame`, at
-        PRIOR_FPS, of the whole capture, which is what terms see.
+        """Propose, restore residual motion, refine, and retarget to the rig. The segment begins at frame `first_frame`
+        of the whole capture, at PRIOR_FPS, which is the time that terms see.
         """
         proposal, contacts = self._propose()
         if self.bands.exact:
@@ -98,15 +98,15 @@ class SegmentDenoiser:
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
         within = self.bands.within
         refined = replace(refined, contacts=refined.contacts[:within], ledger=refined.ledger.slice(within))
-        examined, found = self.examined, self._collect_faults(motion, proposal.slice(0, within), refined)
+        inspection, found = self.inspection, self._collect_faults(motion, proposal.slice(0, within), refined)
         return DenoiseSolution(
             motion,
             Status(Outcome.DONE),
             refined.ledger,
             refined.windows,
-            capture=examined.motion,
-            noise=examined.noise,
-            noise_root=examined.noise_root,
+            capture=inspection.motion,
+            noise=inspection.noise,
+            noise_root=inspection.noise_root,
             faults=found,
             contacts=refined.contacts,
             proposal_share=1 - share[:within],
@@ -115,8 +115,8 @@ class SegmentDenoiser:
 
     def _convert_to_capture_rate(self, parts: Sequence[DensityInterval]) -> tuple[DensityInterval, ...]:
         """Convert intervals to frames of the capture; the last ends with it."""
-        frames, shown = self.examined.motion.num_frames, self.shown.num_frames
-        ratio = float(self.examined.motion.fps) / float(self.shown.fps)
+        frames, shown = self.inspection.motion.num_frames, self.shown.num_frames
+        ratio = float(self.inspection.motion.fps) / float(self.shown.fps)
         moved = [
             replace(
                 part,
@@ -130,18 +130,18 @@ class SegmentDenoiser:
     def _collect_faults(
         self, motion: Motion, proposal: Motion, refined: RefinedMotion
     ) -> tuple[artefacts.Artefact, ...]:
-        """What was found wrong, on the rig; `proposal` is the motion before its feet were put down."""
-        examined, names = self.examined, motion.skeleton.names
-        turn = rotations.multiply(rotations.inverse(examined.motion.local_quat_xyzw), motion.local_quat_xyzw)
-        away = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
-        traveller = names[examined.travels]
-        apart = 100 * (examined.place(motion) - examined.place(examined.motion)).norm(dim=-1)
+        """Collect the artefacts, on the rig; `proposal` is the motion before the MAP stage."""
+        inspection, names = self.inspection, motion.skeleton.names
+        rotation = rotations.multiply(rotations.inverse(inspection.motion.local_quat_xyzw), motion.local_quat_xyzw)
+        angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
+        travelling = names[inspection.travels]
+        distances = 100 * (inspection.place(motion) - inspection.place(inspection.motion)).norm(dim=-1)
         found = artefacts.list_noise(
-            names, examined.noise, examined.noise_root, travels=examined.travels, frames=motion.num_frames
+            names, inspection.noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
         )
-        found += artefacts.list_spikes(names, self._map_spikes_to_rig(), away, "deg")
-        found += artefacts.list_spikes([traveller], self._find_root_spikes(), apart[:, None], "cm")
-        found += artefacts.list_dropouts(names, examined.dropouts)
+        found += artefacts.list_spikes(names, self._map_spikes_to_rig(), angles, "deg")
+        found += artefacts.list_spikes([travelling], self._find_root_spikes(), distances[:, None], "cm")
+        found += artefacts.list_dropouts(names, inspection.dropouts)
         toes = proposal.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
@@ -153,125 +153,125 @@ class SegmentDenoiser:
         return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
 
     def _map_spikes_to_rig(self) -> Bool[Tensor, "frames joints"]:
-        """By joint of the rig; where the proposal told them, as it told them."""
-        spikes = self.examined.spikes.clone()
+        """Return spikes by joint of the rig, as redetected beside the proposal where that was done."""
+        spikes = self.inspection.spikes.clone()
         if self.bands.exact:
-            told = ~self.capture.seen[0]
+            detected = ~self.capture.seen[0]
             for canonical, joint in enumerate(self.rigmap.joint_of):
                 if joint is not None:
-                    spikes[:, joint] = told[:, canonical] & ~self.examined.dropouts[:, joint]
+                    spikes[:, joint] = detected[:, canonical] & ~self.inspection.dropouts[:, joint]
         return spikes
 
     def _find_root_spikes(self) -> Bool[Tensor, "frames 1"]:
-        """In which frames the root's place leaps."""
+        """Find frames in which the root position is a spike."""
         if not self.bands.exact:
-            return self.examined.spikes_root[:, None]
+            return self.inspection.spikes_root[:, None]
         return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
 
-    def _estimate_noise(self, canonical: Motion, seen: Tensor) -> tuple[Float[Tensor, " joints"], float]:
+    def _estimate_noise(self, canonical: Motion, observed: Tensor) -> tuple[Float[Tensor, " joints"], float]:
         """Estimate the noise of canonical joints' angles (radians) and the hips' position (metres), at the capture's
         rate.
         """
-        wanted = self.settings
-        sigma = estimate_angle_noise(canonical.local_quat_xyzw, seen)
-        if wanted.sigma_deg is not None:
+        settings = self.settings
+        sigma = estimate_angle_noise(canonical.local_quat_xyzw, observed)
+        if settings.sigma_deg is not None:
             # Joints that never move have no noise either: they are locked, or the rig has none there.
-            sigma = torch.where(sigma > 0, math.radians(wanted.sigma_deg), 0.0).to(sigma)
-        root = estimate_position_noise(canonical.root_position, self.seen_root)
-        return sigma, root if wanted.sigma_cm is None else wanted.sigma_cm / 100
+            sigma = torch.where(sigma > 0, math.radians(settings.sigma_deg), 0.0).to(sigma)
+        root = estimate_position_noise(canonical.root_position, self.observed_root)
+        return sigma, root if settings.sigma_cm is None else settings.sigma_cm / 100
 
-    def _build_capture(self, seen: Tensor) -> Capture:
-        """What the network is shown, at its own rate."""
-        root = self.seen_root[:, None]
+    def _build_capture(self, observed: Tensor) -> Capture:
+        """Build the network's input, at its own rate."""
+        root = self.observed_root[:, None]
         sigma = self.bands.noise_at_prior_rate(self.sigma)
         sigma_root = self.bands.noise_at_prior_rate(torch.tensor(self.sigma_root))
         return Capture.of_motion(
             self.shown,
-            seen=self._resample_mask(seen),
+            seen=self._resample_mask(observed),
             seen_root=self._resample_mask(root)[:, 0],
             sigma=sigma,
             sigma_root=float(sigma_root),
         )
 
-    def _resample_mask(self, seen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
-        """Seen at the prior's rate is what was seen in half of the frames about there."""
-        ratio = float(self.examined.motion.fps) / float(self.shown.fps)
+    def _resample_mask(self, observed: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
+        """Resample a mask to the prior's rate: observed where at least half of the frames around it are."""
+        ratio = float(self.inspection.motion.fps) / float(self.shown.fps)
         side = max(0, round((ratio - 1) / 2))
-        padded = torch.nn.functional.pad(seen.double().T[:, None], (side, side), mode="replicate")
+        padded = torch.nn.functional.pad(observed.double().T[:, None], (side, side), mode="replicate")
         share = torch.nn.functional.avg_pool1d(padded, 2 * side + 1, stride=1)[:, 0].T
-        at = (torch.arange(self.shown.num_frames) * ratio).round().long().clamp(max=len(seen) - 1)
+        at = (torch.arange(self.shown.num_frames) * ratio).round().long().clamp(max=len(observed) - 1)
         return share[at] >= 0.5
 
     def _propose(self) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """The network's motion on the performer's bones, and the log odds of contacts."""
+        """Return the network's motion on the performer's bones, and contact logits."""
         scale = leg_length(CANONICAL) / leg_length(self.rigmap.skeleton)
-        asked = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
-        cleaned = self.denoiser.clean(asked)
+        unit_capture = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
+        cleaned = self.denoiser.clean(unit_capture)
         quats = rotations.make_sign_continuous(cleaned.pose.local_quat_xyzw[0].double())
         motion = Motion(self.rigmap.skeleton, self.shown.fps, cleaned.pose.root_position[0].double() / scale, quats)
         return motion, cleaned.contact_logits[0]
 
     def _redetect_spikes(self, proposal: Motion) -> Capture:
-        """Spikes told anew by what is left beside the proposal: fast motion that passed for one is seen again."""
-        dropouts = ~_map_mask_to_canonical(~self.examined.dropouts, self.rigmap)
+        """Detect spikes again in the residual beside the proposal: fast motion mistaken for one is observed again."""
+        dropouts = ~_map_mask_to_canonical(~self.inspection.dropouts, self.rigmap)
         spikes = find_residual_spikes(self._compute_residual_rotations(proposal), self.capture.sigma[0].double())
         root = (self.shown.root_position - proposal.root_position)[:, None]
         leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]
         return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
 
     def _restore_residual(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
-        """The proposal with the motion that it left out, and the share of that by frame and joint."""
+        """Return the proposal with its residual motion restored, and the restored share by frame and joint."""
         capture = self.capture
         angles, share = restore_residual_motion(
             self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double()
         )
-        place = (self.shown.root_position - proposal.root_position)[:, None]
-        root, _ = restore_residual_motion(place, capture.seen_root[0][:, None], capture.sigma_root.double())
+        offset = (self.shown.root_position - proposal.root_position)[:, None]
+        root, _ = restore_residual_motion(offset, capture.seen_root[0][:, None], capture.sigma_root.double())
         quats = rotations.multiply(proposal.local_quat_xyzw, rotations.from_rotation_vector(angles))
-        changed = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)
-        return changed, share
+        restored = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)
+        return restored, share
 
     def _compute_residual_rotations(self, proposal: Motion) -> Float[Tensor, "frames joints 3"]:
-        """By which turns the capture differs from the proposal."""
-        turned = rotations.multiply(rotations.inverse(proposal.local_quat_xyzw), self.shown.local_quat_xyzw)
-        return rotations.to_rotation_vector(turned)
+        """Compute the rotation vectors from the proposal to the capture, radians."""
+        residual = rotations.multiply(rotations.inverse(proposal.local_quat_xyzw), self.shown.local_quat_xyzw)
+        return rotations.to_rotation_vector(residual)
 
 
 def _match_quaternion_signs(motion: Motion, other: Motion) -> Motion:
-    """The same rotations with signs as the other's: frames that were not seen, and show anything, change none after."""
+    """Give quaternions the signs of another motion's, so that unobserved frames flip no sign after them."""
     dots = (motion.local_quat_xyzw * other.local_quat_xyzw).sum(dim=-1, keepdim=True)
     return replace(motion, local_quat_xyzw=torch.where(dots < 0, -1.0, 1.0) * motion.local_quat_xyzw)
 
 
-def _smooth_noncanonical_joints(examined: Inspection, rig: Rig | None) -> Motion:
-    """The repaired capture; joints that the canonical skeleton lacks, as fingers, are smoothed as their noise asks."""
-    motion = examined.repaired()
+def _smooth_noncanonical_joints(inspection: Inspection, rig: Rig | None) -> Motion:
+    """Return the repaired capture; joints without a canonical one, such as fingers, are smoothed by their noise."""
+    motion = inspection.repaired()
     used = set(retarget.identify_rig(motion.skeleton, rig).joint_of)
-    others = [j for j in range(motion.num_joints) if j not in used and examined.noise[j] > 0]
+    others = [j for j in range(motion.num_joints) if j not in used and inspection.noise[j] > 0]
     if not others:
         return motion
     quats = motion.local_quat_xyzw.clone()
-    quats[:, others] = smooth_rotations(quats[:, others], examined.noise[others])
+    quats[:, others] = smooth_rotations(quats[:, others], inspection.noise[others])
     return replace(motion, local_quat_xyzw=quats)
 
 
-def _map_mask_to_canonical(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, "frames joints"]:
-    """A canonical joint is seen if its own joint of the rig is, and all that lie between it and the one above."""
+def _map_mask_to_canonical(observed: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, "frames joints"]:
+    """Map a mask: a canonical joint is observed if its rig joint is, and all between it and the canonical parent."""
     parents = rigmap.rig_skeleton.parents
     columns = []
     for canonical, joint in enumerate(rigmap.joint_of):
         above = rigmap.joint_of[CANONICAL.parents[canonical]] if canonical else None
-        column = torch.ones(len(seen), dtype=torch.bool)
+        column = torch.ones(len(observed), dtype=torch.bool)
         while joint is not None and joint >= 0 and joint != above:
-            column = column & seen[:, joint]
+            column = column & observed[:, joint]
             joint = parents[joint]
         columns.append(column)
     return torch.stack(columns, dim=1)
 
 
-def _are_hip_ancestors_observed(seen: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, " frames"]:
-    """Whether all joints above the hips were seen: they carry its place."""
-    column, joint = torch.ones(len(seen), dtype=torch.bool), rigmap.joint_of[0]
+def _are_hip_ancestors_observed(observed: Bool[Tensor, "frames rigged"], rigmap: RigMap) -> Bool[Tensor, " frames"]:
+    """Return whether all ancestors of the hips were observed, which determine their position."""
+    column, joint = torch.ones(len(observed), dtype=torch.bool), rigmap.joint_of[0]
     while joint is not None and (joint := rigmap.rig_skeleton.parents[joint]) >= 0:
-        column = column & seen[:, joint]
+        column = column & observed[:, joint]
     return column

@@ -1,4 +1,4 @@
-"""Walk a drawn curve (rnn paper, section 5.2): choose a start, then solve window after window."""
+"""Walk along a curve (Wang et al. 2019, section 5.2): select an initial state, then solve a receding horizon."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -25,37 +25,35 @@ from mapctl.terms import FootContact, LatentPrior, Path, Term
 
 @dataclass(frozen=True)
 class FollowSettings:
-    """Sigmas and search of a followed curve; the terms' own docstrings give the meaning."""
+    """Sigmas and search of path following; the terms' own docstrings give the meaning."""
 
     path_sigma_slow: float = Path.sigma_slow
-    """Sideways offset after its slow part is taken, metres."""
+    """Sigma of the slow part of the sideways offset, metres."""
     path_free_sway: float = Path.free_sway
-    """Sideways offset that is left to the walker, metres."""
+    """Sideways offset that costs nothing, metres."""
     path_sigma_raw: float = Path.sigma_raw
-    """Sideways offset beyond it, metres."""
+    """Sigma of the sideways offset beyond the free sway, metres."""
     path_sigma_progress: float = Path.sigma_progress
-    """Arc missing or too much, metres."""
+    """Sigma of the arc behind or ahead of the requested one, metres."""
     footing: FootContact = field(default_factory=FootContact)
-    """Planted feet."""
+    """Contact term."""
     noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
-    """The prior, in the latents of its rollout. A well trained prior's own spread is small: at sigma 1 the same walk
-    holds its path and its feet less well (docs/results.md)."""
+    """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 1 the
+    same walk follows its path less well and skates more (docs/results.md)."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
-    """How windows are laid."""
+    """Lengths of the receding horizon."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
-    """How one window is solved."""
+    """Solver of one window."""
     joint: str = "hips"
-    """Which joint follows the curve."""
+    """Joint that follows the curve."""
 
-    def scaled_to(self, person: Character) -> "FollowSettings":
-        """The same sigmas for somebody of this size, in metres of the prior's size."""
-        if person.scale == 1.0:
-            return self
+    def scaled_to(self, character: Character) -> "FollowSettings":
+        """Return the settings for a character of this size, in metres of the prior's size."""
         sigmas = {
-            name: getattr(self, name) / person.scale
+            name: getattr(self, name) / character.scale
             for name in ("path_sigma_slow", "path_free_sway", "path_sigma_raw", "path_sigma_progress")
         }
-        return replace(self, footing=person.footing(self.footing), **sigmas)
+        return replace(self, footing=character.footing(self.footing), **sigmas)
 
 
 def follow(
@@ -77,42 +75,42 @@ def follow(
     the same in every window; they see the character at its own size and the time since the first frame. On another
     `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
     `settings.footing`. The first frame is the start pose. The motion is at PRIOR_FPS; `Motion.resample` gives other
-    rates. After `deadline_seconds` of wall clock, and at Ctrl-C, what is solved by then comes back and the status says
-    so. RequestError for wishes that make no sense; wishes that cannot hold are named with numbers in the status.
+    rates. After `deadline_seconds` of wall clock, and at Ctrl-C, the solution so far is returned and the status says
+    so. RequestError for requests that make no sense; infeasible ones are named with numbers in the status.
     """
     began = time.perf_counter()
     deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
     request, lowered = PathRequest(curve, profile, seconds).fitted(PRIOR_FPS)
     settings = settings or FollowSettings()
-    person = Character(skeleton, settings.footing.rest_height)
+    character = Character(skeleton, settings.footing.rest_height)
     generator = generator or torch.Generator().manual_seed(0)
     frames = request.frames(PRIOR_FPS)
-    # Windows look ahead beyond the last frame, so the wanted arcs go on that far.
+    # Windows look ahead beyond the last frame, so the requested arcs extend that far.
     arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
-    seen, seen_arcs = person.curve(curve), arcs / person.scale
-    more = [person.term(term) for term in terms]
-    terms_of = build_follow_terms(seen, seen_arcs, settings.scaled_to(person), more)
+    unit_curve, unit_arcs = character.curve(curve), arcs / character.scale
+    caller_terms = [character.term(term) for term in terms]
+    terms_of = build_follow_terms(unit_curve, unit_arcs, settings.scaled_to(character), caller_terms)
     start = select_initial_state(
-        prior, seen, seen_arcs, terms_of, skeleton=person.unit_skeleton, fps=PRIOR_FPS, generator=generator
+        prior, unit_curve, unit_arcs, terms_of, skeleton=character.unit_skeleton, fps=PRIOR_FPS, generator=generator
     )
-    solver = RecedingHorizonSolver(prior, settings.window, person.unit_skeleton, method=settings.method)
+    solver = RecedingHorizonSolver(prior, settings.window, character.unit_skeleton, method=settings.method)
     done, outcome = solver.solve(
         start.committed, terms_of, frames, generator=generator, progress=progress, deadline=deadline
     )
-    motion = person.motion(decode(done.features, start.before_first, skeleton=person.unit_skeleton))
+    motion = character.motion(decode(done.features, start.before_first, skeleton=character.unit_skeleton))
     notes = [lowered] if lowered else []
-    notes += check_path(request, arcs[:frames], person.data_limits(prior.limits))
+    notes += check_path(request, arcs[:frames], character.data_limits(prior.limits))
     notes += check_tracking(motion, curve, settings.joint)
     status = Status(outcome).with_notes(notes, infeasible=bool(notes))
-    ledger, seconds = person.ledger(done.ledger), time.perf_counter() - began
+    ledger, seconds = character.ledger(done.ledger), time.perf_counter() - began
     return Solution(motion, status, ledger, done.windows, done.features, seconds)
 
 
 def build_follow_terms(
-    curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings, more: Sequence[Term] = ()
+    curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings, caller_terms: Sequence[Term] = ()
 ) -> TermsOf:
-    """Build the terms of each window, for the wanted arcs of all frames and the look-ahead beyond them."""
+    """Build the terms of each window, for the requested arcs of all frames and the look-ahead beyond them."""
     path = Path(
         curve,
         arcs,
@@ -124,6 +122,6 @@ def build_follow_terms(
     )
 
     def terms(first: int, frames: int) -> Sequence[Term]:
-        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *more
+        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *caller_terms
 
     return terms

@@ -1,7 +1,8 @@
-"""Finish a generated motion: feet that its own contact labels call planted stand, and the rest follows (section 4.3).
+"""Foot clean-up of a generated motion: feet are planted where its own contact labels say so (Wang et al. 2019, section
+4.3).
 
-A sliding-window MAP over the latents of the motion: the noise prior takes the tremble away, footing the slide, and
-closeness keeps what the motion does. Works piece by piece in memory that does not grow.
+A receding-horizon MAP over the motion's latent noise: the latent prior removes jitter, the contact term removes foot
+skate, and motion tracking keeps the rest. Works piece by piece in constant memory.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,26 +29,26 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True)
 class FootCleanupSettings:
-    """Sigmas and search of the finishing pass; the terms' own docstrings give the meaning."""
+    """Sigmas and search of the foot clean-up; the terms' own docstrings give the meaning."""
 
     sigma_noise: float = 1.0
-    """Of the noise prior: above 1 leaves more of the motion's own tremble."""
+    """Sigma of the latent prior: above 1 leaves more of the motion's own jitter."""
     sigma_pose: float = MotionTracking.sigma_pose
-    """Distance of joints from the motion's, metres."""
+    """Sigma of the distance of joints from the motion's, metres."""
     sigma_trajectory: float = MotionTracking.sigma_trajectory
-    """Way over the ground within a window, metres."""
+    """Sigma of the trajectory's deviation over the ground within a window, metres."""
     sigma_heading: float = MotionTracking.sigma_heading
-    """Turn within a window, radians."""
+    """Sigma of the heading's deviation within a window, radians."""
     footing: FootContact = field(default_factory=lambda: FootContact(sigma_speed=0.06))
-    """Planted feet. Mocap's own move a little: feet that stood still would be told from them."""
+    """Contact term. Mocap's planted feet move a little: perfectly still ones would be distinguishable from them."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
-    """How windows are laid."""
+    """Lengths of the receding horizon."""
     share: float = GuidedNoiseSolver.share
-    """Of the motion's noise that the search starts with."""
+    """Share of the motion's latent noise in the warm start."""
 
-    def scaled_to(self, person: Character) -> "FootCleanupSettings":
-        """The same for somebody of this size, in metres of the prior's size."""
-        return self if person.scale == 1.0 else replace(self, footing=person.footing(self.footing))
+    def scaled_to(self, character: Character) -> "FootCleanupSettings":
+        """Return the settings for a character of this size, in metres of the prior's size."""
+        return replace(self, footing=character.footing(self.footing))
 
 
 def clean_up_feet(
@@ -57,7 +58,7 @@ def clean_up_feet(
     frames: int,
     state: DensityState,
     generator: torch.Generator,
-    place: GroundPose | None = None,
+    ground_pose: GroundPose | None = None,
     settings: FootCleanupSettings | None = None,
     skeleton: Skeleton = CANONICAL,
     terms: Sequence[Term] = (),
@@ -65,27 +66,27 @@ def clean_up_feet(
 ) -> Iterator[Float[Tensor, "_ size"]]:
     """Clean up the feet of the first `frames` of consecutive pieces of features, contact labels debounced.
 
-    `state` and `place` (the origin) are the density's and the character's before the first frame, batch of one. `terms`
-    are the caller's own, the same in every window; `record` is called with each window that was solved. Windows look
-    ahead, so the pieces must hold `settings.window.frames` more than are asked for; RequestError where they do not.
+    `state` and `ground_pose` (default: the origin) are the density's and the character's before the first frame, batch
+    of one. `terms` are the caller's own, the same in every window; `record` is called with each solved window. Windows
+    look ahead, so the pieces must hold `settings.window.frames` more frames than requested; RequestError otherwise.
     """
-    settings, place = settings or FootCleanupSettings(), place or GroundPose.origin()
-    place = GroundPose(place.position_xz.float(), place.heading.float())
+    settings, ground_pose = settings or FootCleanupSettings(), ground_pose or GroundPose.origin()
+    ground_pose = GroundPose(ground_pose.position_xz.float(), ground_pose.heading.float())
     still = torch.zeros(0, skeleton.num_joints, 3)
-    done = CommittedFrames(state, place, state.last_frame.float(), still, discarded=-1)
-    away = torch.zeros(2)  # of the world's origin from the windows' own
+    done = CommittedFrames(state, ground_pose, state.last_frame.float(), still, discarded=-1)
+    travelled = torch.zeros(2)  # offset from the world's origin to the windows' own
     waiting, left = torch.zeros(0, LAYOUT.size), frames
     for piece in pieces:
         waiting = torch.cat([waiting, piece.float()])
         while left > 0 and len(waiting) >= settings.window.frames:
             count = min(settings.window.frames - settings.window.overlap, left)
             window = _debounce_window_contacts(done.features, waiting[: settings.window.frames])
-            own = [ViewedTerm(term, partial(_move_trial, away=away)) for term in terms]
-            done = _clean_up_window(prior, done, window, count, settings, skeleton, generator, own)
+            caller_terms = [ViewedTerm(term, partial(_move_trial, offset=travelled)) for term in terms]
+            done = _clean_up_window(prior, done, window, count, settings, skeleton, generator, caller_terms)
             if record is not None:
                 record(done)
             yield done.features[-count:]
-            waiting, left, away = waiting[count:], left - count, away + done.place.position_xz
+            waiting, left, travelled = waiting[count:], left - count, travelled + done.place.position_xz
             done = _discard_history(done)
     if left > 0:
         raise RequestError(
@@ -101,30 +102,30 @@ def _clean_up_window(
     settings: FootCleanupSettings,
     skeleton: Skeleton,
     generator: torch.Generator,
-    more: Sequence[Term],
+    caller_terms: Sequence[Term],
 ) -> CommittedFrames:
-    """Commit `count` more frames; a window without a finite solution is left as it was."""
-    closeness = MotionTracking(
+    """Commit `count` more frames; a window without a finite solution stays unchanged."""
+    tracking = MotionTracking(
         window,
         sigma_pose=settings.sigma_pose,
         sigma_trajectory=settings.sigma_trajectory,
         sigma_heading=settings.sigma_heading,
     )
-    terms: tuple[Term, ...] = LatentPrior(settings.sigma_noise), closeness, settings.footing, *more
+    terms: tuple[Term, ...] = LatentPrior(settings.sigma_noise), tracking, settings.footing, *caller_terms
     method = GuidedNoiseSolver(window, share=settings.share)
     solver = RecedingHorizonSolver(prior, settings.window, skeleton, method=method)
-    following, _ = solver.solve(done, lambda first, frames: terms, len(done.features) + count, generator=generator)
-    return following
+    next_done, _ = solver.solve(done, lambda first, frames: terms, len(done.features) + count, generator=generator)
+    return next_done
 
 
-def _move_trial(trial: Trial, away: Float[Tensor, "2"]) -> Trial:
-    """Move a trial over the ground to where it is in the world."""
-    start = replace(trial.start, position_xz=trial.start.position_xz + away)
-    return replace(trial, start=start, before=trial.before + rotations.lift_ground(away))
+def _move_trial(trial: Trial, offset: Float[Tensor, "2"]) -> Trial:
+    """Translate a trial over the ground to its position in the world."""
+    start = replace(trial.start, position_xz=trial.start.position_xz + offset)
+    return replace(trial, start=start, before=trial.before + rotations.lift_ground(offset))
 
 
 def _discard_history(done: CommittedFrames) -> CommittedFrames:
-    """Discard all that no later window looks at, and move to the origin, where single precision is finest."""
+    """Discard all frames that no later window reads, and move to the origin, where single precision is finest."""
     here = done.place.position_xz
     return replace(
         done.discard_history(MIN_CONTACT_FRAMES),

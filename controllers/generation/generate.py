@@ -1,7 +1,7 @@
-"""Random generation of any length (rnn paper, sections 4.1.4, 4.2.3, 4.3 and 5.1).
+"""Random generation of any length (Wang et al. 2019, sections 4.1.4, 4.2.3, 4.3 and 5.1).
 
-The prior is sampled frame after frame, a refiner makes the samples look captured, and a finishing pass makes the feet
-stand that the motion's own contact labels call planted. All three work piece by piece.
+The prior is sampled frame after frame, a refiner makes the samples look captured, and a foot clean-up plants feet where
+the motion's own contact labels say so. All three work piece by piece.
 """
 
 import time
@@ -33,24 +33,24 @@ _GOLDEN = (5**0.5 - 1) / 2
 
 @dataclass(frozen=True)
 class GenerateSettings:
-    """How motion is drawn."""
+    """How motion is sampled."""
 
     temperature: float = 1.0
-    """Spread of the draws: 0 is the prior's mean, 1 the prior itself."""
+    """Temperature of the samples: 0 is the prior's mean, 1 the prior itself."""
     start: int | None = None
-    """Which of the prior's starts; drawn by their weight if None."""
+    """Index of one of the prior's initial states; sampled by their weights if None."""
     condition_on_start: bool = True
-    """Whether the prior is told what its data say of the start's clip (gait, style), if it can be told: left to itself
-    it lets most runs fall into a walk within ten seconds, which no clip of the data does."""
+    """Whether a prior with labels is conditioned on those of the initial state's clip (gait, style): unconditioned it
+    lets most runs fall into a walk within ten seconds, which no clip of the data does."""
     foot_cleanup: FootCleanupSettings | None = field(default_factory=FootCleanupSettings)
-    """Of the pass that makes planted feet stand; None leaves it out."""
+    """Settings of the foot clean-up; None leaves it out."""
 
     def __post_init__(self):
         if not 0 <= self.temperature <= 2:
             raise RequestError(f"the temperature must lie between 0 and 2, got {self.temperature:g}")
 
-    def person(self, skeleton: Skeleton) -> Character:
-        """Whose bones move, whose toes rest as high as the finishing pass has it."""
+    def character(self, skeleton: Skeleton) -> Character:
+        """Return the character with these bones, and the toe height at rest of the foot clean-up."""
         return Character(skeleton, self.foot_cleanup.footing.rest_height if self.foot_cleanup else TOE_REST_HEIGHT)
 
 
@@ -68,18 +68,20 @@ def stream(
     """Generate consecutive pieces of one motion at PRIOR_FPS, at most 20 s each, so that memory does not grow with its
     length.
 
-    Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the memory.
+    Begins at the origin facing +Z, or at the end of `start_clip` (any known rig), whose frames warm up the state.
     On another `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
     `settings.foot_cleanup`. `terms` are the caller's own, in every window of the foot clean-up; they see the character
-    at its own size, in the world, and the time since the first frame. RequestError, at once, for a length or a start
-    that cannot be, and for terms without a foot clean-up.
+    at its own size, in the world, and the time since the first frame. RequestError, at once, for an impossible length
+    or start, and for terms without a foot clean-up.
     """
     settings, solved = settings or GenerateSettings(), list[CommittedFrames]()
     if terms and settings.foot_cleanup is None:
-        raise RequestError("terms are wishes to the foot clean-up, which is left out")
-    person = settings.person(skeleton)
-    pieces, place = _start_stream(prior, seconds, generator, settings, start_clip, refiner, person, terms, solved)
-    return _decode_pieces(pieces, place, person, solved)
+        raise RequestError("terms belong to the foot clean-up, which is left out")
+    character = settings.character(skeleton)
+    pieces, ground_pose = _start_stream(
+        prior, seconds, generator, settings, start_clip, refiner, character, terms, solved
+    )
+    return _decode_pieces(pieces, ground_pose, character, solved)
 
 
 def generate(
@@ -123,45 +125,42 @@ def _join_pieces(whole: Solution, piece: Solution) -> Solution:
 def initialise_generation(
     prior: Density, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
 ) -> tuple[Density, DensityState, GroundPose]:
-    """The prior, conditioned as it is to be, its state and the place (float64) before the first frame.
+    """Return the prior, conditioned if requested, its state and the ground pose (float64) before the first frame.
 
-    Begins at a start of its own, or at the end of a clip, of which nothing is told; the clip's lengths are divided by
-    `scale`, the size of its performer beside the prior's.
+    Begins at an initial state of its own, or unconditioned at the end of a clip; the clip's lengths are divided by
+    `scale`, the ratio of its performer's size to the prior's.
     """
     if clip is not None:
         canonical, _ = retarget.to_canonical(clip)
         if scale != 1.0:
             bones = replace(canonical.skeleton, offsets=canonical.skeleton.offsets / scale)
             canonical = replace(canonical, skeleton=bones, root_position=canonical.root_position / scale)
-        features, place = encode(canonical.resample(PRIOR_FPS))
-        ground, heading = integrate_root(features, place)
-        seen = features.float()
-        state = replay(prior, seen[1:], prior.start_after(seen[:1]))
+        features, ground_pose = encode(canonical.resample(PRIOR_FPS))
+        ground, heading = integrate_root(features, ground_pose)
+        observed = features.float()
+        state = replay(prior, observed[1:], prior.start_after(observed[:1]))
         return prior, state, GroundPose(ground[-1], heading[-1])
     count = len(prior.initial_states.speed)
     if settings.start is not None and not 0 <= settings.start < count:
         raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
-    drawn = int(torch.multinomial(prior.initial_states.weight, 1, generator=generator))
-    pick = drawn if settings.start is None else settings.start
+    sampled = int(torch.multinomial(prior.initial_states.weight, 1, generator=generator))
+    pick = sampled if settings.start is None else settings.start
     state = prior.initial_states.state.pick(torch.tensor([pick]))
-    return (
-        prior.conditioned_like_start(pick) if settings.condition_on_start else prior,
-        state,
-        GroundPose.origin(torch.float64),
-    )
+    prior = prior.conditioned_like_start(pick) if settings.condition_on_start else prior
+    return prior, state, GroundPose.origin(torch.float64)
 
 
 def sample_stratified_starts(prior: Density, count: int, generator: torch.Generator) -> list[int]:
-    """A start for each of several motions, which together begin as the data do: spread over the speeds by weight.
+    """Sample an initial state for each of several motions, stratified over the data's speeds by weight.
 
-    A golden-ratio sequence from a drawn beginning, so that a few motions are already spread, and the first of many are
-    those of a few.
+    A golden-ratio sequence from a random first value, so that a few motions are already stratified, and the first of
+    many are those of a few.
     """
     slow_to_fast = torch.argsort(prior.initial_states.speed)
-    upto = prior.initial_states.weight[slow_to_fast].double().cumsum(0)
+    cumulative = prior.initial_states.weight[slow_to_fast].double().cumsum(0)
     first = torch.rand((), generator=generator, dtype=torch.float64)
-    drawn = torch.remainder(first + _GOLDEN * torch.arange(count, dtype=torch.float64), 1.0) * upto[-1]
-    return slow_to_fast[torch.searchsorted(upto, drawn).clamp(max=len(upto) - 1)].tolist()
+    quantiles = torch.remainder(first + _GOLDEN * torch.arange(count, dtype=torch.float64), 1.0) * cumulative[-1]
+    return slow_to_fast[torch.searchsorted(cumulative, quantiles).clamp(max=len(cumulative) - 1)].tolist()
 
 
 def _start_stream(
@@ -171,17 +170,17 @@ def _start_stream(
     settings: GenerateSettings,
     clip: Motion | None,
     refiner: Refiner | None,
-    person: Character,
+    character: Character,
     terms: Sequence[Term],
     solved: list[CommittedFrames],
 ) -> tuple[Iterator[Float[Tensor, "_ size"]], GroundPose]:
-    """Start pieces of features, and find the place before the first; what cannot be is refused before any is drawn.
+    """Start pieces of features, and find the ground pose before the first; RequestError comes before any sampling.
     Windows of the foot clean-up are appended to `solved`.
     """
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
-    prior, state, place = initialise_generation(prior, settings, clip, generator, scale=person.scale)
+    prior, state, ground_pose = initialise_generation(prior, settings, clip, generator, scale=character.scale)
     pieces = _sample_chunks(prior, state, generator, settings.temperature)
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
@@ -192,26 +191,26 @@ def _start_stream(
             frames=frames,
             state=state,
             generator=generator,
-            place=place,
-            settings=settings.foot_cleanup.scaled_to(person),
-            skeleton=person.unit_skeleton,
-            terms=[person.term(term) for term in terms],
+            ground_pose=ground_pose,
+            settings=settings.foot_cleanup.scaled_to(character),
+            skeleton=character.unit_skeleton,
+            terms=[character.term(term) for term in terms],
             record=solved.append,
         )
-    return _rechunk(pieces, frames), place
+    return _rechunk(pieces, frames), ground_pose
 
 
 def _sample_chunks(
     prior: Density, state: DensityState, generator: torch.Generator, temperature: float
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Draws without end."""
+    """Sample chunks without end."""
     while True:
         features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
         yield features[0]
 
 
 def _rechunk(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:
-    """The first `frames` frames, _CHUNK at a time."""
+    """Yield the first `frames` frames, _CHUNK at a time."""
     held = None
     for piece in pieces:
         held = piece if held is None else torch.cat([held, piece])
@@ -223,18 +222,21 @@ def _rechunk(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator
 
 
 def _decode_pieces(
-    pieces: Iterator[Float[Tensor, "_ size"]], place: GroundPose, person: Character, solved: list[CommittedFrames]
+    pieces: Iterator[Float[Tensor, "_ size"]],
+    ground_pose: GroundPose,
+    character: Character,
+    solved: list[CommittedFrames],
 ) -> Iterator[Solution]:
     """Decode pieces of features, each with the ledger of its frames and the windows solved for it."""
     ledger, began = Ledger(), time.perf_counter()
     for features in pieces:
-        motion = person.motion(decode(features, place, skeleton=person.unit_skeleton))
-        ground, heading = integrate_root(features.double(), place)
-        place = GroundPose(ground[-1], heading[-1])
+        motion = character.motion(decode(features, ground_pose, skeleton=character.unit_skeleton))
+        ground, heading = integrate_root(features.double(), ground_pose)
+        ground_pose = GroundPose(ground[-1], heading[-1])
         for done in solved:
             ledger = ledger.join(done.ledger)
         windows, count = tuple(window for done in solved for window in done.windows), len(features)
         solved.clear()
-        own, seconds = person.ledger(ledger.slice(count)), time.perf_counter() - began
-        yield Solution(motion, Status(Outcome.DONE), own, windows, features, seconds)
+        ledger_part, seconds = character.ledger(ledger.slice(count)), time.perf_counter() - began
+        yield Solution(motion, Status(Outcome.DONE), ledger_part, windows, features, seconds)
         ledger, began = ledger.pick(slice(count, None)), time.perf_counter()

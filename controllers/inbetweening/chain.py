@@ -1,4 +1,4 @@
-"""One long motion through short pieces of many clips, the gaps between filled in (Kaufmann et al. 2020, figure 1)."""
+"""One long motion through short pieces of many clips, the gaps between infilled (Kaufmann et al. 2020, figure 1)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,17 +19,17 @@ from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.terms import Term
 
-_VELOCITY_FRAMES = 5  # frames over which the way on at a piece's end is told
+_VELOCITY_FRAMES = 5  # frames over which the velocity at a piece's end is estimated
 
 
 @dataclass(frozen=True)
 class ChainSettings:
-    """How long pieces and gaps are, frames at the prior's rate."""
+    """Lengths of pieces and gaps, frames at the prior's rate."""
 
     piece: int = 40
-    """From the middle of every clip; a shorter one is taken whole."""
+    """Frames of a piece, from the middle of every clip; a shorter clip is taken whole."""
     gap: tuple[int, int] = (50, 100)
-    """Between two pieces, drawn evenly from the first up to the second."""
+    """Fewest and most frames of a gap, sampled uniformly."""
 
     def __post_init__(self):
         if self.piece < 2 or not 1 <= self.gap[0] <= self.gap[1] <= 900:
@@ -48,8 +48,8 @@ def chain(
 ) -> InbetweenSolution:
     """Chain pieces of clips to a motion on the first clip's rig at PRIOR_FPS. RequestError for fewer than two clips.
 
-    Each piece goes where the one before leads: on in its direction for half of the gap, then in the next one's. The
-    generator draws the gaps' lengths, then what the in-betweener draws.
+    Each piece is aligned to the one before: the trajectory goes on at its velocity for half of the gap, then at the
+    next one's. The generator samples the gaps' lengths, then is the in-betweener's.
     """
     settings = settings or ChainSettings()
     if len(clips) < 2:
@@ -58,8 +58,8 @@ def chain(
     whole: Motion | None = None
     masks: list[Mask] = []
     for clip in clips:
-        piece, missed = _cut_piece(clip, body, settings.piece)
-        notes += missed
+        piece, piece_notes = _cut_piece(clip, body, settings.piece)
+        notes += piece_notes
         if whole is None:
             whole = piece
             continue
@@ -67,9 +67,9 @@ def chain(
         gap = int(torch.randint(low, high + 1, (), generator=generator))
         masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
         piece = _align_to_predecessor(whole, piece, gap)
-        held = torch.full((gap,), whole.num_frames - 1)
+        last = torch.full((gap,), whole.num_frames - 1)
         whole = whole.join(
-            replace(whole, root_position=whole.root_position[held], local_quat_xyzw=whole.local_quat_xyzw[held])
+            replace(whole, root_position=whole.root_position[last], local_quat_xyzw=whole.local_quat_xyzw[last])
         ).join(piece)
     assert whole is not None, "there are clips"
     done = infill(
@@ -79,39 +79,33 @@ def chain(
 
 
 def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int) -> tuple[Motion, tuple[str, ...]]:
-    """Frames from a clip's middle, on the bones of the body and on its floor, and what of them could not be kept."""
-    carried = retarget_motion(clip, body)
-    motion = carried.motion.resample(PRIOR_FPS)
+    """Cut frames from a clip's middle, retargeted to the body and its floor; and note what could not be kept."""
+    retargeted = retarget_motion(clip, body)
+    motion = retargeted.motion.resample(PRIOR_FPS)
     count = min(frames, motion.num_frames)
     start = (motion.num_frames - count) // 2
-    return replace(motion.slice(start, start + count), source=None), carried.notes
+    return replace(motion.slice(start, start + count), source=None), retargeted.notes
 
 
 def _align_to_predecessor(before: Motion, piece: Motion, gap: int) -> Motion:
-    """The piece, moved and turned to where the motion before it comes after so many frames."""
+    """Align a piece to the position and heading that the motion before it reaches after so many frames."""
     facing = heading(before.local_quat_xyzw[-1:, 0])
     turned = _rotate_about_vertical(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
-    way = (
-        (gap + 1)
-        / 2
-        * (
-            _compute_mean_velocity(before.root_position[-_VELOCITY_FRAMES:])
-            + _compute_mean_velocity(turned.root_position[:_VELOCITY_FRAMES])
-        )
-    )
-    aim = before.root_position[-1] + way
-    moved = aim - turned.root_position[0]
-    moved[1] = 0
-    return replace(turned, root_position=turned.root_position + moved)
+    velocity = _compute_mean_velocity(before.root_position[-_VELOCITY_FRAMES:])
+    next_velocity = _compute_mean_velocity(turned.root_position[:_VELOCITY_FRAMES])
+    target = before.root_position[-1] + (gap + 1) / 2 * (velocity + next_velocity)
+    offset = target - turned.root_position[0]
+    offset[1] = 0
+    return replace(turned, root_position=turned.root_position + offset)
 
 
-def _compute_mean_velocity(places: Tensor) -> Tensor:
-    """Mean way of a frame."""
-    return (places[-1] - places[0]) / max(1, len(places) - 1)
+def _compute_mean_velocity(positions: Tensor) -> Tensor:
+    """Compute the mean velocity, metres a frame."""
+    return (positions[-1] - positions[0]) / max(1, len(positions) - 1)
 
 
 def _rotate_about_vertical(motion: Motion, angle: Tensor) -> Motion:
-    """About the vertical through the origin."""
+    """Rotate a motion about the vertical through the origin."""
     turn = rotations.about_y(angle).expand(motion.num_frames, 4)
     quats = motion.local_quat_xyzw.clone()
     quats[:, 0] = rotations.multiply(turn, quats[:, 0])

@@ -1,5 +1,5 @@
-"""How sure answers for gaps are: what they were off by in clips that no training saw, by who gave them, how long the
-gap was, and whether the body was on its way.
+"""Error estimates for gaps: errors measured on held-out clips, by proposer, length of the gap, and whether the body was
+travelling.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,13 +11,12 @@ from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, leg_length
 
 INFILLER = "infiller"
-"""Name of the source whose errors are the measure where another's were never measured."""
+"""Name of the source whose errors are used where another's were never measured."""
 TRAVELLING_SPEED = 0.35
-"""Metres a second of the hips, from one end of a gap to the other, of a body with canonical legs, from which it is on
-its way."""
-_MIN_CLIPS = 5  # clips that tell no tenth of them
+"""Speed of the hips, m/s, from one end of a gap to the other, from which a body with canonical legs is travelling."""
+_MIN_CLIPS = 5  # fewest clips for a 90th percentile
 TRAINED_GAP_FRAMES = 75
-"""Of the longest gaps that the infiller was trained on: their mean length and a standard deviation."""
+"""Frames of the longest gaps that the infiller was trained on: their mean length and a standard deviation."""
 MEASURED_ERRORS: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float, int]]] = {
     ("infiller", "going", False): (
         (15, 4.5, 8.3, 22),
@@ -58,35 +57,34 @@ MEASURED_ERRORS: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float
     ("rollout", "going", True): ((90, 7.5, 33.1, 14), (120, 12.9, 39.3, 10), (180, 41.4, 119.2, 4)),
     ("rollout", "in place", False): ((60, 18.9, 18.9, 1),),
 }
-"""By who answered, whether the body was on its way, and whether frames beside the gap were known: frames of the gap,
-centimetres in half and in nine of ten of the clips, and how many these were; by `mapctl bench gaps --data DATA
---count 25`."""
+"""Measured errors by proposer, whether the body was travelling, and whether frames beside the gap were known: frames of
+the gap, median and 90th percentile of the error (cm), and number of clips; by `mapctl bench gaps --data DATA --count
+25`."""
 
 _MEASURED_SOURCES = {INFILLER: INFILLER, "standing": INFILLER, "rollout": "rollout", "density": "rollout"}
 
 
 def is_travelling(motion: Motion, start: int, stop: int) -> bool:
-    """Return whether the body (canonical joints) goes elsewhere in a gap, faster than one shifts one's weight."""
+    """Return whether the body (canonical joints) travels in a gap, faster than a shift of weight."""
     distance = float((motion.root_position[stop] - motion.root_position[start])[::2].norm())
-    return distance * leg_length(CANONICAL) / leg_length(motion.skeleton) > TRAVELLING_SPEED * (stop - start) / float(
-        motion.fps
-    )
+    fastest_still = TRAVELLING_SPEED * (stop - start) / float(motion.fps)
+    return distance * leg_length(CANONICAL) / leg_length(motion.skeleton) > fastest_still
 
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """What an answer for a gap is off by, mean over joints and frames, in the world."""
+    """Error of a proposal for a gap, mean over joints and frames, in the world."""
 
     median_cm: float
-    """At most, in half of unseen clips."""
+    """Median over held-out clips, cm."""
     percentile_90_cm: float
-    """And in nine of ten."""
+    """90th percentile over held-out clips, cm."""
     clips: int
-    """That these were."""
+    """Number of these clips."""
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The estimate in words."""
         if self.clips < _MIN_CLIPS:
             return (
                 f"joints about {self.median_cm:.0f} cm from mocap's in the only {self.clips} unseen clips of the kind"
@@ -97,18 +95,19 @@ class ErrorEstimate:
         )
 
 
-def estimate_error(by: str, frames: int, *, going: bool, beside: bool) -> ErrorEstimate | None:
-    """Estimate the error of an answer for a gap of so many frames at PRIOR_FPS; `beside` where frames around it are
-    known. None for a source that was never measured.
+def estimate_error(by: str, frames: int, *, travelling: bool, in_context: bool) -> ErrorEstimate | None:
+    """Estimate the error of a proposal for a gap of so many frames at PRIOR_FPS; `in_context` where frames around it
+    are known. None for a source that was never measured.
 
-    Between measured lengths straight lines; longer gaps than measured are at least as unsure as the longest. Kinds of
-    gap in which rollouts were never measured count as the infiller's.
+    Linear between measured lengths; gaps longer than measured have the longest's error. Kinds of gap in which rollouts
+    were never measured have the infiller's.
     """
     name = _MEASURED_SOURCES.get(by.split(" ")[0])
     if name is None:
         return None
-    what = "going" if going else "in place"
-    rows = MEASURED_ERRORS.get((name, what, beside)) or MEASURED_ERRORS[(INFILLER, what, beside)]
-    lengths, half, most, clips = np.array(rows).T
+    what = "going" if travelling else "in place"
+    rows = MEASURED_ERRORS.get((name, what, in_context)) or MEASURED_ERRORS[(INFILLER, what, in_context)]
+    lengths, median, percentile_90, clips = np.array(rows).T
     nearest = int(clips[np.abs(lengths - frames).argmin()])
-    return ErrorEstimate(float(np.interp(frames, lengths, half)), float(np.interp(frames, lengths, most)), nearest)
+    median_cm, percentile_90_cm = (float(np.interp(frames, lengths, errors)) for errors in (median, percentile_90))
+    return ErrorEstimate(median_cm, percentile_90_cm, nearest)

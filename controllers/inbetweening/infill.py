@@ -28,29 +28,29 @@ def infill(
     densities: Sequence[Density] = (),
     terms: Sequence[Term] = (),
     rig: Rig | None = None,
-    course: Curve | None = None,
+    curve: Curve | None = None,
     generator: torch.Generator | None = None,
 ) -> InbetweenSolution:
     """Fill what the masks say is missing. RequestError for masks that do not fit.
 
-    What stands in a gap does not matter. A gap at the motion's beginning or end is extended into. On a `course` the
-    hips go along it while they are missing; the in-betweener's rough one then proposes, since others leave it. Of
-    `densities` the likeliest joins the MAP stage, and so do `terms`; what is drawn is drawn from the generator.
+    Values within a gap are ignored. A gap at the motion's beginning or end is extrapolated. Along a `curve` the hips go
+    while they are missing; the in-betweener's rough one then proposes, since others leave it. Of `densities` the
+    likeliest joins the MAP stage, and so do `terms`; all sampling is from the generator.
     """
     masks = resolve_joint_names(motion, masks, rig)
-    # What rig it is must not be told from what stands in a gap.
+    # The rig must not be identified from values within a gap.
     shown = interpolate_missing(motion, MissingMask(*expand_masks(motion, masks)))
     missing = MissingMask.of_masks(motion, masks, to_canonical(shown, rig)[1])
-    if course is not None and not missing.root.any():
-        raise RequestError("a curve leads the hips where they are lost, and they never are; leave it out")
+    if curve is not None and not missing.root.any():
+        raise RequestError("the hips follow a curve where they are missing, and they never are; leave it out")
     return fill(
         motion,
         missing,
-        inbetweener if course is None else inbetweener.rough,
+        inbetweener if curve is None else inbetweener.rough,
         settings=settings,
         densities=densities,
         terms=terms,
         rig=rig,
-        course=course,
+        curve=curve,
         generator=generator,
     )

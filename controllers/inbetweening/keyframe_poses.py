@@ -1,5 +1,5 @@
-"""What a key file asks for, as a motion on one body and the keys in it: poses are read, put in their places, turned,
-and brought to the body's rig where they come from another.
+"""Poses of a key file as a motion on one body and its keys: poses are read, positioned, oriented, and retargeted to the
+body's rig where they come from another.
 """
 
 from collections.abc import Iterator
@@ -26,19 +26,19 @@ from mapctl.retarget.rigs import Rig
 
 @dataclass(frozen=True, eq=False)
 class KeyframeClip:
-    """Ready for `tween`."""
+    """Motion and keys as `tween` takes them."""
 
     motion: Motion
-    """On the body's rig, at the wanted rate: the poses at their keys, straight lines between them."""
+    """Motion on the body's rig, at the requested rate: the poses at their keys, interpolated between them."""
     keys: Keys
-    """What counts of it."""
+    """Keys of the motion."""
     rig: Rig | None
-    """The body's, where it is known."""
+    """The body's rig, where it is known."""
 
 
 def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> KeyframeClip:
-    """The motion and the keys that a request asks for. RequestError, which names the key, for poses and joints that are
-    not there; `rig` is the body's where it is not the one that would be recognised.
+    """Build the motion and the keys of a request. RequestError, which names the key, for poses and joints that do not
+    exist; `rig` is the body's where it is not the one that would be recognised.
     """
     first = next((number for number, key in enumerate(request.key) if key.needs_pose), 0)
     reader = _PoseReader(rig)
@@ -56,43 +56,43 @@ def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> Keyframe
 
 @dataclass(frozen=True, eq=False)
 class _LoadedClip:
-    """A file that has been read."""
+    """Motion of a file, as read and retargeted."""
 
     clip: Motion
-    """As it is."""
+    """Clip as read."""
     canonical: Motion
-    """On canonical joints, with the bones of the body and on its floor."""
+    """Clip on canonical joints, with the bones of the body and on its floor."""
     target_body: RiggedCharacter
     """The body."""
 
     @property
     def rigmap(self) -> RigMap:
-        """The way back to the body's rig."""
+        """Map from canonical joints to the body's rig."""
         return self.target_body.rigmap
 
 
 @dataclass(eq=False)
 class _PoseReader:
-    """Reads every file once."""
+    """Reader that loads every file once."""
 
     rig: Rig | None
-    """Of the body."""
-    seen: dict[str, _LoadedClip] = field(default_factory=dict)
-    """By path."""
+    """Rig of the body."""
+    clips: dict[str, _LoadedClip] = field(default_factory=dict)
+    """Loaded clips by path."""
 
     def body(self, path: str) -> _LoadedClip:
-        """The body's own file, by its rig where one is asked for."""
+        """Load the body's own file, on its rig where one is given."""
         unit = None if self.rig is None else self.rig.metres_per_unit
         clip = formats.load(Path(path), metres_per_unit=unit)
-        self.seen[path] = _LoadedClip(clip, *RiggedCharacter.of(clip, self.rig))
-        return self.seen[path]
+        self.clips[path] = _LoadedClip(clip, *RiggedCharacter.of(clip, self.rig))
+        return self.clips[path]
 
     def pose(self, path: str, body: _LoadedClip) -> _LoadedClip:
-        """A clip, brought to the body; the rig of another skeleton must be recognised."""
-        if path not in self.seen:
+        """Load a clip, retargeted to the body; the rig of another skeleton must be recognised."""
+        if path not in self.clips:
             clip = formats.load(Path(path))
-            self.seen[path] = _LoadedClip(clip, retarget_motion(clip, body.target_body).motion, body.target_body)
-        return self.seen[path]
+            self.clips[path] = _LoadedClip(clip, retarget_motion(clip, body.target_body).motion, body.target_body)
+        return self.clips[path]
 
 
 def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:
@@ -104,7 +104,7 @@ def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:
 
 
 def _build_pose(key: KeyEntry, request: KeyRequest, reader: _PoseReader, body: _LoadedClip, number: int) -> Motion:
-    """One frame on the body's rig, where it is wanted."""
+    """Build one frame on the body's rig, at its requested position and heading."""
     with _prefix_errors(f"key[{number}].pose"):
         found = reader.pose(key.pose or request.body or "", body)
     clip = found.clip
@@ -123,7 +123,7 @@ def _build_pose(key: KeyEntry, request: KeyRequest, reader: _PoseReader, body: _
 
 
 def _position_pose(pose: Motion, key: KeyEntry) -> Motion:
-    """A canonical pose at its place over the ground, at its height, turned to where it is to face."""
+    """Set a canonical pose's position on the ground, its height and its heading."""
     root, quats = pose.root_position.clone(), pose.local_quat_xyzw.clone()
     if key.place is not None:
         root[0, 0], root[0, 2] = key.place
@@ -136,16 +136,16 @@ def _position_pose(pose: Motion, key: KeyEntry) -> Motion:
 
 
 def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:
-    """Poses at their frames, and straight lines between them."""
+    """Interpolate from pose to pose between their frames."""
     at = torch.tensor(sorted(poses))
     joined = reduce(Motion.join, (poses[frame] for frame in sorted(poses)))
-    held = torch.searchsorted(at, torch.arange(frames), right=True) - 1
-    moving = {joint: values[held] for joint, values in joined.moving_offsets.items()}
+    source = torch.searchsorted(at, torch.arange(frames), right=True) - 1
+    moving = {joint: values[source] for joint, values in joined.moving_offsets.items()}
     motion = replace(
         joined,
-        root_position=joined.root_position[held],
+        root_position=joined.root_position[source],
         moving_offsets=moving,
-        local_quat_xyzw=rotations.make_sign_continuous(joined.local_quat_xyzw)[held],
+        local_quat_xyzw=rotations.make_sign_continuous(joined.local_quat_xyzw)[source],
     )
     free = torch.ones(frames, dtype=torch.bool)
     free[at] = False
@@ -154,7 +154,7 @@ def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:
 
 @contextmanager
 def _prefix_errors(where: str) -> Iterator[None]:
-    """Errors within name the key of the request."""
+    """Prefix errors raised within by the key of the request."""
     try:
         yield
     except MapctlError as error:

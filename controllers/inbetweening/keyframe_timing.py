@@ -1,4 +1,4 @@
-"""How long the way from one keyframe to the next takes people, as a model of mocap has it, beside what is given."""
+"""Suggested timing of keyframes: time from one to the next by a model of mocap, beside the given time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,33 +23,33 @@ from mapctl.skeleton import CANONICAL, leg_length
 
 @dataclass(frozen=True)
 class KeyInterval:
-    """Between two neighbouring keys that are whole poses."""
+    """Interval between two neighbouring keyframes that are whole poses."""
 
     start: int
-    """Frame of the first."""
+    """Frame of the first keyframe."""
     stop: int
-    """And of the second."""
+    """Frame of the second keyframe."""
     suggested: int
-    """Frames from one to the other as mocap would have it."""
+    """Median number of frames between such poses in mocap."""
     usual: tuple[int, int]
-    """Frames within which four of five of mocap's pairs would lie."""
+    """Numbers of frames between which four of five of mocap's pairs lie."""
     metres: float
-    """From hips to hips over the ground, on this body."""
+    """Distance of the hips over the ground, on this body, metres."""
     given_speed: float
-    """Over these, m/s, with the given timing."""
+    """Mean speed over this distance with the given timing, m/s."""
     suggested_speed: float
-    """And with the suggested one."""
+    """Mean speed over this distance with the suggested timing, m/s."""
     pose_distance_cm: float
-    """Mean distance of the joints seen from the hips."""
+    """Mean distance of the joints relative to the hips, cm."""
 
     @property
     def given(self) -> int:
-        """Frames from one to the other."""
+        """Given number of frames between the keyframes."""
         return self.stop - self.start
 
     @property
     def reason(self) -> str:
-        """Why, in numbers."""
+        """Reason for the suggestion, with numbers."""
         low, high = self.usual
         verdict = "short" if self.given < low else "long" if self.given > high else "usual"
         if self.metres < TRAVELLING_DISTANCE:
@@ -63,7 +63,7 @@ class KeyInterval:
         )
 
     def summary(self) -> dict[str, Any]:
-        """For a report."""
+        """Return the interval as a report's JSON has it."""
         return {
             "from": self.start,
             "to": self.stop,
@@ -79,38 +79,29 @@ class KeyInterval:
 
 
 def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig | None = None) -> list[KeyInterval]:
-    """For neighbouring keys that are whole poses how long the way between them would take; keys that tell less lie
-    within. RequestError for keys that do not fit the motion.
+    """Suggest the time between neighbouring keyframes that are whole poses; others may lie between. RequestError for
+    keys that do not fit the motion.
     """
-    wanted = [key.frame for key in keys.checked(motion) if key.what == "pose"]
-    canonical = to_canonical(_select_frames(motion, wanted), rig)[0]
+    key_frames = [key.frame for key in keys.checked(motion) if key.what == "pose"]
+    canonical = to_canonical(_select_frames(motion, key_frames), rig)[0]
     scale, fps = leg_length(canonical.skeleton) / leg_length(CANONICAL), float(motion.fps)
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
-    first = torch.arange(len(wanted) - 1)
-    ways = compute_travel_distance(body, first, first + 1)
-    usual = (fps * timing.estimate_seconds(compute_pair_features(body, first, first + 1), ways)).tolist()
-    metres = (scale * ways).tolist()
-    apart = (100 * scale * compute_pose_distance(body, first, first + 1)).tolist()
+    first = torch.arange(len(key_frames) - 1)
+    distances = compute_travel_distance(body, first, first + 1)
+    quantiles = (fps * timing.estimate_seconds(compute_pair_features(body, first, first + 1), distances)).tolist()
+    metres = (scale * distances).tolist()
+    pose_distances = (100 * scale * compute_pose_distance(body, first, first + 1)).tolist()
     intervals = []
-    for number, (start, stop) in enumerate(pairwise(wanted)):
-        low, suggested, high = (max(1, round(frames)) for frames in usual[number])
-        intervals.append(
-            KeyInterval(
-                start,
-                stop,
-                suggested,
-                (low, high),
-                metres[number],
-                metres[number] * fps / (stop - start),
-                metres[number] * fps / suggested,
-                apart[number],
-            )
-        )
+    each = zip(pairwise(key_frames), quantiles, metres, pose_distances, strict=True)
+    for (start, stop), counts, distance, pose_distance in each:
+        low, suggested, high = (max(1, round(count)) for count in counts)
+        speeds = distance * fps / (stop - start), distance * fps / suggested
+        intervals.append(KeyInterval(start, stop, suggested, (low, high), distance, *speeds, pose_distance))
     return intervals
 
 
 def _select_frames(motion: Motion, frames: Sequence[int]) -> Motion:
-    """These frames alone."""
+    """Return a motion of these frames alone."""
     picked = torch.tensor(frames)
     moving = {joint: values[picked] for joint, values in motion.moving_offsets.items()}
     return Motion(motion.skeleton, motion.fps, motion.root_position[picked], motion.local_quat_xyzw[picked], moving)

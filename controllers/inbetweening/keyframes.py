@@ -1,4 +1,4 @@
-"""Keys of in-betweening: which frames of a motion count, what of each does, and how far a motion misses them."""
+"""Keyframes of in-betweening: what they leave missing, their effector targets, and the errors of a motion at them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,83 +18,80 @@ from mapctl.skeleton import CANONICAL, LIMBS
 
 
 def missing_between_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> MissingMask:
-    """What of a motion the keys do not tell."""
+    """Return the mask of all values of a motion that keys do not give."""
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in keys if key.what == "pose"]] = False
     joints, root = free[:, None].expand(-1, motion.num_joints).clone(), free.clone()
-    above = torch.tensor([_carries_hips(joint, rigmap) for joint in range(motion.num_joints)])
+    carries_hips = torch.tensor([_carries_hips(joint, rigmap) for joint in range(motion.num_joints)])
     for key in keys:
         if key.what == "root":
             root[key.frame] = False
-            joints[key.frame] = ~above
+            joints[key.frame] = ~carries_hips
     return MissingMask(joints, root)
 
 
 def collect_effector_targets(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> EffectorTargets | None:
-    """Where hands and feet are to be; None where no key tells that alone. RequestError for joints that are neither."""
+    """Collect the targets of keys that give only positions of hands and feet; None where no key does. RequestError for
+    joints that are neither."""
     if all(key.what != "limbs" for key in keys):
         return None
     wanted = torch.zeros(motion.num_frames, CANONICAL.num_joints, dtype=torch.bool)
-    places, own = torch.zeros(*wanted.shape, 3, dtype=torch.float64), rig_joint_positions(motion, rigmap)
+    positions, own = torch.zeros(*wanted.shape, 3, dtype=torch.float64), rig_joint_positions(motion, rigmap)
     for key in keys:
         for name in key.ends:
             limb = effector_joint(name, rigmap)
             wanted[key.frame, limb] = True
-            told = key.places.get(name)
-            places[key.frame, limb] = own[key.frame, limb] if told is None else own.new_tensor(told)
-    return EffectorTargets(places, wanted)
+            given = key.places.get(name)
+            positions[key.frame, limb] = own[key.frame, limb] if given is None else own.new_tensor(given)
+    return EffectorTargets(positions, wanted)
 
 
 def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
-    """By key, how far what it tells is missed by the joint that misses it by most: places in cm, and rotations in
-    degrees where it tells any.
-    """
+    """Compute by key the largest error over joints: of positions, cm, and of rotations, degrees, where it gives any."""
     wanted, hips = keys.checked(source), rigmap.joint_of[0]
-    away = 100 * (made.joint_positions() - source.joint_positions()).norm(dim=-1)
-    turn = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
-    turned = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
+    distance = 100 * (made.joint_positions() - source.joint_positions()).norm(dim=-1)
+    rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
+    angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
     targets = collect_effector_targets(wanted, source, rigmap)
     rows = []
     for key in wanted:
         row: dict[str, Any] = {"frame": key.frame, "what": key.what}
         if key.what == "limbs" and targets is not None:
-            off = (rig_joint_positions(made, rigmap)[key.frame] - targets.places[key.frame]).norm(dim=-1)
-            rows.append(row | {"missed_cm": 100 * float(off[targets.wanted[key.frame]].max())})
+            miss = (rig_joint_positions(made, rigmap)[key.frame] - targets.places[key.frame]).norm(dim=-1)
+            rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
             continue
         joints = [hips or 0] if key.what == "root" else list(range(source.num_joints))
-        rows.append(
-            row
-            | {"missed_cm": float(away[key.frame, joints].max()), "missed_deg": float(turned[key.frame, joints].max())}
-        )
+        row |= {"missed_cm": float(distance[key.frame, joints].max())}
+        rows.append(row | {"missed_deg": float(angles[key.frame, joints].max())})
     return rows
 
 
 def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
-    """RequestError for a name that is no hand or foot of the motion's rig."""
+    """Raise RequestError for a name that is no hand or foot of the motion's rig."""
     rigmap = to_canonical(motion, rig)[1]
     for name in names:
         effector_joint(name, rigmap)
 
 
 def effector_joint(name: str, rigmap: RigMap) -> int:
-    """The canonical joint of a limb's end, by its canonical name or the rig's own in any case; RequestError, with the
-    nearest name, for anything else."""
+    """Find the canonical joint of an effector, by its canonical name or the rig's own in any case; RequestError, with
+    the nearest name, for anything else."""
     names = rigmap.rig_skeleton.names
     known = {c: joint for c, joint in zip(CANONICAL.names, rigmap.joint_of, strict=True) if joint is not None}
     ends = {known[end]: CANONICAL.index(end) for end in LIMBS if end in known}
     joint = find_joint(name, names, lambda: known)
     if joint in ends:
         return ends[joint]
-    told = [classify_joint(CANONICAL.names[end]) for end in ends.values()]
-    raise RequestError(f"no hand or foot {name!r}; {describe_nearest(name, [names[end] for end in ends], told)}")
+    given = [classify_joint(CANONICAL.names[end]) for end in ends.values()]
+    raise RequestError(f"no hand or foot {name!r}; {describe_nearest(name, [names[end] for end in ends], given)}")
 
 
 def _carries_hips(joint: int, rigmap: RigMap) -> bool:
-    """Whether a joint of the rig is the hips or lies above them."""
+    """Return whether a joint of the rig is the hips or an ancestor of theirs."""
     own: int | None = rigmap.joint_of[0]
-    above: Sequence[int] = rigmap.rig_skeleton.parents
+    parents: Sequence[int] = rigmap.rig_skeleton.parents
     while own is not None and own >= 0:
         if own == joint:
             return True
-        own = above[own]
+        own = parents[own]
     return False

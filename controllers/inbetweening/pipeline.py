@@ -1,5 +1,5 @@
-"""Make whole what lacks frames or joints, on any rig: an in-betweener proposes, the MAP stage puts the feet down, and
-what is known stays to the bit.
+"""Fill missing frames or joints of a motion on any rig: an in-betweener proposes, MAP refines the proposal, and what is
+known stays to the bit.
 """
 
 import time
@@ -28,17 +28,17 @@ from mapctl.retarget import as_rig, from_canonical, rig_joint_positions, to_cano
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
 
-_REPORTED_ERROR = 0.001  # metres from a target that are worth a note
-_REACH_TOLERANCE = 1e-4  # metres from it that are nothing
+_REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
+_REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached
 _MAX_REACH_ATTEMPTS = 6
 
 
 @dataclass(frozen=True)
 class InfillSettings:
-    """How gaps are filled."""
+    """Settings of in-betweening."""
 
     finish: bool = True
-    """Whether the MAP stage finishes the proposal; if not it stays as it is, on rigid bones and with exact keys."""
+    """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
     refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
     """Sigmas and search of the MAP stage."""
 
@@ -53,28 +53,27 @@ def fill(
     terms: Sequence[Term] = (),
     rig: Rig | None = None,
     targets: EffectorTargets | None = None,
-    course: Curve | None = None,
+    curve: Curve | None = None,
     generator: torch.Generator | None = None,
 ) -> InbetweenSolution:
-    """Fill in what is missing of a motion.
+    """Fill missing values of a motion.
 
-    `targets` are positions of the rig's hands and feet in frames in which they are missing; along `course` the hips go
+    `targets` are positions of the rig's hands and feet in frames in which they are missing; the hips follow `curve`
     while they are. The MAP stage adds `terms`, and the likeliest of `densities` its likelihood.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
     generator = generator or torch.Generator().manual_seed(0)
     clip = CanonicalClip.of(motion, missing, rig)
-    if course is not None:
-        clip = replace(clip, canonical=move_root_along_curve(clip.canonical, missing.root, course))
-    query = clip.query(effector_targets=targets, keep_trajectory=course is not None)
+    if curve is not None:
+        clip = replace(clip, canonical=move_root_along_curve(clip.canonical, missing.root, curve))
+    query = clip.query(effector_targets=targets, keep_trajectory=curve is not None)
     answer, reached = propose_through_keys(query, inbetweener, generator)
     made, ledger, windows = answer.motion, Ledger(), ()
     if settings.finish:
         made, ledger, windows = refine_gaps(answer, query, reached, settings.refinement, densities, terms)
-    done, too_far = _reach_targets(clip, clip.back(made, query), targets)
-    status = (
-        Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer)).with_notes(too_far, infeasible=bool(too_far))
-    )
+    done, unreached = _reach_targets(clip, clip.back(made, query), targets)
+    status = Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer))
+    status = status.with_notes(unreached, infeasible=bool(unreached))
     sources = answer.attribute(query)
     return InbetweenSolution(
         done,
@@ -91,12 +90,12 @@ def fill(
 
 
 def _note_open_ends(clip: CanonicalClip, answer: Proposal) -> tuple[str, ...]:
-    """Note on gaps that have one edge only who extends the motion."""
+    """Note which in-betweener extrapolates gaps that have one edge only."""
     notes, missing = [], clip.missing.root
     if bool(missing[0]):
+        by = answer.source
         notes.append(
-            f"a gap at the beginning: the motion is extended backwards by {answer.source}, with nothing before it to"
-            " meet"
+            f"a gap at the beginning: the motion is extended backwards by {by}, with nothing before it to meet"
         )
     if bool(missing[-1]):
         end = max(answer.others, key=lambda one: one.stop, default=None)
@@ -108,7 +107,7 @@ def _note_open_ends(clip: CanonicalClip, answer: Proposal) -> tuple[str, ...]:
 def _reach_targets(
     clip: CanonicalClip, filled: Motion, targets: EffectorTargets | None
 ) -> tuple[Motion, tuple[str, ...]]:
-    """Bend limbs until they are at their targets; and note those that do not reach."""
+    """Bend limbs until they are at their targets; and note those that are out of reach."""
     if targets is None:
         return filled, ()
     canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
@@ -120,9 +119,9 @@ def _reach_targets(
         before, errors = errors, compute_target_errors(found, targets)
         if float(errors.max()) < _REACH_TOLERANCE or float((errors - before).abs().max()) < _REACH_TOLERANCE:
             break
-        # Joints that only the rig has carry a limb's end elsewhere than on canonical joints.
+        # Joints that only the rig has offset an effector from its canonical position.
         aim = EffectorTargets(targets.places + there.joint_positions() - found, targets.wanted)
     if float(errors.max()) <= _REPORTED_ERROR:
         return done, ()
     worst = int(errors.argmax())
-    return done, (f"frame {worst}: a limb stays {100 * float(errors.max()):.1f} cm from its place, out of reach",)
+    return done, (f"frame {worst}: a limb stays {100 * float(errors.max()):.1f} cm from its target, out of reach",)

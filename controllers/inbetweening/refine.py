@@ -1,4 +1,4 @@
-"""The MAP stage of in-betweening: feet are put down about what was proposed, gap by gap."""
+"""MAP refinement of in-betweening: proposals are refined gap by gap."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,9 +32,8 @@ INFILL_REFINEMENT = RefinementSettings(
     budget=Budget(evaluations=40),
     lbfgs=LbfgsSettings(max_iterations=40),
 )
-"""Of the MAP stage about an infiller's proposal, which is further off than a denoiser's: heights of toes are the
-network's, since styles differ in them, but for those of toes that skate; jerk costs something; and it may take twice
-the evaluations."""
+"""Settings about an infiller's proposal, whose error is larger than a denoiser's: heights of toes stay near the
+network's, since styles differ in them, except those of toes that skate; a jerk term; and twice the evaluations."""
 
 
 def refine_gaps(
@@ -52,11 +51,11 @@ def refine_gaps(
     for first, last in _find_gap_windows(missing.frames):
         if last - first < 2:
             continue
-        part, lost = slice(first, last), missing.slice(first, last)
+        part, part_missing = slice(first, last), missing.slice(first, last)
         capture = Capture.of_motion(
             motion.slice(first, last),
-            seen=~lost.joints,
-            seen_root=~lost.root,
+            seen=~part_missing.joints,
+            seen_root=~part_missing.root,
             sigma=torch.zeros(CANONICAL.num_joints),
             sigma_root=0.0,
         )
@@ -70,14 +69,14 @@ def refine_gaps(
             terms=terms,
             first_frame=first,
         )
-        quats[part] = torch.where(lost.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
-        root[part] = torch.where(lost.root[:, None], refined.motion.root_position, root[part])
+        quats[part] = torch.where(part_missing.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
+        root[part] = torch.where(part_missing.root[:, None], refined.motion.root_position, root[part])
         ledger, windows = ledger.join(refined.ledger), [*windows, *refined.windows]
     return replace(motion, root_position=root, local_quat_xyzw=quats), ledger, tuple(windows)
 
 
 def _find_gap_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
-    """Find first frame and one past the last of each gap with what is beside it; gaps that see each other are one."""
+    """Find first frame and one past the last of each gap with its context; gaps whose contexts overlap are merged."""
     near = missing.clone()
     for _, start, stop in true_intervals(missing[:, None]):
         near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True

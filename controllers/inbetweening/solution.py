@@ -1,4 +1,4 @@
-"""What in-betweening returns: a whole motion, who proposed what of it, and what of it is new."""
+"""Solution of in-betweening: a complete motion, what of it was missing, and who proposed it."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,18 +16,18 @@ from mapctl.retarget.rigs import Rig
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InbetweenSolution(Solution):
-    """A whole motion on the given rig, at its rate, with all of its frames."""
+    """A complete motion on the given rig, at its rate, with all of its frames."""
 
     missing: MissingMask
-    """What was filled in, by joint of the rig."""
+    """Values that were filled in, by joint of the rig."""
     rig: Rig
     """The rig as it was identified."""
     contacts: Bool[Tensor, "frames 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.bool))
-    """Left and right toe planted, at PRIOR_FPS."""
+    """Contacts of the left and the right toe, at PRIOR_FPS."""
     sources: tuple[GapSource, ...] = ()
-    """Who proposed the motion in each gap in which nothing was known."""
+    """Proposer of the motion in each gap in which nothing was known."""
     gap_notes: tuple[str, ...] = ()
-    """A line on each of these: who, how sure, and what nobody knows."""
+    """A note on each of these gaps: proposer, error estimate, remarks."""
 
     @property
     def frame_ms(self) -> float:

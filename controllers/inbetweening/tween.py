@@ -1,5 +1,5 @@
-"""In-betweening: a few keys to a whole motion that meets them. What a key gives is no unknown, so it is met to the bit;
-where it gives only the position of a hand or a foot, the limb is bent until it is there.
+"""In-betweening of keyframes. What a key gives is no unknown, so it is met to the bit; where it gives only the position
+of a hand or a foot, the limb is bent to reach it.
 """
 
 from collections.abc import Sequence
@@ -32,9 +32,9 @@ def tween(
     rig: Rig | None = None,
     generator: torch.Generator | None = None,
 ) -> InbetweenSolution:
-    """Make a motion of the same length through the keys of a motion, of which nothing else counts.
+    """Make a motion of the same length through the keys of a motion, of which all else is ignored.
 
-    Of `densities` the likeliest joins the MAP stage, and so do `terms`; what is drawn is drawn from the generator.
+    Of `densities` the likeliest joins the MAP stage, and so do `terms`; all sampling is from the generator.
     RequestError for keys that do not fit the motion or its rig; keys that no body could meet in time are named in the
     status, which is then infeasible.
     """
@@ -57,8 +57,8 @@ def tween(
 
 
 def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
-    """Return all that counts, the keys and the interpolation between them: on canonical joints, with the map of the
-    rig, which is recognised from these, and on the rig.
+    """Return the keys with an interpolation between them: on canonical joints, with the map of the rig, which is
+    identified from these, and on the rig.
     """
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in wanted if key.shown]] = False

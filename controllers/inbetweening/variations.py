@@ -1,4 +1,4 @@
-"""Several answers to one question: the same keys met by different motions, each with its energy."""
+"""Variations: different motions through the same keys, each with its energy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,36 +21,36 @@ from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import to_canonical
 
 MAX_VARIATIONS = 1000
-"""Variations at a time."""
-_MIN_FRAMES = 8  # frames at PRIOR_FPS: shorter motions have no energy to speak of
+"""Most variations in one call."""
+_MIN_FRAMES = 8  # frames at PRIOR_FPS of the shortest motion whose energy is meaningful
 
 Tweening = Callable[[Inbetweener, torch.Generator], InbetweenSolution]
-"""Makes one answer, as `tween` with its motion, keys and settings filled in."""
+"""Function that makes one variation: `tween` with its motion, keys and settings bound."""
 
 
 @dataclass(frozen=True, eq=False)
 class Variation:
-    """One answer."""
+    """One of several motions through the same keys."""
 
     solution: InbetweenSolution
-    """The motion, and how it came about."""
+    """Solution of in-betweening."""
     ledger: Ledger
     """Energy of the finished motion by term: likelihood, footing, clearance, support and jerk."""
 
     @property
     def energy(self) -> float:
-        """Nats a frame: less is likelier."""
+        """Mean energy of a frame, nats: less is likelier."""
         return sum(float(entry.energy.mean()) for entry in self.ledger.entries)
 
 
 @dataclass(frozen=True, eq=False)
 class Variations:
-    """Several answers."""
+    """Several motions through the same keys."""
 
     each: tuple[Variation, ...]
-    """The first is what is made of the keys if one answer is asked for; the others are drawn."""
+    """Variations; the first is that of a plain `tween`, the others are sampled."""
     diversity: Diversity
-    """How different they are on average."""
+    """Average pairwise distances of the variations."""
 
 
 def sample_variations(
@@ -63,10 +63,10 @@ def sample_variations(
     refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> Variations:
-    """Make so many motions through the same keys. The first answers are the same however many are asked for.
+    """Make so many motions through the same keys. The first ones do not depend on the count.
 
-    The first is that of one in-betweener; in the others the likeliest density of `rollouts` is drawn from and steered
-    from key to key. RequestError for fewer than two, and for keys that are too near to each other to leave a choice.
+    The first is by one in-betweener; in the others the likeliest density of `rollouts` is sampled and steered from key
+    to key. RequestError for fewer than two, and for keys that are too close in time to leave a choice.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
@@ -88,8 +88,8 @@ def lowest_energy(
     refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> InbetweenSolution:
-    """Make so many answers and keep the one with the least energy: of the rollouts' fallback, of slerp, and of draws;
-    its status tells all energies. RequestError for fewer than two.
+    """Make so many motions and keep the one with the lowest energy: by the rollouts' fallback, by slerp, and sampled;
+    its status lists all energies. RequestError for fewer than two.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"the best is of 2 to {MAX_VARIATIONS}, got {count}")
@@ -105,7 +105,7 @@ def lowest_energy(
 
 
 def _make_first(make: Tweening, first: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
-    """Make the first answer; RequestError for motions too short for an energy."""
+    """Make the first variation; RequestError for motions too short for an energy."""
     made = make(first, generator)
     if made.motion.num_frames < _MIN_FRAMES * made.motion.fps / PRIOR_FPS:
         raise RequestError(f"a motion of {made.motion.num_frames} frames leaves nothing to vary")
@@ -127,7 +127,7 @@ def _sample_rollouts(
     generator: torch.Generator,
     progress: Callable[[int, int], None] | None,
 ) -> Sequence[InbetweenSolution]:
-    """Make answers of a density, each of a seed of its own: the first ones are the same however many there are."""
+    """Sample variations by rollouts, each with a seed of its own: the first ones do not depend on the count."""
     found = []
     for number in range(count):
         if progress is not None:

@@ -3,10 +3,10 @@
 The frames of a step are due when the ones before them have been shown. A step begins when those before it begin to be
 shown, so a command waits for two steps at most: 0.2 s at three frames a step.
 
-Where the machine is too slow, this is the rule. A step that begins late searches less, but never less than
-`SteerSettings.least_evaluations`, so commands are obeyed. If its frames are later than `LoopSettings.slack` all the
-same, the stream's time stands still for as long: motion plays slower than real time, and no frame and no command is
-left out.
+On a machine that is too slow, a step that begins late searches less, but never less than
+`SteerSettings.least_evaluations`, so that commands are obeyed. If its frames are still later than
+`LoopSettings.slack`, the stream's time is held for as long: motion plays slower than real time, and no frame and no
+command is dropped.
 """
 
 import time
@@ -29,44 +29,44 @@ from mapctl.rotations import make_sign_continuous
 
 @runtime_checkable
 class Source(Protocol):
-    """Where commands come from: a script, a joystick, a web page."""
+    """Source of commands: a script, a joystick, a web page."""
 
     def at(self, seconds: float) -> Command:
-        """The command that holds now, at so many seconds of the stream."""
+        """Return the command that holds now, at so many seconds of the stream."""
         ...
 
 
 @runtime_checkable
 class Display(Protocol):
-    """Where frames go to."""
+    """Destination of frames."""
 
     def show(self, frames: SteerFrames, due: float) -> None:
-        """Frames in time; `due` is the second of the stream at which the first of them is to be seen."""
+        """Show frames; `due` is the second of the stream at which the first of them is to be visible."""
         ...
 
 
 @runtime_checkable
 class Clock(Protocol):
-    """Seconds of the stream."""
+    """Clock of the stream."""
 
     real: bool
     """Whether time passes by itself, so that a step has a deadline."""
 
     def now(self) -> float:
-        """The time."""
+        """Return the time, seconds."""
         ...
 
     def wait_until(self, seconds: float) -> None:
-        """Return at that time, or at once if it has passed."""
+        """Wait until that time; return at once if it has passed."""
         ...
 
     def hold(self, seconds: float) -> None:
-        """Let so many seconds of real time not have counted."""
+        """Set the time back by so many seconds."""
         ...
 
 
 class WallClock:
-    """Real time, from the making on, less what it was held for."""
+    """Real time since the clock was made, less the time for which it was held."""
 
     real = True
 
@@ -88,7 +88,7 @@ class WallClock:
 
 
 class StreamClock:
-    """Time that passes only by waiting: as fast as the machine can, and nothing is ever late."""
+    """Time that passes only by waiting: as fast as the machine can, so that nothing is late."""
 
     real = False
 
@@ -104,17 +104,17 @@ class StreamClock:
         self._now = max(self._now, seconds)
 
     def hold(self, seconds: float) -> None:
-        """See Clock; nothing is late, so nobody asks."""
+        """See Clock; nothing is late, so it is never called."""
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How the loop keeps its time."""
+    """Timing of the loop."""
 
     margin: float = 0.026
-    """Seconds before frames are due at which the search for them ends: what is left to do then takes that long."""
+    """Seconds before frames are due at which the search for them ends: the time of the work after the search."""
     slack: float = 0.1
-    """Seconds by which frames may be late before time stands still for them; less is made up for by searching less."""
+    """Seconds by which frames may be late before time is held for them; less is compensated by searching less."""
 
 
 @dataclass(frozen=True)
@@ -122,25 +122,25 @@ class StepRecord:
     """Cost and time of one step."""
 
     frames: int
-    """Delivered."""
+    """Number of frames delivered."""
     asked: float
-    """Second of the stream at which the source was asked."""
+    """Second of the stream at which the source was asked for a command."""
     due: float
-    """Second at which the first of the frames was due."""
+    """Second of the stream at which the first of the frames was due."""
     delivered: float
-    """Second at which they were there."""
+    """Second of the stream at which the frames were delivered."""
     seconds: float
-    """Compute."""
+    """Compute, seconds."""
     evaluations: int
-    """Of energy and gradient."""
+    """Evaluations of energy and gradient."""
     note: str
-    """Why less was searched than could have been, if so."""
+    """Why the search was cut short; empty if it was not."""
     held: float = 0.0
-    """Seconds for which time then stood still."""
+    """Seconds for which the stream's time was held after it."""
 
     @property
     def late_frames(self) -> int:
-        """Frames that came after they were due."""
+        """Number of frames delivered after they were due."""
         return sum(self.delivered > self.due + k / PRIOR_FPS for k in range(self.frames))
 
 
@@ -151,11 +151,11 @@ class Recorder:
     pieces: list[SteerFrames] = field(default_factory=list)
 
     def show(self, frames: SteerFrames, due: float) -> None:
-        """Keep them."""
+        """Keep the frames."""
         self.pieces.append(frames)
 
     def motion(self, frames: int | None = None) -> Motion:
-        """All that was shown, or the first so many frames."""
+        """Return all that was shown, or the first so many frames."""
         if not self.pieces:
             raise RequestError("nothing was shown")
         first = self.pieces[0].motion
@@ -165,12 +165,12 @@ class Recorder:
 
     @property
     def steering_targets(self) -> list[SteeringTarget]:
-        """Of every frame."""
-        return [wish for piece in self.pieces for wish in piece.steering_targets]
+        """Steering targets of all frames."""
+        return [target for piece in self.pieces for target in piece.steering_targets]
 
     @property
     def ledger(self) -> Ledger:
-        """Of every solved frame."""
+        """Ledger of all solved frames."""
         ledger = Ledger()
         for piece in self.pieces:
             ledger = ledger.join(piece.ledger) if piece.ledger.entries else ledger
@@ -185,7 +185,7 @@ def iterate_steps(
     clock: Clock,
     settings: LoopSettings | None = None,
 ) -> Iterator[tuple[SteerState, StepRecord]]:
-    """Steer without end, a step at a time; the first pose counts as delivered.
+    """Yield one step after the other without end; the first pose counts as delivered.
 
     Frame k is due at second k / PRIOR_FPS. The clock starts a step before that.
     """
@@ -201,15 +201,11 @@ def iterate_steps(
         delivered = clock.now() - begun
         held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
         if held:
-            clock.hold(held)  # before they are shown: they are due now
+            clock.hold(held)  # before they are shown, since they are due now
         for display in displays:
             display.show(new, due)
-        yield (
-            state,
-            StepRecord(
-                new.motion.num_frames, asked, due, delivered, new.seconds, new.evaluations, "; ".join(new.notes), held
-            ),
-        )
+        frames, note = new.motion.num_frames, "; ".join(new.notes)
+        yield state, StepRecord(frames, asked, due, delivered, new.seconds, new.evaluations, note, held)
 
 
 def drive(
@@ -222,7 +218,7 @@ def drive(
     settings: LoopSettings | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[SteerState, list[StepRecord]]:
-    """Steer until `frames` have been delivered, or `stop()` says so, or Ctrl-C."""
+    """Steer until `frames` have been delivered, `stop()` is true, or Ctrl-C."""
     records: list[StepRecord] = []
     stream = iterate_steps(state, source, displays, clock=clock or StreamClock(), settings=settings)
     try:
@@ -238,13 +234,13 @@ def drive(
 def summarise_step_timing(
     records: Sequence[StepRecord], arrivals: Sequence[float] = ()
 ) -> dict[str, float | int | None]:
-    """For a report: compute of each frame, late frames, evaluations, and the longest latency of a command.
+    """Summarise for a report: compute of each frame, late frames, evaluations, and the longest latency of a command.
 
     The latency of a command runs from its arrival to the due time of the first frame that it could still change.
     """
     each = np.repeat([1000 * r.seconds / r.frames for r in records], [r.frames for r in records])
     count = sum(record.frames for record in records)
-    latencies = [seen - at for at in arrivals if (seen := _find_first_affected_due(records, at)) is not None]
+    latencies = [due - at for at in arrivals if (due := _find_first_affected_due(records, at)) is not None]
     return {
         "frame_ms_p50": float(np.percentile(each, 50)) if count else None,
         "frame_ms_p99": float(np.percentile(each, 99)) if count else None,
@@ -263,5 +259,5 @@ def _find_first_affected_due(records: Sequence[StepRecord], arrival: float) -> f
 
 
 def _worst_latency(records: Sequence[StepRecord]) -> float | None:
-    """Of a command that comes just after the source was asked."""
+    """Compute the latency of a command that arrives just after the source was asked, the longest over all steps."""
     return max((b.due - a.asked for a, b in pairwise(records)), default=None)

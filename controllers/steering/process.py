@@ -1,6 +1,6 @@
 """A character that is steered live in a process of its own.
 
-Neither a web server nor another character then holds up its steps: each has its own core as long as there are cores.
+Neither a web server nor another character then delays its steps: each has its own core as long as there are cores.
 Times cross between processes as values of time.perf_counter, which all processes of a machine share.
 """
 
@@ -29,7 +29,7 @@ from mapctl.skeleton import CANONICAL, Skeleton
 __all__ = ["CharacterProcess", "CharacterRequest"]
 
 _READY_SECONDS = 120.0
-_MAX_QUEUED_STEPS = 3000  # steps that are kept for somebody who does not look: five minutes
+_MAX_QUEUED_STEPS = 3000  # steps that are kept for a caller that does not poll: five minutes
 _PROCESS_ENDED = "a character's process ended by itself"
 
 
@@ -39,12 +39,12 @@ class CharacterProcess:
     skeleton: Skeleton = CANONICAL
 
     def __init__(self, request: CharacterRequest):
-        """Start it; several start at once if all are made before the first is waited for."""
+        """Start the process; several start in parallel if all are made before the first `wait`."""
         self._request = request
         self._start()
 
     def wait(self) -> None:
-        """Until it walks. RequestError where its prior cannot be loaded, or does not know what it is told."""
+        """Wait until it walks. RequestError where its prior cannot be loaded, or does not know its labels."""
         if not self._ready.wait(_READY_SECONDS):
             self._failed = self._failed or "a character's process did not start"
         if self._failed:
@@ -57,16 +57,16 @@ class CharacterProcess:
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
         """See LiveCharacter. RequestError where the points make no curve."""
-        places = np.array(points, dtype=np.float64).reshape(-1, 2)
-        curves.through(places)  # what is wrong with them is said here, not there
-        self._send("walk", places, speed)
+        positions = np.array(points, dtype=np.float64).reshape(-1, 2)
+        curves.through(positions)  # so that errors are raised here, not in the process
+        self._send("walk", positions, speed)
 
     def pause(self, paused: bool) -> None:
         """See LiveCharacter."""
         self._send("pause", paused)
 
     def reset(self) -> None:
-        """See LiveCharacter. Who is no more is started again, which takes a while."""
+        """See LiveCharacter. A process that has ended is started again, which takes a while."""
         if self._failed:
             self.close()
             self._start()
@@ -75,7 +75,7 @@ class CharacterProcess:
 
     def poll(self) -> list[FrameChunk]:
         """See LiveCharacter."""
-        failed, found = self._failed, list[FrameChunk]()  # in this order: what came before the end is kept
+        failed, found = self._failed, list[FrameChunk]()  # in this order: frames before the end are kept
         while self._delivered:
             found.append(self._delivered.popleft())
         if failed and not found:
@@ -83,7 +83,7 @@ class CharacterProcess:
         return found
 
     def memory_mb(self) -> float:
-        """Of its process, resident; NaN where the system does not tell."""
+        """Return the resident memory of the process, MB; NaN where the system does not report it."""
         status = Path(f"/proc/{self._process.pid}/status")
         found = re.search(r"VmRSS:\s*(\d+) kB", status.read_text()) if status.exists() else None
         return int(found[1]) / 1024 if found else math.nan
@@ -91,7 +91,7 @@ class CharacterProcess:
     def close(self) -> None:
         """See LiveCharacter."""
         self._send("close")
-        self._process.join(2.0 if self._ready.is_set() else 0.1)  # who still loads does not listen yet
+        self._process.join(2.0 if self._ready.is_set() else 0.1)  # while it loads it does not listen yet
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
@@ -100,14 +100,14 @@ class CharacterProcess:
         self._ours.close()
 
     def _start(self) -> None:
-        self._ours, theirs = multiprocessing.Pipe()
-        self._process = spawn(run_worker, theirs, self._request)
-        theirs.close()
+        self._ours, worker_connection = multiprocessing.Pipe()
+        self._process = spawn(run_worker, worker_connection, self._request)
+        worker_connection.close()
         self._delivered: deque[FrameChunk] = deque(maxlen=_MAX_QUEUED_STEPS)
         self._orders: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
         self._ready, self._failed = threading.Event(), ""
-        # A full pipe would hold up the character, so it is emptied whether or not somebody looks; and whoever gives
-        # orders is not held up by a character that does not read them.
+        # A full pipe would block the character, so it is emptied whether or not the caller polls; and a character that
+        # does not read its orders does not block the caller.
         self._receiver = threading.Thread(target=self._receive, daemon=True)
         self._receiver.start()
         threading.Thread(target=_send_orders, args=(self._ours, self._orders), daemon=True).start()
@@ -129,8 +129,8 @@ class CharacterProcess:
             self._ready.set()
 
 
-def _send_orders(ours: Connection, orders: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
-    """Send what is ordered, until None or the end of the other side, which the receiver notices."""
+def _send_orders(connection: Connection, orders: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
+    """Send queued orders, until None or the end of the process, which the receiver notices."""
     with suppress(OSError):
         while (message := orders.get()) is not None:
-            ours.send(message)
+            connection.send(message)

@@ -1,4 +1,4 @@
-"""What the process of a character that is steered live does: load, begin; at every step read orders and send frames."""
+"""The process of a character that is steered live: load, begin, and at every step read orders and send frames."""
 
 import itertools
 import time
@@ -22,27 +22,27 @@ from mapctl.intent.steering import Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
 
-_WARM_UP_STEPS = 3  # steps before the clock starts, in which what is loaded on first use is loaded
+_WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
 
 
 @dataclass(frozen=True)
 class CharacterRequest:
-    """Who is to be steered."""
+    """Request for a steered character."""
 
     load: Callable[[], Any]
-    """Makes the density, in the character's process: `functools.partial(priors.load, "locomotion")`."""
+    """Loader of the density, called in the character's process: `functools.partial(priors.load, "locomotion")`."""
     first: Command
-    """To begin with."""
+    """First command."""
     seed: int = 0
-    """Of the pose that it begins with."""
+    """Seed of the first pose."""
     at: tuple[float, float] = (0.0, 0.0)
-    """Where it begins, x and z in metres."""
+    """Position of the first pose, x and z in metres."""
     settings: SteerSettings = field(default_factory=SteerSettings)
-    """Sigmas, lengths and effort."""
+    """Sigmas, window lengths and budget."""
 
 
 class ParentClosed(Exception):
-    """The other side wants the end, or is gone."""
+    """The parent process closed the connection, or has ended."""
 
 
 class ProcessClock:
@@ -53,10 +53,10 @@ class ProcessClock:
     def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
         self._connection, self._pilot, self._prior = connection, pilot, prior
         self.again = False
-        self._began = 0.0  # when the stream's second 0 is
+        self._began = 0.0  # time of the stream's second 0
         self._paused_since: float | None = None
         self._shift = 0.0
-        self._held = 0.0  # seconds by which the frames that are shown next came too late
+        self._held = 0.0  # seconds by which the next frames are late
         self._notes: list[str] = []
 
     def now(self) -> float:
@@ -73,7 +73,7 @@ class ProcessClock:
                 return
 
     def hold(self, seconds: float) -> None:
-        """See Clock: as a pause that nobody asked for."""
+        """See Clock: like a pause."""
         self._shift += seconds
         self._held += seconds
 
@@ -87,10 +87,10 @@ class ProcessClock:
         self._notes.clear()
 
     def begin(self, state: steer.SteerState, frames: SteerFrames) -> None:
-        """Show the first pose, from which on the stream's seconds count."""
+        """Show the first pose, and start the stream's seconds there."""
         self.again = False
         lead = state.settings.commit / PRIOR_FPS
-        self._began = self.now() - state.frames / PRIOR_FPS + lead  # as controllers.steering.loop.iterate_steps has it
+        self._began = self.now() - state.frames / PRIOR_FPS + lead  # as in controllers.steering.loop.iterate_steps
         self.show(frames, 0.0)
 
     def _handle_order(self) -> None:
@@ -102,7 +102,7 @@ class ProcessClock:
             raise ParentClosed
         try:
             self._execute_order(word, *content)
-        except MapctlError as error:  # an order that cannot be; the one before it holds
+        except MapctlError as error:  # an impossible order; the one before it holds
             self._notes.append(str(error))
 
     def _execute_order(self, word: str, *content: Any) -> None:
@@ -127,14 +127,12 @@ class ProcessClock:
 
 
 def run_worker(connection: Connection, request: CharacterRequest) -> None:
-    """Steer until the other side wants the end; what else ends it is told to the other side, in a line."""
+    """Steer until the parent closes the connection; anything else that ends it is sent to the parent, in a line."""
     torch.set_num_threads(1)
     with suppress(ParentClosed, BrokenPipeError):
         try:
             _run_character(connection, request)
-        except (
-            ParentClosed
-        ):  # wanted: nobody is to be told that anything failed, least of all who is started in its place
+        except ParentClosed:  # a requested end is no failure to report
             return
         except MapctlError as error:
             connection.send(("failed", str(error)))
@@ -148,18 +146,18 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
     prior, generator = request.load(), torch.Generator().manual_seed(request.seed)
     first, _ = steer.accept(prior, request.first)
     pilot = Autopilot(first, request.settings.limits)
-    desk = ProcessClock(connection, pilot, prior)
+    clock = ProcessClock(connection, pilot, prior)
     for number in itertools.count():
         state, pose = steer.begin(prior, first, generator=generator, at=request.at, settings=request.settings)
         if number == 0:
             for _ in range(_WARM_UP_STEPS):
                 steer.step(state, first)
             connection.send(("ready", None))
-        desk.begin(state, pose)
-        for _ in iterate_steps(state, pilot, [desk], clock=desk):
-            if desk.again:
+        clock.begin(state, pose)
+        for _ in iterate_steps(state, pilot, [clock], clock=clock):
+            if clock.again:
                 break
-        first = pilot.at(desk.now())
+        first = pilot.at(clock.now())
 
 
 def _to_frame_chunk(

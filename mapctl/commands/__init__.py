@@ -2,7 +2,7 @@
 and nothing else imports them.
 
 A package holds a frozen dataclass of options, which imports nothing heavy; the work is in its module `run`, imported
-when it is asked for, in one place (`mapctl.commands.shared.command`).
+when it runs, by `mapctl.commands.shared.command` alone.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from mapctl.commands.tween import Tween
 
 @runtime_checkable
 class Runnable(Protocol):
-    """What every sub-command can do."""
+    """Protocol of sub-commands."""
 
     def run(self) -> int:
         """Do the work and return the exit status; MapctlError for what is wrong with the request."""
@@ -55,8 +55,8 @@ COMMANDS: dict[str, type[Runnable]] = {
     "info": Info,
     "bench": Bench,
 }
-"""By the name the user types, in the order of the help."""
+"""Sub-commands by the name the user types, in the order of the help."""
 SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES, "train": {kind.model: kind for kind in MODELS}}
 """The sub-commands of commands that have some."""
 IMPLIED = {"bench": next(iter(TABLES))}
-"""The sub-command that is meant where none is named."""
+"""Default of the sub-commands, by command."""

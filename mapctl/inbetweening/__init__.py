@@ -1,4 +1,4 @@
-"""Gaps in a motion: what is missing, what is asked of an in-betweener, and what it proposes."""
+"""Gaps in a motion: the missing values, the query to an in-betweener, and its proposal."""
 
 from mapctl.inbetweening.position_image import PositionImage, ProposedPositions
 from mapctl.inbetweening.query import GapQuery, Proposal

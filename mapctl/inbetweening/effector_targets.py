@@ -1,4 +1,4 @@
-"""Target positions of effectors in frames that are otherwise free, and their exact fulfilment."""
+"""Target positions of effectors in frames that are otherwise free, and inverse kinematics that meets them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,56 +28,53 @@ class EffectorTargets:
     """Whether a joint has a target in a frame."""
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
-        """Return the targets at other times, rising: each is kept at the time that is nearest to its own."""
+        """Return the targets at other, increasing times: each is moved to the time nearest to its own."""
         own = torch.arange(len(self.places), dtype=seconds.dtype) / fps
         after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
         before = (after - 1).clamp_min(0)
         nearest = torch.where((seconds[before] - own).abs() <= (seconds[after] - own).abs(), before, after)
         joints = self.places.shape[1]
-        places, wanted = self.places.new_zeros(len(seconds), joints, 3), self.wanted.new_zeros(len(seconds), joints)
+        positions, wanted = self.places.new_zeros(len(seconds), joints, 3), self.wanted.new_zeros(len(seconds), joints)
         for frame, joint in self.wanted.nonzero().tolist():
-            places[nearest[frame], joint] = self.places[frame, joint]
+            positions[nearest[frame], joint] = self.places[frame, joint]
             wanted[nearest[frame], joint] = True
-        return EffectorTargets(places, wanted)
+        return EffectorTargets(positions, wanted)
 
 
 def check_limbs(targets: EffectorTargets) -> None:
-    """Raise RequestError unless only ends of limbs have targets."""
-    other = [
-        name
-        for name, some in zip(CANONICAL.names, targets.wanted.any(dim=0).tolist(), strict=True)
-        if some and name not in LIMBS
-    ]
+    """Raise RequestError unless only effectors of limbs have targets."""
+    wanted = [CANONICAL.names[joint] for joint in targets.wanted.any(dim=0).nonzero()[:, 0].tolist()]
+    other = [name for name in wanted if name not in LIMBS]
     if other:
-        raise RequestError(f"places are for {', '.join(LIMBS)}; {other[0]} has none")
+        raise RequestError(f"effector targets are for {', '.join(LIMBS)}; {other[0]} has none")
 
 
 def compute_target_errors(
-    places: Float[Tensor, "frames joints 3"], targets: EffectorTargets
+    positions: Float[Tensor, "frames joints 3"], targets: EffectorTargets
 ) -> Float[Tensor, " frames"]:
     """Compute the largest distance of a joint to its target, by frame, metres."""
-    away = (places - targets.places).norm(dim=-1)
-    return (away * targets.wanted).amax(dim=1)
+    distances = (positions - targets.places).norm(dim=-1)
+    return (distances * targets.wanted).amax(dim=1)
 
 
 def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[Tensor, " frames"]) -> Motion:
     """Bend limbs of a canonical motion to their targets, if these are in reach; they go there and back smoothly within
-    frames that are `free`. RequestError for targets of joints that end no limb."""
+    frames that are `free`. RequestError for targets of joints that are no effector."""
     check_limbs(targets)
     for limb in LIMBS.values():
         wanted = targets.wanted[:, limb.end] & free
         if not bool(wanted.any()):
             continue
-        places = motion.joint_positions().clone()
-        away = torch.where(wanted[:, None], targets.places[:, limb.end] - places[:, limb.end], 0.0)
-        seconds = max(_MIN_REACH_SECONDS, math.sqrt(float(away.norm(dim=-1).max()) / _REACH_ACCELERATION))
-        offset = smooth_offsets.interpolate_offsets(away, wanted | ~free, seconds=seconds, fps=float(motion.fps))
+        positions = motion.joint_positions().clone()
+        errors = torch.where(wanted[:, None], targets.places[:, limb.end] - positions[:, limb.end], 0.0)
+        seconds = max(_MIN_REACH_SECONDS, math.sqrt(float(errors.norm(dim=-1).max()) / _REACH_ACCELERATION))
+        offset = smooth_offsets.interpolate_offsets(errors, wanted | ~free, seconds=seconds, fps=float(motion.fps))
         offset = torch.where(free[:, None], offset, 0.0)
-        places[:, limb.end] += offset
-        turning = torch.zeros(places.shape[:2], dtype=torch.bool)
+        positions[:, limb.end] += offset
+        turning = torch.zeros(positions.shape[:2], dtype=torch.bool)
         turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NEGLIGIBLE)[:, None]
         quats = inverse.solve_inverse_kinematics(
-            places, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,)
+            positions, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,)
         )
         motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
     return motion

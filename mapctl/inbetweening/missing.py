@@ -27,9 +27,9 @@ class MissingMask:
 
     @staticmethod
     def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap) -> "MissingMask":
-        """Build the mask from masks by joint. A joint whose position is missing takes the rotation that put it there
-        along: its parent's, unless others show that too. RequestError for joints and frames that the motion has not,
-        and where nothing is left of it."""
+        """Build the mask from masks by joint. Where a joint is missing so is its parent's rotation, unless the parent
+        has other children that show it. RequestError for joints and frames that the motion has not, and where nothing
+        of it is left."""
         for mask in masks:
             if mask.stop > motion.num_frames:
                 raise RequestError(
@@ -55,10 +55,10 @@ class MissingMask:
         return MissingMask(self.joints[start:stop], self.root[start:stop])
 
 
-def interpolate_missing(motion: Motion, lost: MissingMask) -> Motion:
+def interpolate_missing(motion: Motion, missing: MissingMask) -> Motion:
     """Interpolate missing values from the nearest known frames on both sides: joints by slerp, positions linearly;
     beyond the first and the last known frame they hold, and joints that are never known rest."""
-    known = ~lost.joints.T
+    known = ~missing.joints.T
     before, after = last_observed(known).T, next_observed(known).T
     quats = motion.local_quat_xyzw
     start, stop = (torch.take_along_dim(quats, frame[..., None], dim=0) for frame in (before, after))
@@ -67,28 +67,28 @@ def interpolate_missing(motion: Motion, lost: MissingMask) -> Motion:
     between = rotations.slerp(start, stop, weight)
     rest = quats.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quats)
     between = torch.where(known.any(dim=1)[None, :, None], between, rest)
-    moving = {joint: _interpolate_root(values, lost.root) for joint, values in motion.moving_offsets.items()}
+    moving = {joint: _interpolate_root(values, missing.root) for joint, values in motion.moving_offsets.items()}
     return replace(
         motion,
-        local_quat_xyzw=torch.where(lost.joints[..., None], between, quats),
-        root_position=_interpolate_root(motion.root_position, lost.root),
+        local_quat_xyzw=torch.where(missing.joints[..., None], between, quats),
+        root_position=_interpolate_root(motion.root_position, missing.root),
         moving_offsets=moving,
     )
 
 
-def restore_observed(motion: Motion, original: Motion, lost: MissingMask) -> Motion:
-    """Return the original with what it lacks from `motion`, of the same rig and length; all else to the bit."""
+def restore_observed(motion: Motion, original: Motion, missing: MissingMask) -> Motion:
+    """Return the original with its missing values from `motion`, of the same rig and length; all else to the bit."""
     moving = {
-        joint: torch.where(lost.root[:, None], motion.moving_offsets[joint], values)
+        joint: torch.where(missing.root[:, None], motion.moving_offsets[joint], values)
         for joint, values in original.moving_offsets.items()
     }
     return replace(
         original,
         moving_offsets=moving,
-        root_position=torch.where(lost.root[:, None], motion.root_position, original.root_position),
-        local_quat_xyzw=torch.where(lost.joints[..., None], motion.local_quat_xyzw, original.local_quat_xyzw),
+        root_position=torch.where(missing.root[:, None], motion.root_position, original.root_position),
+        local_quat_xyzw=torch.where(missing.joints[..., None], motion.local_quat_xyzw, original.local_quat_xyzw),
     )
 
 
-def _interpolate_root(values: Float[Tensor, "frames 3"], lost: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
-    return torch.where(lost[:, None], fill_missing(values[None], ~lost[None])[0], values)
+def _interpolate_root(values: Float[Tensor, "frames 3"], missing: Bool[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
+    return torch.where(missing[:, None], fill_missing(values[None], ~missing[None])[0], values)

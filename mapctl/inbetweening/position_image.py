@@ -1,9 +1,9 @@
 """Position images: a motion with gaps as joint positions by frame (Kaufmann et al. 2020, section 3.1).
 
-There every frame is seen from its own root, whose trajectory is given by its velocities. In a gap the root is not
-known, and the integral of proposed velocities does not end where the motion goes on. So positions here are relative to
-a reference that is the root where it is known and an interpolation where it is not (linear from one known root to the
-next): the proposal fits both ends.
+In the paper every frame is relative to its own root, whose trajectory is given by its velocities. In a gap the root is
+not known, and the integral of proposed velocities does not end where the motion goes on. So positions here are relative
+to a reference that is the root where it is known and an interpolation where it is not (linear from one known root to
+the next): the proposal fits both ends.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ class PositionImage:
 
     @staticmethod
     def of_world(
-        places_world: Float[Tensor, "batch frames joints 3"],
+        positions_world: Float[Tensor, "batch frames joints 3"],
         heading: Float[Tensor, "batch frames"],
         contacts: Float[Tensor, "batch frames 2"],
         *,
@@ -49,19 +49,19 @@ class PositionImage:
         known; the reference is their root. Contacts of toes that are not known may be anything finite."""
         known = known & present[..., None]
         bits = torch.where(known[..., list(toes)], contacts, 0.5)
-        ground, facing = places_world[..., 0, ::2], rotations.unwrap_angle(heading)
-        image = PositionImage(places_world, bits, known, present, ground, facing)
-        return replace(image, places=image.from_world(places_world))
+        ground, facing = positions_world[..., 0, ::2], rotations.unwrap_angle(heading)
+        image = PositionImage(positions_world, bits, known, present, ground, facing)
+        return replace(image, places=image.from_world(positions_world))
 
-    def from_world(self, places_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
+    def from_world(self, positions_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
         """Transform world positions to the reference."""
         offset = rotations.lift_ground(self.ground)[..., None, :]
-        return rotations.rotate_about_y(places_world - offset, -self.heading[..., None])
+        return rotations.rotate_about_y(positions_world - offset, -self.heading[..., None])
 
-    def to_world(self, places: Float[Tensor, "batch frames joints 3"]) -> Tensor:
+    def to_world(self, positions: Float[Tensor, "batch frames joints 3"]) -> Tensor:
         """Invert `from_world`."""
         offset = rotations.lift_ground(self.ground)[..., None, :]
-        return rotations.rotate_about_y(places, self.heading[..., None]) + offset
+        return rotations.rotate_about_y(positions, self.heading[..., None]) + offset
 
     def mirrored(self) -> "PositionImage":
         """Exchange left and right."""
@@ -83,15 +83,14 @@ class PositionImage:
 
 @dataclass(frozen=True, eq=False)
 class ProposedPositions:
-    """An in-betweener's proposal for an image."""
+    """Positions that a network proposes for an image."""
 
     places: Float[Tensor, "batch frames joints 3"]
-    """Positions of all joints relative to the image's reference, metres. Bones may have changed their lengths a little.
-    """
+    """Positions of all joints relative to the image's reference, metres. Bone lengths are not exact."""
     contacts: Float[Tensor, "batch frames 2"]
     """Contact logits of the left and the right toe."""
 
 
-def mirror_positions(places: Float[Tensor, "*batch joints 3"]) -> Float[Tensor, "*batch joints 3"]:
+def mirror_positions(positions: Float[Tensor, "*batch joints 3"]) -> Float[Tensor, "*batch joints 3"]:
     """Mirror positions through the reference's sagittal plane."""
-    return places[..., _PARTNERS, :] * places.new_tensor([-1.0, 1.0, 1.0])
+    return positions[..., _PARTNERS, :] * positions.new_tensor([-1.0, 1.0, 1.0])

@@ -27,9 +27,9 @@ _MIN_SWING_SPEED = 0.5  # m/s from which a proposed toe swings, whatever its log
 def propose_from_positions(
     query: GapQuery, complete: Callable[[PositionImage], ProposedPositions], source: str
 ) -> Proposal:
-    """Propose the motion whose joints are as near as rigid bones come to the positions that `complete` proposes.
+    """Propose the motion on rigid bones nearest to the positions that `complete` proposes.
 
-    Where the query keeps its trajectory, the hips follow it but for their sway. Effector targets are not looked at.
+    Where the query keeps its trajectory, the hips follow it but for their sway. Effector targets are ignored.
     """
     shown, missing = query.motion, query.missing
     body = query.to_unit_size(shown)
@@ -63,15 +63,15 @@ def propose_from_positions(
 
 
 def _select_limbs(missing: Bool[Tensor, "frames joints"]) -> list[Limb]:
-    """Return arms and legs; those known in no frame bend as only the proposal says."""
+    """Return arms and legs; those known in no frame bend as proposed."""
     return [
         replace(limb, shown=not bool(missing[:, [limb.upper, limb.lower]].any(dim=1).all())) for limb in LIMBS.values()
     ]
 
 
 def _remove_jitter(positions: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
-    """Smooth what a network changes over about a frame, since each of its frames is a little off on its own. Where it
-    changes next to nothing that is jitter, and the interpolation is as good; what it leaves alone stays.
+    """Smooth a network's changes over about a frame, since the errors of its frames are independent. Where the changes
+    are tiny they are jitter, and fade to the interpolation; known positions stay.
     """
     change = (positions - image.places)[0]
     smooth = gaussian.convolve(change, gaussian.kernel(_JITTER_SIGMA, 3), "repeated")
@@ -86,7 +86,7 @@ def _estimate_root_drift(
     """Estimate the drift of the hips over the ground, without their sway; none where they are known."""
     offset = torch.where(missing[:, None], offset, 0.0) * torch.tensor([1.0, 0.0, 1.0], dtype=offset.dtype)
     slow, taps = torch.zeros_like(offset), gaussian.kernel(_SWAY_SIGMA, 4 * _SWAY_SIGMA)
-    for _ in range(_DRIFT_PASSES):  # each takes the slow part of what the ones before it left
+    for _ in range(_DRIFT_PASSES):  # each takes the slow part of the remainder
         slow = slow + torch.where(missing[:, None], gaussian.convolve(offset - slow, taps, "repeated"), 0.0)
     return slow
 

@@ -1,4 +1,4 @@
-"""What an in-betweener is asked, a motion with gaps, and what it answers, a motion without them."""
+"""Query to an in-betweener, a motion with gaps, and its proposal, a motion without them."""
 
 from dataclasses import dataclass, replace
 
@@ -19,7 +19,7 @@ _CERTAIN_LOGIT = 4.0
 
 @dataclass(frozen=True, eq=False)
 class GapQuery:
-    """A motion with gaps on canonical joints at PRIOR_FPS, and what is wanted in them."""
+    """A motion with gaps on canonical joints at PRIOR_FPS, and the targets in them."""
 
     motion: Motion
     """Motion on the character's own bones, interpolated where values are missing."""
@@ -28,13 +28,13 @@ class GapQuery:
     seconds: Float[Tensor, " frames"]
     """Time of each frame, seconds. A key between two frames is taken for one of them and stays at its own time."""
     effector_targets: EffectorTargets | None = None
-    """World positions wanted of joints in frames in which they are missing."""
+    """World positions that joints are to reach in frames in which they are missing."""
     keep_trajectory: bool = False
-    """Whether the root of `motion` shows the wanted trajectory where it is missing; it may sway about that."""
+    """Whether the root of `motion` shows the requested trajectory where it is missing; it may sway about that."""
 
     @property
     def known_positions(self) -> Bool[Tensor, "frames joints"]:
-        """Joints whose world position is known: the root and all rotations that carry them are."""
+        """Joints whose world position is known: the root position and all rotations above them are."""
         known = [~self.missing.root]
         for parent in CANONICAL.parents[1:]:
             known.append(known[parent] & ~self.missing.joints[:, parent])
@@ -68,7 +68,7 @@ class GapQuery:
 
 @dataclass(frozen=True)
 class GapSource:
-    """Who proposed the motion in one gap."""
+    """Source of the motion in one gap."""
 
     start: int
     """First frame of the gap, at PRIOR_FPS."""
@@ -77,7 +77,7 @@ class GapSource:
     by: str
     """Name of the in-betweener, as in `infiller` or `rollout of locomotion`."""
     reason: str = ""
-    """Why another one that was asked first did not propose; empty where it was not so."""
+    """Why another in-betweener that was tried first did not propose; empty where none was."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class Proposal:
     """Gaps that others proposed, or that were left to `source` for a reason."""
 
     def attribute(self, query: GapQuery) -> tuple[GapSource, ...]:
-        """Name who proposed each gap with known frames on both sides, and the others' gaps, in the order of time."""
+        """Name the source of each gap with known frames on both sides, and of the others' gaps, in temporal order."""
         named = {start: GapSource(start, stop, self.source) for start, stop in query.enclosed_gaps}
         named |= {other.start: other for other in self.others}
         return tuple(named[start] for start in sorted(named))

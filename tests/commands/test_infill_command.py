@@ -186,7 +186,7 @@ def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):
         (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "rollouts", "--curve", "line:4"], "--curve needs"),
         (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "map"], "map is now --method auto"),
         (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "linear"], "linear is now --method slerp --no-finish"),
-        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L", "--curve", "line:4"], "a curve leads the hips where"),
+        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L", "--curve", "line:4"], "the hips follow a curve where"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -240,8 +240,8 @@ def test_a_tall_character_is_steered_in_its_own_metres():
     )
     torch.testing.assert_close(first.motion.root_position[0, ::2], torch.tensor([1.0, 2.0]).double(), atol=1e-5, rtol=0)
     state, frames = steer.step(state, Command(1.3, 0.0))
-    assert state.person.scale == pytest.approx(SIZE)
-    assert frames.motion.skeleton.offsets is state.person.skeleton.offsets
+    assert state.character.scale == pytest.approx(SIZE)
+    assert frames.motion.skeleton.offsets is state.character.skeleton.offsets
     step = (frames.motion.root_position[0] - first.motion.root_position[0]).norm()
     assert 0.005 < float(step) < 0.15
     assert frames.steering_targets[0].speed == pytest.approx(first.steering_targets[0].speed, abs=0.2)

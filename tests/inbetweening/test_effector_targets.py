@@ -204,7 +204,7 @@ def test_motions_of_a_few_frames_are_met_too(frames):
 
 @pytest.mark.parametrize("joint", ["hips", "head", "leftLowerArm", "rightToes"])
 def test_joints_that_are_no_hand_or_foot_are_refused(joint):
-    with pytest.raises(RequestError, match=f"places are for leftHand, .*; {joint} has none"):
+    with pytest.raises(RequestError, match=f"effector targets are for leftHand, .*; {joint} has none"):
         reach_effector_targets(walk(5), at(walk(5), {(2, joint): torch.zeros(3).double()}), all_free(walk(5)))
 
 

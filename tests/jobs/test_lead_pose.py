@@ -125,7 +125,7 @@ def test_where_the_body_is_may_be_mixed_too():
     truth = pose.join(replace(truth, local_quat_xyzw=quats, root_position=place))
     given = noisy(truth, 3.0, 1.0, seed=1)
     found = find_lead_transition(given, retarget.identify_rig(given.skeleton))
-    assert found.place
+    assert found.position
     assert bool(found.joints[0])
     away = errors_cm(truth, cleaned(given).motion)
     assert away[1:6].max() < 12  # of 1.8 m between the two places

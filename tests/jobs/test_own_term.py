@@ -172,7 +172,7 @@ def test_terms_of_a_generated_motion_see_where_it_is_in_the_world(start):
 
 
 def test_terms_without_a_clean_up_to_join_are_refused():
-    with pytest.raises(RequestError, match="terms are wishes to the foot clean-up"):
+    with pytest.raises(RequestError, match="terms belong to the foot clean-up"):
         generate(
             TOY, seconds=1, generator=generator(), settings=GenerateSettings(foot_cleanup=None), terms=[HandHeight(1.0)]
         )

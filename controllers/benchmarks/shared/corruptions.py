@@ -1,4 +1,4 @@
-"""Clean captures spoilt in known ways, on any rig: what the table of denoising is measured on."""
+"""Known corruptions of clean captures, on any rig, on which denoising is measured."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,82 +20,81 @@ from mapctl.skeleton import CANONICAL, LIMBS, TOES
 
 @dataclass(frozen=True)
 class CorruptedClip:
-    """A capture as it would come."""
+    """A corrupted capture."""
 
     motion: Motion
-    """On the rig of the clean one."""
+    """Motion on the rig of the clean one."""
     masks: tuple[Mask, ...] = ()
-    """What its user would say is lost."""
+    """Masks that a user would give with it."""
 
 
 CorruptionFunction = Callable[[Motion, torch.Generator], CorruptedClip]
-"""Spoils a clean motion."""
+"""Function that corrupts a clean motion."""
 
 
 def add_noise(
     motion: Motion, generator: torch.Generator, *, degrees: float, centimetres: float, spikes: float = 0.01
 ) -> CorruptedClip:
-    """Normal noise on every angle of the joints that move and on the root's place; spikes of 40 degrees."""
+    """Add normal noise to every angle of the joints that move and to the root position; spikes of 40 degrees."""
     moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
     angles = math.radians(degrees) * _sample_angle_noise(motion, generator)
     hit = torch.rand(angles.shape, generator=generator, dtype=torch.float64) < spikes
     angles = angles + hit * math.radians(40) * torch.sign(_sample_angle_noise(motion, generator))
     turns = rotations.from_rotation_vector(angles * moves[None, :, None])
     quats = rotations.multiply(motion.local_quat_xyzw, turns)
-    return CorruptedClip(
-        _translate_body(
-            replace(motion, local_quat_xyzw=quats), _sample_position_noise(motion, generator) * centimetres / 100
-        )
-    )
+    offset = _sample_position_noise(motion, generator) * centimetres / 100
+    return CorruptedClip(_translate_body(replace(motion, local_quat_xyzw=quats), offset))
 
 
 def perturb_positions(motion: Motion, generator: torch.Generator, *, centimetres: float) -> CorruptedClip:
-    """Noise on the places of the joints, as of markers: bones point from one wrong place to another, and keep their
-    length. The hips are misplaced themselves.
+    """Add noise to the joints' positions, as of markers: bones point from one noisy position to the next and keep their
+    lengths; the hips' own position is noisy.
     """
     canonical, rigmap = to_canonical(motion)
-    places = canonical.joint_positions()
-    wrong = places + centimetres / 100 * torch.randn(places.shape, generator=generator, dtype=torch.float64)
+    positions = canonical.joint_positions()
+    perturbed = positions + centimetres / 100 * torch.randn(positions.shape, generator=generator, dtype=torch.float64)
     world = canonical.joint_rotations().clone()
     for joint in range(CANONICAL.num_joints):
         if below := CANONICAL.children(joint):
             child = below[0]
-            turn = rotations.between_vectors(places[:, child] - places[:, joint], wrong[:, child] - wrong[:, joint])
+            turn = rotations.between_vectors(
+                positions[:, child] - positions[:, joint], perturbed[:, child] - perturbed[:, joint]
+            )
             world[:, joint] = rotations.multiply(turn, world[:, joint])
     local = rotations.make_sign_continuous(local_from_world(CANONICAL.parents, world))
-    spoilt = replace(canonical, root_position=wrong[:, 0], local_quat_xyzw=local)
-    return CorruptedClip(from_canonical(spoilt, rigmap, motion))
+    corrupted = replace(canonical, root_position=perturbed[:, 0], local_quat_xyzw=local)
+    return CorruptedClip(from_canonical(corrupted, rigmap, motion))
 
 
 def drop_joints(motion: Motion, generator: torch.Generator, *, share: float) -> CorruptedClip:
-    """In each frame a share of the joints is lost: they are masked, and point anywhere."""
-    spoilt = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
-    lost = torch.rand(motion.num_frames, motion.num_joints, generator=generator) < share
-    masks = [Mask(motion.skeleton.names[joint], frame, frame + 1) for frame, joint in lost.nonzero().tolist()]
-    return CorruptedClip(_randomise_rotations(spoilt, lost, generator), tuple(masks))
+    """Drop a share of the joints in each frame: they are masked, and their rotations random."""
+    corrupted = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
+    missing = torch.rand(motion.num_frames, motion.num_joints, generator=generator) < share
+    masks = [Mask(motion.skeleton.names[joint], frame, frame + 1) for frame, joint in missing.nonzero().tolist()]
+    return CorruptedClip(_randomise_rotations(corrupted, missing, generator), tuple(masks))
 
 
 def drop_arm(motion: Motion, generator: torch.Generator, *, seconds: float) -> CorruptedClip:
-    """An arm is lost for a while, in the middle; slight noise on the rest."""
-    spoilt = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
+    """Drop an arm for some seconds in the middle; slight noise on the rest."""
+    corrupted = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
     rigmap = retarget.identify_rig(motion.skeleton)
     length = min(round(seconds * float(motion.fps)), motion.num_frames // 2)
     start = (motion.num_frames - length) // 2
     limb = LIMBS["leftHand"]
     arm = [rigmap.joint_of[joint] for joint in (limb.upper, limb.lower, limb.end)]
     joints = [joint for joint in arm if joint is not None]
-    lost = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
-    lost[start : start + length, joints] = True
+    missing = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
+    missing[start : start + length, joints] = True
     masks = tuple(Mask(motion.skeleton.names[joint], start, start + length) for joint in joints)
-    return CorruptedClip(_randomise_rotations(spoilt, lost, generator), masks)
+    return CorruptedClip(_randomise_rotations(corrupted, missing, generator), masks)
 
 
 def add_drift(motion: Motion, generator: torch.Generator, *, speed: float) -> CorruptedClip:
-    """The body drifts to and fro over the ground, m/s, and its planted feet with it; slight noise."""
-    spoilt = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
+    """Make the body and its planted feet drift to and fro over the ground, m/s; slight noise."""
+    corrupted = add_noise(motion, generator, degrees=1.0, centimetres=0.5, spikes=0.0).motion
     seconds = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
     swing = speed * 1.5 / math.pi * torch.sin(math.pi * seconds / 1.5)
-    return CorruptedClip(_translate_body(spoilt, torch.stack([swing, 0 * swing, 0 * swing], dim=-1)))
+    return CorruptedClip(_translate_body(corrupted, torch.stack([swing, 0 * swing, 0 * swing], dim=-1)))
 
 
 CONDITIONS: Mapping[str, CorruptionFunction] = {
@@ -109,11 +108,11 @@ CONDITIONS: Mapping[str, CorruptionFunction] = {
     "an arm lost for 2 s": partial(drop_arm, seconds=2.0),
     "body drifts by 20 cm/s": partial(add_drift, speed=0.2),
 }
-"""By name, as the table lists them."""
+"""Corruptions by name, in the order of the table."""
 
 
 def detect_true_contacts(motion: Motion) -> Tensor:
-    """Left and right toe planted in a clean motion, at its own rate (frames, 2)."""
+    """Detect contacts of the left and the right toe in a clean motion, at its own rate (frames, 2)."""
     canonical, _ = to_canonical(motion)
     toes = canonical.skeleton.indices(TOES)
     return detect_contacts(canonical.joint_positions()[:, toes], float(motion.fps))
@@ -127,18 +126,18 @@ def _sample_position_noise(motion: Motion, generator: torch.Generator) -> Tensor
     return torch.randn(motion.num_frames, 3, generator=generator, dtype=torch.float64)
 
 
-def _translate_body(motion: Motion, by: Tensor) -> Motion:
-    """The joint that travels, moved: the hips or the root."""
+def _translate_body(motion: Motion, offset: Tensor) -> Motion:
+    """Translate the travelling joint: the hips or the root."""
     hips = retarget.identify_rig(motion.skeleton).joint_of[0]
     if hips is None:
         raise RequestError("a rig without hips cannot be moved")
     if hips == 0 or hips not in motion.moving_offsets:
-        return replace(motion, root_position=motion.root_position + by)
-    moving = {**motion.moving_offsets, hips: motion.moving_offsets[hips] + by}
+        return replace(motion, root_position=motion.root_position + offset)
+    moving = {**motion.moving_offsets, hips: motion.moving_offsets[hips] + offset}
     return replace(motion, moving_offsets=moving)
 
 
-def _randomise_rotations(motion: Motion, lost: Tensor, generator: torch.Generator) -> Motion:
-    """Lost joints turned at random, so that whoever looks at them sees it."""
+def _randomise_rotations(motion: Motion, missing: Tensor, generator: torch.Generator) -> Motion:
+    """Randomise the rotations of missing joints, so that reading them shows in the error."""
     wild = rotations.from_rotation_vector(_sample_angle_noise(motion, generator))
-    return replace(motion, local_quat_xyzw=torch.where(lost[..., None], wild, motion.local_quat_xyzw))
+    return replace(motion, local_quat_xyzw=torch.where(missing[..., None], wild, motion.local_quat_xyzw))

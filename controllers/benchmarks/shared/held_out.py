@@ -1,4 +1,4 @@
-"""Clips that no training saw, by kind."""
+"""Clips held out from training, by kind."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 
 HeldOut = Mapping[str, Sequence[str]]
-"""Names of clips by the part of the data that they are in, as a model's card tells them."""
+"""Names of clips by the part of the data that they are in, as in a model's card."""
 
 CLIP_KINDS: Mapping[str, str] = {
     "walks": r"bandai.*_walk_",
@@ -20,31 +20,31 @@ CLIP_KINDS: Mapping[str, str] = {
     "gestures, dance, fights": r"bandai",
     "CMU, 120 fps": r"cmu",
 }
-"""Clips by the first pattern that their path holds."""
+"""Kinds of clips, by the first pattern that is found in their path."""
 _MAX_CLIP_SECONDS = 20.0  # seconds of a clip that are used
 
 
 @dataclass(frozen=True, eq=False)
 class CleanClip:
-    """A clean clip."""
+    """A clean clip and its kind."""
 
     kind: str
-    """Of CLIP_KINDS."""
+    """Key of CLIP_KINDS."""
     motion: Motion
-    """On its rig, without a T-pose in front."""
+    """Motion on its rig, without a leading T-pose."""
 
 
 def find_held_out(data: Path, held_out: HeldOut) -> list[Path]:
-    """The clips below the data folder that were kept from training; RequestError where they are not all there."""
+    """Find the held-out clips below the data folder; RequestError unless all are there."""
     paths = [data / name for part in ("validation", "test") for name in held_out.get(part, ())]
     if not paths or not all(path.is_file() for path in paths):
-        lost = next((path for path in paths if not path.is_file()), "no clip at all")
-        raise RequestError(f"{data} does not hold the clips kept from training: {lost}")
+        missing = next((path for path in paths if not path.is_file()), "no clip at all")
+        raise RequestError(f"{data} does not hold the clips kept from training: {missing}")
     return paths
 
 
 def load_clean_clips(data: Path, held_out: HeldOut, count: int) -> list[CleanClip]:
-    """About so many, as many of each kind, without their T-poses."""
+    """Load about so many held-out clips, as many of each kind, without their T-poses."""
     paths: dict[str, list[Path]] = {}
     for path in find_held_out(data, held_out):
         paths.setdefault(classify_clip(path.relative_to(data).as_posix()), []).append(path)
@@ -57,7 +57,7 @@ def load_clean_clips(data: Path, held_out: HeldOut, count: int) -> list[CleanCli
 
 
 def load_canonical(data: Path, held_out: HeldOut, count: int, *, fps: int | None = None) -> dict[str, list[Motion]]:
-    """The same on canonical joints, by kind; at that frame rate if one is named."""
+    """Load held-out clips on canonical joints, by kind; resampled to `fps` if given."""
     kinds: dict[str, list[Motion]] = {}
     for clip in load_clean_clips(data, held_out, count):
         motion = retarget.to_canonical(clip.motion)[0]
@@ -66,11 +66,11 @@ def load_canonical(data: Path, held_out: HeldOut, count: int, *, fps: int | None
 
 
 def classify_clip(name: str) -> str:
-    """By the first pattern that fits; `other` if none does."""
+    """Return the kind of the first pattern that fits; `other` if none does."""
     return next((kind for kind, pattern in CLIP_KINDS.items() if re.search(pattern, name)), "other")
 
 
 def trim_clip(motion: Motion, *, skip_first: bool) -> Motion:
-    """The first seconds of a clip, without its frame 0 if that is a T-pose."""
+    """Return the first seconds of a clip, without its frame 0 if that is a T-pose."""
     first = 1 if skip_first else 0
     return motion.slice(first, min(motion.num_frames, first + round(_MAX_CLIP_SECONDS * float(motion.fps))))

@@ -1,4 +1,4 @@
-"""What the tables of all benchmarks are made of."""
+"""Rows of the benchmarks' tables."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,10 +10,7 @@ Row = dict[str, Any]
 
 
 def average_rows(rows: Sequence[Row], columns: Sequence[str] | None = None) -> Row:
-    """The mean of each column, of those of the first row if none are named.
-
-    NaN, where a clip cannot give a figure, is left out; of none it stays.
-    """
+    """Compute the mean of each column, of those of the first row if none are named; NaN does not count."""
     means = {}
     for name in rows[0] if columns is None else columns:
         column = np.array([row[name] for row in rows])

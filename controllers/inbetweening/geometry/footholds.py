@@ -1,4 +1,4 @@
-"""Planted feet that stay where they are: toes are held at one place as long as they stand, and legs bend to that."""
+"""Footholds: planted toes are held at one position during each contact, by inverse kinematics of the legs."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,38 +11,38 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
 _TOES = list(TOE_JOINTS)
-_STANCE_FADE_SECONDS = 0.12  # over which a foot that swings leaves the correction of where it stood
+_STANCE_FADE_SECONDS = 0.12  # over which a swinging foot's correction fades away from its contacts
 
 
 def hold_planted(
-    motion: Motion, stands: Bool[Tensor, "frames 2"], *, free: Bool[Tensor, " frames"], rest_height: float
+    motion: Motion, planted: Bool[Tensor, "frames 2"], *, free: Bool[Tensor, " frames"], rest_height: float
 ) -> Motion:
-    """A canonical motion whose toes (left, right) stay at one place while they stand, in frames that are free.
+    """Hold the toes (left, right) of a canonical motion at one position during each contact, in frames that are free.
 
-    A stand that begins or ends in frames that are not free goes on in the place it has there; others are in the middle
-    of where they slid along, at `estimate_rest_height` (metres). Between stands the correction fades. Hips stay; feet
-    keep how they lie.
+    A contact that begins or ends in frames that are not free keeps its position there; others are held at the mean of
+    their positions, at `rest_height` (metres). Between contacts the correction fades. Hips and the feet's orientations
+    stay.
     """
-    places, ends = motion.joint_positions(), motion.joint_positions().clone()
+    positions, goals = motion.joint_positions(), motion.joint_positions().clone()
     for foot, toe in enumerate(_TOES):
-        moved = torch.zeros_like(places[:, toe])
-        for _, start, stop in true_intervals(stands[:, foot, None]):
+        offset = torch.zeros_like(positions[:, toe])
+        for _, start, stop in true_intervals(planted[:, foot, None]):
             part = slice(start, stop)
-            moved[part] = _compute_stance_offset(places[part, toe], ~free[part], rest_height)
-        firm = ~free | stands[:, foot]
-        ends[:, CANONICAL.parents[toe]] += interpolate_offsets(
-            moved, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
+            offset[part] = _compute_stance_offset(positions[part, toe], ~free[part], rest_height)
+        firm = ~free | planted[:, foot]
+        goals[:, CANONICAL.parents[toe]] += interpolate_offsets(
+            offset, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
         )
     turning = free[:, None].expand(-1, CANONICAL.num_joints)
-    return bend_limbs(motion, motion, ends, torch.zeros_like(turning), turning)
+    return bend_limbs(motion, motion, goals, torch.zeros_like(turning), turning)
 
 
 def _compute_stance_offset(
-    track: Float[Tensor, "stand 3"], held: Bool[Tensor, " stand"], rest_height: float
-) -> Float[Tensor, "stand 3"]:
-    """What brings a stand's frames to the place of those that are held, straight between such, or to its own middle."""
-    if bool(held.any()):
-        return fill_missing(track[None], held[None])[0] - track
-    middle = track.mean(dim=0)
+    positions: Float[Tensor, "contact 3"], anchored: Bool[Tensor, " contact"], rest_height: float
+) -> Float[Tensor, "contact 3"]:
+    """Compute the offsets from a contact's positions to the anchored ones, interpolated linearly, or to their mean."""
+    if bool(anchored.any()):
+        return fill_missing(positions[None], anchored[None])[0] - positions
+    middle = positions.mean(dim=0)
     middle[1] = rest_height
-    return middle - track
+    return middle - positions

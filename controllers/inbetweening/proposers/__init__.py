@@ -1,4 +1,4 @@
-"""Who proposes what a gap lacks: the in-betweeners behind --method."""
+"""Proposers of motion in gaps: the in-betweeners behind --method."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ModelLoaders:
-    """Loads the models that an in-betweener needs, when it needs them."""
+    """Loaders of the models that an in-betweener needs, called when it needs them."""
 
     infiller: Callable[[], Inbetweener]
-    """Loads the infiller."""
+    """Loader of the infiller."""
     densities: Callable[[], Sequence[Density]]
-    """Loads the densities that are rolled."""
+    """Loader of the densities for rollouts."""
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
@@ -36,12 +36,12 @@ METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
     "rollouts": lambda models: RolloutInbetweener(models.densities(), models.infiller()),
     "slerp": lambda models: SlerpInbetweener(),
 }
-"""In-betweeners by the name of the method that chooses them."""
+"""Builders of in-betweeners by the name of the method."""
 _RENAMED = {"map": "--method auto", "linear": "--method slerp --no-finish"}
 
 
 def check_method(method: str) -> None:
-    """RequestError for a method that there is not."""
+    """Raise RequestError for an unknown method."""
     if method not in METHODS:
         known = f"{method} is now {_RENAMED[method]}" if method in _RENAMED else f"there are {', '.join(METHODS)}"
         raise RequestError(f"there is no --method {method}; {known}")

@@ -1,9 +1,9 @@
-"""Choose who fills a gap: the infiller where it knows enough, a rollout where it would slide, a held pose where the
-body stands still.
+"""Choice of the proposer of each gap: the infiller with enough context, a rollout where the infiller would slide, a
+held pose where the body stands still.
 
-Between poses that are seconds apart the infiller's answer is the mean of many: feet that hang and slide. Likelihood
-does not show it, since a mean is likely; what a viewer sees does: a low foot that moves under the body, a detour of the
-body, a limb that jumps.
+Between poses that are seconds apart the infiller's proposal is the mean of many motions: feet float and slide. The
+likelihood does not show it, since a mean is likely; visible artefacts do: skating feet, a detour of the body, a limb
+that jumps.
 """
 
 from collections.abc import Sequence
@@ -39,37 +39,37 @@ _STANDING_CONTACT_LOGIT = 4.0
 
 @dataclass(frozen=True)
 class ChoiceSettings:
-    """When others than the infiller are asked, and what counts against an answer."""
+    """Thresholds at which other proposers are tried, and weights of the cost of a proposal."""
 
     max_bare_frames: int = 30
-    """Frames of the longest gap between poses with little known beside them that the infiller fills unasked."""
+    """Frames of the longest gap with little context in which only the infiller is tried."""
     context: int = 8
-    """Known frames on both sides of a gap from which on the infiller knows how somebody moves."""
+    """Known frames on both sides of a gap that are enough context for the infiller."""
     known: int = 60
-    """Frames of the longest gap between such that it fills unasked: the mean length that it was trained on."""
+    """Frames of the longest gap with enough context in which only the infiller is tried: its mean training length."""
     acceptable_cost: float = 0.2
-    """Cost, m/s, of an answer with which nobody else is asked."""
+    """Cost, m/s, of a proposal below which no other one is tried."""
     tempos: tuple[float, ...] = (1.0, 0.94, 1.06)
-    """Of rollouts, in this order: how long they are before they are brought to the gap's length. Steps then end
-    earlier or later, which is what a rollout that starts from one pose cannot choose otherwise."""
+    """Tempos of rollouts in the order in which they are tried: their length relative to the gap's before time is
+    warped. Steps then end earlier or later, which a rollout that starts from one pose cannot choose otherwise."""
     same_pose_distance: float = 0.06
-    """Mean distance of the joints, metres, of two poses between which somebody just stands."""
+    """Mean distance of the joints, metres, below which two poses count as one."""
     at_rest: float = 0.15
-    """Mean speed of the joints beside a gap, m/s, below which somebody is not about to move."""
+    """Mean speed of the joints beside a gap, m/s, below which the body is at rest."""
     skate: float = 0.5
-    """Weight of skating beside sliding."""
+    """Weight of skating toes beside sliding of the support."""
     detour_weight: float = 0.5
-    """Weight of a way that is longer than the straight one, m/s."""
+    """Weight of the trajectory's excess length over the straight one, m/s for m/s."""
     unsupported_weight: float = 0.5
     """Weight of the longest time on no planted foot, m/s for a second."""
     missed: float = 0.3
-    """Weight of the distance at which a rollout would have arrived, per second: m/s for a metre."""
+    """Weight of a rollout's error at arrival, per second of the gap: m/s for a metre."""
     max_step_ratio: float = 1.3
-    """How much farther than in the infiller's answer, which is a calm one, hands and feet may go in a frame."""
+    """Largest ratio of the step of hands and feet in a frame to that of the infiller's proposal, which is calm."""
     step: float = 0.08
-    """Metres that they may go in a frame at any rate."""
+    """Step of hands and feet in a frame that is always allowed, metres."""
     excess_step_weight: float = 8.0
-    """Weight of a metre more than that, m/s."""
+    """Weight of a step beyond both, m/s for a metre."""
     rolling: RolloutSettings = field(
         default_factory=lambda: RolloutSettings(
             temperature=0.0,
@@ -84,29 +84,29 @@ class ChoiceSettings:
             ),
         )
     )
-    """Rollouts: the likeliest ones, without a swarm before L-BFGS, which did not lower the cost here."""
+    """Settings of rollouts: the likeliest ones, without a swarm before L-BFGS, which did not lower the cost here."""
 
 
 @dataclass(frozen=True, eq=False)
 class AutoInbetweener(Inbetweener):
-    """The infiller's proposal, but in gaps where a rollout or a held pose costs a viewer less; the end is extended by a
-    density that knows what comes before it.
+    """In-betweener that takes the infiller's proposal, except in gaps where a rollout or a held pose has a lower cost;
+    the end is extrapolated by a density.
     """
 
     infiller: Inbetweener
-    """Proposes first, and fills all in which something is known."""
+    """In-betweener that proposes first, and fills gaps in which something is known."""
     densities: Sequence[Density] = ()
-    """Densities to choose rollouts from; without any nothing is rolled."""
+    """Densities for rollouts; without any nothing is rolled."""
     settings: ChoiceSettings = field(default_factory=ChoiceSettings)
-    """When others are asked, and what counts against an answer."""
+    """Thresholds and weights of the choice."""
 
     @property
     def rough(self) -> Inbetweener:
-        """The infiller."""
+        """Rough in-betweener of the infiller."""
         return self.infiller.rough
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose by whoever costs least in each gap, one after the other in time; nothing is drawn at random."""
+        """Propose the candidate with the lowest cost in each gap, one after the other in time, without sampling."""
         first = self.infiller.propose(query, generator=generator)
         roller = Roller.of(query, first, self.densities) if self.densities else None
         best, others = _Candidate(first.motion, first.contact_logits, first.source, 0.0), list(first.others)
@@ -124,7 +124,7 @@ class AutoInbetweener(Inbetweener):
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """One answer for one gap."""
+    """One candidate for one gap."""
 
     body: Motion
     """All frames, on the character's bones."""
@@ -134,7 +134,7 @@ class _Candidate:
 
 
 def _has_enough_context(query: GapQuery, start: int, stop: int, settings: ChoiceSettings) -> bool:
-    """Return whether the infiller knows enough beside a gap to fill it unasked."""
+    """Return whether a gap has enough context that only the infiller is tried."""
     known = ~query.missing.frames
     before, after = known[max(0, start - settings.context) : start], known[stop : stop + settings.context]
     beside = min(int(before.sum()), int(after.sum()))
@@ -144,7 +144,7 @@ def _has_enough_context(query: GapQuery, start: int, stop: int, settings: Choice
 def _choose_candidate(
     query: GapQuery, before: _Candidate, roller: Roller | None, gap: tuple[int, int], settings: ChoiceSettings
 ) -> _Candidate:
-    """Choose the least costly of the infiller's answer, standing still, and rollouts of several tempos."""
+    """Choose the least costly of the infiller's proposal, standing still, and rollouts of several tempos."""
     start, stop = gap
     first = replace(before, cost=compute_artefact_cost(before.body, before.contact_logits, gap, settings))
     calm = settings.max_step_ratio * max(settings.step, _find_largest_step(before.body, gap))
@@ -170,8 +170,8 @@ def _choose_candidate(
 def compute_artefact_cost(
     motion: Motion, contact_logits: Float[Tensor, "frames 2"], gap: tuple[int, int], settings: ChoiceSettings
 ) -> float:
-    """Compute what a viewer sees of a filled gap as a speed, m/s: sliding of what the body stands on, skating toes, a
-    detour, the longest time on no foot.
+    """Compute the cost of visible artefacts in a filled gap as a speed, m/s: sliding of the support, skating toes, a
+    detour, the longest unsupported time.
     """
     start, stop = gap[0] - 1, gap[1] + 1
     positions, fps = motion.joint_positions()[start:stop], float(motion.fps)
@@ -192,15 +192,15 @@ def compute_artefact_cost(
 
 
 def _find_largest_step(motion: Motion, gap: tuple[int, int]) -> float:
-    """Find the largest step of hands and toes in a gap, into it and out of it, seen from the hips, metres a frame."""
+    """Find the largest step of hands and toes relative to the hips in a gap and across its edges, metres a frame."""
     shown = motion.slice(gap[0] - 1, gap[1] + 1)
     effectors = shown.joint_positions()[:, _EFFECTORS]
     return worst_frame.measure_peaks(effectors, shown.root_position, float(motion.fps)).step
 
 
 def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceSettings) -> bool:
-    """Return whether the body has one position and pose before a gap and after it, and is at rest as far as frames
-    beside it show.
+    """Return whether the body has the same pose and position before and after a gap, and is at rest in known frames
+    beside it.
     """
     positions, unknown = query.motion.joint_positions(), query.missing.frames
     apart = float((positions[stop] - positions[start - 1]).norm(dim=-1).mean())
@@ -212,7 +212,7 @@ def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceS
 
 
 def _hold_pose(query: GapQuery, before: _Candidate, gap: tuple[int, int]) -> _Candidate:
-    """Hold the pose, which changes slowly into the next."""
+    """Hold the pose, interpolated slowly to the next."""
     part, body = slice(*gap), before.body
     root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), before.contact_logits.clone()
     root[part], quats[part] = query.motion.root_position[part], query.motion.local_quat_xyzw[part]

@@ -1,4 +1,4 @@
-"""Extrapolation beyond the last known frame: the likeliest rollout of a density that knows what comes before."""
+"""Extrapolation beyond the last known frame: the likeliest rollout of a density after the frames before."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,27 +15,27 @@ from mapctl.problem.warm_start import keep_warm_start
 from mapctl.protocols import Density
 from mapctl.terms import LatentPrior
 
-_MIN_KNOWN_FRAMES = 5  # frames that tell how somebody goes on
+_MIN_KNOWN_FRAMES = 5  # fewest frames from which a motion is extrapolated
 
 
 def extrapolate_end(
     query: GapQuery, proposal: Proposal, densities: Sequence[Density], settings: RolloutSettings
 ) -> Proposal:
-    """Extend a proposal from where the motion is last known to its end, if nothing is known there.
+    """Extrapolate a proposal from the last known frame to its end, if nothing is known there.
 
-    It stays as it is where the first density (that of locomotion) does not find what comes before as likely as its own
+    It stays unchanged where the first density (that of locomotion) does not find the frames before as likely as its own
     data: densities then stop or turn away. None runs backwards, so a beginning stays as well.
     """
     missing, stop = query.nothing_known, query.motion.num_frames
     start = stop - int(missing.flip(0).long().cumprod(0).sum())
-    # What stood before other gaps tells, and not what fills them.
+    # Only frames since the gap before count, not what fills that.
     since = int(missing[:start].nonzero()[-1]) + 1 if bool(missing[:start].any()) else 0
     if start == stop or start - since < _MIN_KNOWN_FRAMES or not densities:
         return proposal
     body, logits = query.to_unit_size(proposal.motion), proposal.contact_logits
     known = body.slice(since, start)
-    judge = densities[0].with_observation_noise(density_selection.proposal_sigma())
-    if density_selection.select_density_for_motion([judge], known).weight < 1:
+    blurred = densities[0].with_observation_noise(density_selection.proposal_sigma())
+    if density_selection.select_density_for_motion([blurred], known).weight < 1:
         return proposal
     density = select_likeliest_density(densities, known)
     solver = RecedingHorizonSolver(density, method=replace(settings.method, proposal=keep_warm_start))

@@ -1,9 +1,9 @@
-"""Propose through keys that give only a part of a pose: positions of hands, feet or hips.
+"""Proposals through partial keys, which give only positions of hands, feet or hips.
 
-An in-betweener that sees the position of one hand in one frame keeps it there in that frame and goes on beside it as if
-it had seen nothing. So it does not see it. It is asked twice: first without the part, which shows how the trajectory
-must lead for the part to come about; then along that trajectory. What is left at the key's frame is done by as little
-of the whole body as possible (see `mapctl.inbetweening.whole_body`), which goes there and back at a usual acceleration.
+An in-betweener that gets the position of one hand in one frame meets it in that frame and ignores it in the frames
+beside. So partial keys are hidden from it. It proposes twice: first freely, from which the trajectory follows on which
+the targets can be met; then along that trajectory. The error left at the key's frame is met by the smallest motion of
+the whole body (see `mapctl.inbetweening.whole_body`), which goes there and back at a usual acceleration.
 """
 
 import math
@@ -26,16 +26,16 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, LIMBS
 
-_MAX_ROOT_KEY_FRAMES = 5  # frames at the prior's rate: hips that are known for longer, a network goes along with
-_MIN_ROOT_UNCERTAINTY = 0.02  # metres by which somebody who stands may stand elsewhere
-_ROOT_UNCERTAINTY_SHARE = 0.4  # of the way that is gone meanwhile: how far a trajectory may well lead elsewhere
-_MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory tells where somebody faces
+_MAX_ROOT_KEY_FRAMES = 5  # frames at the prior's rate: hips that are known for longer, a network follows
+_MIN_ROOT_UNCERTAINTY = 0.02  # metres, of the position of a standing body
+_ROOT_UNCERTAINTY_SHARE = 0.4  # of the distance travelled since the last known position
+_MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory determines the facing
 _STEP_SECONDS = 0.25
 _MIN_LIMB_SECONDS, _LIMB_ACCELERATION = 0.15, 15.0
-"""Least time over which a limb goes to its place, and the acceleration (m/s^2) at which it goes farther: a sixth of
-what hands and feet of walking people reach."""
+"""Least time in which a limb goes to its target, and its acceleration (m/s^2) beyond that: a sixth of what hands and
+feet reach in walking."""
 _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION = 0.25, 3.0
-"""The same of hips and trunk."""
+"""Least time and acceleration of hips and trunk."""
 _ARMS = tuple(
     joint
     for name, limb in LIMBS.items()
@@ -48,8 +48,8 @@ _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 def propose_through_keys(
     query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator
 ) -> tuple[Proposal, EffectorTargets | None]:
-    """Propose a motion with hands and feet at their targets, and the hips at theirs where single frames tell no more;
-    and the targets, brought in reach where they are not.
+    """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
+    return the targets, moved within reach where they are not.
     """
     hips, targets = _find_root_only_keys(query), query.effector_targets
     wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
@@ -57,11 +57,11 @@ def propose_through_keys(
         return inbetweener.propose(query, generator=generator), targets
     joints = query.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
     blind = replace(query, missing=MissingMask(joints, query.missing.root | hips), effector_targets=None)
-    led = blind
+    guided = blind
     if bool(query.missing.root.any()):
         first = inbetweener.rough.propose(blind, generator=generator).motion
-        led = _interpolate_trajectory(query, blind, first, targets, hips)
-    answer = inbetweener.propose(replace(led, effector_targets=_add_root_targets(query, hips)), generator=generator)
+        guided = _interpolate_trajectory(query, blind, first, targets, hips)
+    answer = inbetweener.propose(replace(guided, effector_targets=_add_root_targets(query, hips)), generator=generator)
     made = answer.motion
     posed = _set_hips(made, query.motion, hips)
     if targets is None:
@@ -100,7 +100,7 @@ def _find_root_only_keys(query: GapQuery) -> Bool[Tensor, " frames"]:
 def _interpolate_trajectory(
     query: GapQuery, blind: GapQuery, body: Motion, targets: EffectorTargets | None, hips: Bool[Tensor, " frames"]
 ) -> GapQuery:
-    """Return the query with its hips along a trajectory through all that keys tell of it, facing as it leads."""
+    """Return the query with its hips along a trajectory through all keys, and facing along it."""
     root, facing = body.root_position.clone(), rotations.unwrap_angle(heading(body.local_quat_xyzw[:, 0]))
     knots = ~blind.missing.root | hips
     root[knots] = query.motion.root_position[knots]
@@ -108,78 +108,70 @@ def _interpolate_trajectory(
     facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
     if targets is not None:
         wanted = targets.wanted.any(dim=1) & blind.missing.root & ~hips
-        root = (
-            root
-            + reach_targets(
-                body,
-                targets,
-                turning=blind.missing.joints,
-                moving=blind.missing.root,
-                stray=_estimate_root_uncertainty(body, blind.missing.root),
-            )[1]
+        turning, moving = blind.missing.joints, blind.missing.root
+        stray = _estimate_root_uncertainty(body, moving)
+        root = root + reach_targets(body, targets, turning=turning, moving=moving, stray=stray)[1]
+        positions = _interpolate_knots(root, knots | wanted, query.seconds)
+        facing = facing + torch.where(
+            knots, 0.0, _compute_heading_change(body.root_position, positions, float(body.fps))
         )
-        places = _interpolate_knots(root, knots | wanted, query.seconds)
-        facing = facing + torch.where(knots, 0.0, _compute_heading_change(body.root_position, places, float(body.fps)))
         knots = knots | wanted
-    places = _interpolate_knots(root, knots, query.seconds)
+    positions = _interpolate_knots(root, knots, query.seconds)
     turned = _interpolate_knots(facing[:, None], knots, query.seconds)[:, 0]
     shown = query.motion
     quats = shown.local_quat_xyzw.clone()
     turn = torch.where(blind.missing.root, turned - heading(quats[:, 0]), 0.0)
     quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
-    led = torch.where(blind.missing.root[:, None], places, shown.root_position)
-    return replace(blind, motion=replace(shown, root_position=led, local_quat_xyzw=quats), keep_trajectory=True)
+    root = torch.where(blind.missing.root[:, None], positions, shown.root_position)
+    return replace(blind, motion=replace(shown, root_position=root, local_quat_xyzw=quats), keep_trajectory=True)
 
 
-def _estimate_root_uncertainty(body: Motion, lost: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """How far hips that are not known may well be from where they are proposed, metres: the farther, the faster they
-    go and the longer they are on their way from or to where they are known.
+def _estimate_root_uncertainty(body: Motion, missing: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """Estimate the uncertainty of proposed hips, metres: proportional to their speed and to the time from the nearest
+    known frame.
     """
-    known, frame, fps = ~lost[None], torch.arange(len(lost)), float(body.fps)
+    known, frame, fps = ~missing[None], torch.arange(len(missing)), float(body.fps)
     before, after = last_observed(known)[0], next_observed(known)[0]
-    away = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
-    way = (body.root_position[after] - body.root_position[before])[:, ::2].norm(dim=-1)
-    return _MIN_ROOT_UNCERTAINTY + _ROOT_UNCERTAINTY_SHARE * away * way * fps / (after - before).clamp_min(1)
+    seconds = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
+    path_length = (body.root_position[after] - body.root_position[before])[:, ::2].norm(dim=-1)
+    return _MIN_ROOT_UNCERTAINTY + _ROOT_UNCERTAINTY_SHARE * seconds * path_length * fps / (after - before).clamp_min(1)
 
 
 def _interpolate_knots(
     values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
 ) -> Float[Tensor, "frames width"]:
-    """The values at the knots, and monotone cubics in time between them; beyond the first and last, as these are."""
-    at, told = seconds[knots], values[knots]
-    if len(at) < 2:
+    """Interpolate between values at knots by monotone cubics in time; constant beyond the first and the last."""
+    if int(knots.sum()) < 2:
         return values
-    # Straight on beyond the ends: a monotone cubic's own guess of its slope there is up to half too fast.
-    at = torch.cat([2 * at[:1] - at[1:2], at, 2 * at[-1:] - at[-2:-1]])
-    told = torch.cat([2 * told[:1] - told[1:2], told, 2 * told[-1:] - told[-2:-1]])
-    curve = PchipInterpolator(at.numpy(), told.numpy())
+    # Linear beyond the ends: a monotone cubic's own estimate of its slope there is up to half too large.
+    at, known = (torch.cat([2 * v[:1] - v[1:2], v, 2 * v[-1:] - v[-2:-1]]) for v in (seconds[knots], values[knots]))
+    curve = PchipInterpolator(at.numpy(), known.numpy())
     return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
 
 
 def _compute_heading_change(
     before: Float[Tensor, "frames 3"], after: Float[Tensor, "frames 3"], fps: float
 ) -> Float[Tensor, " frames"]:
-    """How much more one trajectory turns than another, radians; where either stands, neither tells."""
-    (one, pace), (other, pace_too) = (
-        _compute_travel_direction(before[:, ::2], fps),
-        _compute_travel_direction(after[:, ::2], fps),
-    )
-    believed = torch.minimum(pace, pace_too).square()
-    return rotations.wrap_angle(other - one) * believed / (believed + _MIN_DIRECTION_SPEED**2)
+    """Compute the difference of two trajectories' directions, radians, weighted by speed: none where either stands."""
+    one, speed = _compute_travel_direction(before[:, ::2], fps)
+    other, other_speed = _compute_travel_direction(after[:, ::2], fps)
+    weight = torch.minimum(speed, other_speed).square()
+    return rotations.wrap_angle(other - one) * weight / (weight + _MIN_DIRECTION_SPEED**2)
 
 
 def _compute_travel_direction(
     ground: Float[Tensor, "frames 2"], fps: float
 ) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
-    """Which way a trajectory leads, radians, and how fast, m/s, without the sway of single steps."""
+    """Compute a trajectory's direction, radians, and speed, m/s, without the sway of single steps."""
     reach, frame = max(1, round(_STEP_SECONDS * fps)), torch.arange(len(ground))
     start, stop = (frame - reach).clamp_min(0), (frame + reach).clamp(max=len(ground) - 1)
-    way = (ground[stop] - ground[start]) * fps / (stop - start).clamp_min(1)[:, None]
-    return torch.atan2(way[:, 0], way[:, 1]), way.norm(dim=1)
+    velocity = (ground[stop] - ground[start]) * fps / (stop - start).clamp_min(1)[:, None]
+    return torch.atan2(velocity[:, 0], velocity[:, 1]), velocity.norm(dim=1)
 
 
 def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
-    """The motion with the hips of `known` in these frames; it faces with them, and what they carry keeps its tilt."""
+    """Set the hips to those of `known` in these frames; the body takes their heading, and their children keep their
+    tilt."""
     quats, root = body.local_quat_xyzw.clone(), body.root_position.clone()
     facing = heading(known.local_quat_xyzw[:, 0]) - heading(quats[:, 0])
     turned = rotations.multiply(rotations.about_y(facing), quats[:, 0])
@@ -191,34 +183,34 @@ def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> M
 
 
 def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], query: GapQuery) -> Motion:
-    """`body` that goes to the poses `posed` in the frames of keys and comes back, feet staying on their own tracks."""
+    """Blend `body` to the poses `posed` in the frames of keys and back, feet staying on their own trajectories."""
     fps = float(body.fps)
     turn = rotations.to_rotation_vector(
         rotations.multiply(rotations.inverse(body.local_quat_xyzw), posed.local_quat_xyzw)
     )
-    places, goals = body.joint_positions(), posed.joint_positions()
-    away = torch.where(keys[:, None], (goals - places).norm(dim=-1), 0.0)
-    limb = _compute_duration(away[:, [limb.end for limb in LIMBS.values()]], _MIN_LIMB_SECONDS, _LIMB_ACCELERATION)
-    trunk = _compute_duration(away[:, :1], _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION)
+    positions, goals = body.joint_positions(), posed.joint_positions()
+    distance = torch.where(keys[:, None], (goals - positions).norm(dim=-1), 0.0)
+    limb = _compute_duration(distance[:, [limb.end for limb in LIMBS.values()]], _MIN_LIMB_SECONDS, _LIMB_ACCELERATION)
+    trunk = _compute_duration(distance[:, :1], _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION)
     known = ~query.missing.joints | keys[:, None]
     quats = body.local_quat_xyzw.clone()
     for joint in range(body.num_joints):
         seconds = limb if joint in _ARMS else trunk
-        turned = interpolate_offsets(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
-        quats[:, joint] = rotations.multiply(quats[:, joint], rotations.from_rotation_vector(turned))
-    moved = interpolate_offsets(
+        rotation = interpolate_offsets(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
+        quats[:, joint] = rotations.multiply(quats[:, joint], rotations.from_rotation_vector(rotation))
+    offset = interpolate_offsets(
         (posed.root_position - body.root_position) * keys[:, None], ~query.missing.root | keys, seconds=trunk, fps=fps
     )
-    made = replace(body, root_position=body.root_position + moved, local_quat_xyzw=quats)
-    ends, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
+    made = replace(body, root_position=body.root_position + offset, local_quat_xyzw=quats)
+    goals_made, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
     for foot in _FEET:
         firm = keys | ~query.missing.joints[:, CANONICAL.parents[foot]]
-        ends[:, foot] = places[:, foot] + interpolate_offsets(
-            (goals - places)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
+        goals_made[:, foot] = positions[:, foot] + interpolate_offsets(
+            (goals - positions)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
         )
-    return bend_limbs(made, body, ends, wanted, query.missing.joints)
+    return bend_limbs(made, body, goals_made, wanted, query.missing.joints)
 
 
-def _compute_duration(away: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
-    """Seconds over which the farthest goes to its place and back: a spring's, which is `calm` at its place."""
-    return max(least, math.sqrt(float(away.max()) / calm))
+def _compute_duration(distance: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
+    """Compute the seconds in which the farthest part goes to its target and back: a spring's of acceleration `calm`."""
+    return max(least, math.sqrt(float(distance.max()) / calm))

@@ -1,4 +1,4 @@
-"""What rolling a density through a gap and beyond the end of a motion share: what comes before, and putting it in."""
+"""Rollouts within a motion: the committed frames before one, and its insertion into a gap or beyond the end."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ _PAST_FRAMES = 3  # frames before a gap that terms look back on
 
 
 def select_likeliest_density(densities: Sequence[Density], motion: Motion) -> Density:
-    """Select the density under which a canonical motion, seen with a proposal's errors, is likeliest."""
+    """Select the density under which a canonical motion, with a proposal's observation noise, is likeliest."""
     if len(densities) == 1:
         return densities[0]
     blurred = [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
@@ -39,33 +39,33 @@ def commit_before(
     *,
     since: int = 0,
 ) -> CommittedFrames:
-    """Commit a motion's frames before a gap, with their contacts, single precision; the density sees those that its
-    state, if there is one, has not: from frame `since` on.
+    """Commit a motion's frames before a gap, with their contacts, single precision; a density's `state` is advanced
+    from frame `since` on.
     """
     features, before = encode(body.slice(0, max(2, start)))
     ground, heading = integrate_root(features, before)
     features[:, LAYOUT.slices["contacts"]] = (contact_logits[: len(features)] > 0).to(features)
     features = features[:start].float()
-    place = GroundPose(ground[start - 1].float(), heading[start - 1].float())
+    ground_pose = GroundPose(ground[start - 1].float(), heading[start - 1].float())
     past = body.slice(max(0, start - _PAST_FRAMES), start).joint_positions().float()
-    seen = state if state is not None and since >= start else replay(density, features, state, since=since)
-    return CommittedFrames(seen, place, features, past)
+    advanced = state if state is not None and since >= start else replay(density, features, state, since=since)
+    return CommittedFrames(advanced, ground_pose, features, past)
 
 
 def insert_rollout(
     body: Motion,
     contact_logits: Float[Tensor, "frames 2"],
     window: SolvedWindow,
-    place: GroundPose,
+    ground_pose: GroundPose,
     gap: tuple[int, int],
     *,
     tempo: float = 1.0,
 ) -> tuple[Motion, Float[Tensor, "frames 2"], float]:
-    """Insert a rollout in its gap, moved so that it arrives at the frame after it, if there is one; also returns the
-    contact logits, and by how much it had missed that frame, mean distance of the joints, metres.
+    """Insert a rollout in its gap, corrected so that it arrives at the frame after it, if there is one; also return the
+    contact logits, and the error at that frame before the correction, mean distance of the joints, metres.
     """
     start, stop = gap
-    made = decode(window.trial.features[0], GroundPose(place.position_xz.double(), place.heading.double()))
+    made = decode(window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double()))
     count, missed = stop - start, 0.0
     made, planted = _warp_time(made, window.trial.contacts[0], max(1, round(count * tempo)), count)
     share = torch.sin(0.5 * torch.pi * torch.arange(1, count + 1) / (count + 1)).square()[:, None].double()
@@ -76,12 +76,12 @@ def insert_rollout(
         missed = float((there.joint_positions() - here.joint_positions()).norm(dim=-1).mean())
         root[start:stop] += share * (root[stop] - made.root_position[count])
         turn = rotations.multiply(rotations.inverse(made.local_quat_xyzw[count]), quats[stop])
-        turned = rotations.from_rotation_vector(share[..., None] * rotations.to_rotation_vector(turn))
-        quats[start:stop] = rotations.multiply(quats[start:stop], turned)
-    put = torch.zeros(len(root), dtype=torch.bool)
-    put[start:stop] = True
-    root = blend_seams_in_positions(root, put, fps=PRIOR_FPS)
-    quats = blend_seams_in_rotations(quats, put[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
+        correction = rotations.from_rotation_vector(share[..., None] * rotations.to_rotation_vector(turn))
+        quats[start:stop] = rotations.multiply(quats[start:stop], correction)
+    new = torch.zeros(len(root), dtype=torch.bool)
+    new[start:stop] = True
+    root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
+    quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
     logits[start:stop] = _ROLLOUT_CONTACT_LOGIT * (2 * planted[:count].to(logits) - 1)
     return replace(body, root_position=root, local_quat_xyzw=quats), logits, missed
 
@@ -89,7 +89,7 @@ def insert_rollout(
 def _warp_time(
     made: Motion, planted: Bool[Tensor, "rolled 2"], own: int, count: int
 ) -> tuple[Motion, Bool[Tensor, "frames 2"]]:
-    """Resample what took `own` frames, from the frame before to the one after them, to `count`, and drop the rest."""
+    """Resample a motion of `own` frames, from the frame before to the one after them, to `count`; drop the rest."""
     if own == count:
         return made, planted
     last = min(len(made.root_position) - 1, own)

@@ -1,8 +1,8 @@
-"""Rollouts of a density through the gaps of a motion, steered to arrive where it goes on: a different proposal for each
-draw (Wang et al. 2019, Eq. 14-19, with what comes after a gap as the wish).
+"""Rollouts of a density through the gaps of a motion, steered to its next known frames: a different proposal for each
+sample (Wang et al. 2019, Eq. 14-19, with the frames after a gap as the target).
 
-A swarm searches noise of the root that leads to the next known frames; L-BFGS over all noise then goes there. What is
-still missed is spread over the gap.
+A swarm searches latent noise of the root that leads to the next known frames, then L-BFGS all latent noise. The error
+that is left at arrival is distributed over the gap.
 """
 
 from collections.abc import Sequence
@@ -34,35 +34,35 @@ from mapctl.terms import FootContact, Keyframe, LatentPrior
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How gaps are rolled through."""
+    """Settings of rollouts through gaps."""
 
     temperature: float = 0.5
-    """Standard deviation of the noise that a rollout starts from: what makes one differ from the next."""
+    """Standard deviation of a rollout's initial noise: the difference between samples."""
     slow: float = 3.0
-    """Frames (sigma) over which that noise is smoothed, at the same deviation: others do the same differently, they
-    do not tremble differently."""
+    """Frames (sigma) over which that noise is smoothed, at the same deviation: samples then differ in motion, not in
+    jitter."""
     sigma_noise: float = 2.0
-    """Of the noise prior while steering: above 1 leaves more of what was drawn."""
+    """Sigma of the latent prior while steering: above 1 leaves more of the initial noise."""
     sigma_arrival: float = 0.03
-    """Distance of every joint from the known frame at which a rollout arrives, metres."""
+    """Sigma of the distance of every joint from the known frames at which a rollout arrives, metres."""
     ahead: int = 15
-    """Frames after a gap that are rolled with it, so that it arrives as those known among them ask."""
+    """Frames after a gap that are rolled with it, of which the known ones are targets too."""
     footing: FootContact = field(
         default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05)
     )
-    """Planted feet."""
+    """Contact term."""
     shortest: int = 2
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
     trajectory: float | None = None
-    """Distance of the hips from the proposal's trajectory, metres, as a sigma; None leaves them where they go."""
+    """Sigma of the distance of the hips from the proposal's trajectory, metres; None leaves the trajectory free."""
     stage: int = 0
-    """Frames after which a longer rollout is solved first, then after twice as many, and so on, each from where the one
-    before it ended: from nothing, what is far ahead hardly turns a body. 0 solves all at once."""
+    """Frames that are solved first, then twice as many, and so on, each warm-started by the stage before: without that,
+    targets far ahead hardly turn the body. 0 solves all at once."""
     tempo: float = 1.0
-    """How much longer than the gap a rollout is before its time is brought to the gap's: below 1, it is slowed down.
-    A step that would end too early or too late ends in time."""
+    """Ratio of the rollout's length to the gap's before its time is warped to the gap's: below 1, it is slowed down.
+    Steps that would end too early or too late then end in time."""
     longest: int = 180
-    """Frames that are rolled at a time; what is longer is left to the given proposal."""
+    """Frames of the longest gap that is rolled through; longer ones are left to the fallback."""
     method: LatentNoiseSolver = field(
         default_factory=lambda: LatentNoiseSolver(
             rounds=2,
@@ -71,38 +71,38 @@ class RolloutSettings:
             proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
         )
     )
-    """The swarm and the search after it."""
+    """Solver: the swarm and the search after it."""
 
     @property
     def span(self) -> str:
-        """The gaps that are rolled through, in words: seconds from key to key."""
+        """Range of gaps that are rolled through, in words: seconds from key to key."""
         return f"{(self.shortest + 1) / PRIOR_FPS:.2g} to {(self.longest + 1) / PRIOR_FPS:.2g} s"
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutInbetweener(Inbetweener):
-    """Rolls the density under which the fallback's proposal is likeliest through gaps of which nothing is known."""
+    """In-betweener that rolls the density under which the fallback's proposal is likeliest through unknown gaps."""
 
     densities: Sequence[Density]
     """Densities to choose from, at least one."""
     fallback: Inbetweener
     """Proposes what is not rolled through, and what comes before and after."""
     settings: RolloutSettings = field(default_factory=RolloutSettings)
-    """How gaps are rolled through."""
+    """Settings of the rollouts."""
 
     @property
     def rough(self) -> Inbetweener:
-        """The fallback's, before anything is rolled."""
+        """Rough in-betweener of the fallback."""
         return self.fallback.rough
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose a different motion for each draw; gaps too short or too long are left to the fallback."""
+        """Propose a different motion for each sample; gaps too short or too long are left to the fallback."""
         base = self.fallback.propose(query, generator=generator)
         roller, others = Roller.of(query, base, self.densities), list(base.others)
-        draws, settings = generator or torch.Generator().manual_seed(0), self.settings
+        generator, settings = generator or torch.Generator().manual_seed(0), self.settings
         for start, stop in query.enclosed_gaps:
             if settings.shortest <= stop - start <= settings.longest:
-                roller.accept_rollout(roller.roll(start, stop, draws, settings))
+                roller.accept_rollout(roller.roll(start, stop, generator, settings))
                 others.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
             else:
                 others.append(GapSource(start, stop, base.source, f"rollouts take {settings.span}"))
@@ -120,15 +120,15 @@ class Rollout:
     contact_logits: Float[Tensor, "frames 2"]
     """Contact logits of the left and the right toe."""
     missed: float
-    """Mean distance of the joints from where they were to arrive, before that was spread over the gap, metres."""
+    """Error at arrival before its correction, mean distance of the joints, metres."""
 
 
 @dataclass(eq=False)
 class Roller:
-    """Rolls a density through gaps, one after the other in time; what is put into one is what the next goes on from."""
+    """Roller of a density through gaps, one after the other in time, each from the accepted ones before it."""
 
     query: GapQuery
-    """What is known and wanted."""
+    """Query with the known values and the targets."""
     body: Motion
     """All frames so far, at unit size."""
     contact_logits: Float[Tensor, "frames 2"]
@@ -138,7 +138,7 @@ class Roller:
     state: DensityState | None = None
     """The density's state after `done` frames."""
     done: int = 0
-    """Frames that the state has seen."""
+    """Number of frames that the state includes."""
 
     @staticmethod
     def of(query: GapQuery, proposal: Proposal, densities: Sequence[Density]) -> "Roller":
@@ -152,7 +152,7 @@ class Roller:
         return self.query.to_character(self.body)
 
     def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
-        """Roll through frames start to stop; changes nothing but what the density has seen before them."""
+        """Roll through frames start to stop; only the density's state is advanced."""
         committed = commit_before(self.body, self.contact_logits, start, self.density, self.state, since=self.done)
         assert not isinstance(committed.state, tuple)
         self.state, self.done = committed.state, start
@@ -169,11 +169,11 @@ class Roller:
         return Rollout(start, self._hold_planted(body, logits, start, stop), logits, missed)
 
     def accept_rollout(self, rollout: Rollout) -> None:
-        """Go on from this rollout."""
+        """Accept a rollout, from which later ones go on."""
         self.body, self.contact_logits = rollout.body, rollout.contact_logits
 
     def _hold_planted(self, body: Motion, logits: Float[Tensor, "frames 2"], start: int, stop: int) -> Motion:
-        """Hold toes where they stand in the gap: arriving where it must has moved them."""
+        """Hold planted toes in the gap, which the correction at arrival has moved."""
         planted, free = contacts.debounced(logits > 0), torch.zeros(len(logits), dtype=torch.bool)
         free[start:stop] = True
         held = hold_planted(body, planted, free=free, rest_height=estimate_rest_height(body, planted))
@@ -181,7 +181,7 @@ class Roller:
         return replace(body, local_quat_xyzw=quats)
 
     def _build_trajectory_target(self, start: int, stop: int, frames: int, settings: RolloutSettings) -> Keyframe:
-        """Build the target of the hips in the gap: where the proposal has them, in the rollout's own time."""
+        """Build the target of the hips in the gap: the proposal's trajectory, in the rollout's own time."""
         count = stop - start
         own = max(1, round(count * settings.tempo))
         at = (torch.arange(own) + 1) * (count + 1) / (own + 1) - 1
@@ -192,7 +192,7 @@ class Roller:
         return Keyframe(goals, asked, settings.trajectory or 1.0, name="trajectory")
 
     def _build_arrival_target(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
-        """Build the target of all joints in the known frames after the gap, and of effectors on the way, in the
+        """Build the target of all joints in the known frames after the gap, and of effectors within it, in the
         rollout's own time.
         """
         count = stop - start
@@ -200,20 +200,20 @@ class Roller:
         part = slice(start, stop + settings.ahead)
         known = ~self.query.nothing_known[part]
         last = int(known.nonzero()[-1]) + 1
-        places, known = self.body.joint_positions()[part][:last], known[:last]
+        positions, known = self.body.joint_positions()[part][:last], known[:last]
         wanted = known[:, None].expand(-1, CANONICAL.num_joints)
         if (targets := self.query.effector_targets) is not None:
             own_targets = targets.wanted[part][:last]
-            places = torch.where(own_targets[..., None], targets.places[part][:last] / self.query.scale, places)
+            positions = torch.where(own_targets[..., None], targets.places[part][:last] / self.query.scale, positions)
             wanted = wanted | own_targets
         if own == count:
-            return Keyframe(places.float(), wanted, settings.sigma_arrival)
+            return Keyframe(positions.float(), wanted, settings.sigma_arrival)
         frames, joints = own + last - count, CANONICAL.num_joints
         goals, asked = torch.zeros(frames, joints, 3), torch.zeros(frames, joints, dtype=torch.bool)
-        goals[own:], asked[own:] = places[count:].float(), wanted[count:]
+        goals[own:], asked[own:] = positions[count:].float(), wanted[count:]
         for frame in wanted[:count].any(dim=1).nonzero()[:, 0].tolist():
             at = min(own - 1, round((frame + 1) * (own + 1) / (count + 1)) - 1)
-            goals[at], asked[at] = places[frame].float(), wanted[frame]
+            goals[at], asked[at] = positions[frame].float(), wanted[frame]
         return Keyframe(goals, asked, settings.sigma_arrival)
 
 

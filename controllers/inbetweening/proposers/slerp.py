@@ -8,7 +8,7 @@ from mapctl.protocols import Inbetweener
 
 
 class SlerpInbetweener(Inbetweener):
-    """Proposes the interpolation that the query shows; beyond the first and the last known frame poses are held."""
+    """In-betweener that proposes the query's interpolation; before and after all known frames poses are held."""
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the query's own motion, with contacts where its toes are low and slow."""

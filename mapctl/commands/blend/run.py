@@ -1,4 +1,4 @@
-"""`mapctl blend`: a hand or foot of one clip does for a while what it does in another."""
+"""`mapctl blend`: a hand or foot of one clip moves as in another for some frames."""
 
 import priors
 from controllers.inbetweening.blend import LimbTransfer, blend
@@ -10,15 +10,15 @@ from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
 
 
 def run(command: Blend) -> int:
-    """Check everything, blend, write, tell."""
+    """Check everything, blend, write, report."""
     results.check_destinations(command.out, command.video, given=(command.source, command.other))
     rig = inputs.read_rig(command.rig)
     motion, other = inputs.read_motion(command.source, rig), inputs.read_motion(command.other, None)
     start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
     names = tuple(name.strip() for name in command.joints.split(","))
-    borrowed = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
+    transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
     settings = InfillSettings(finish=not command.no_finish)
-    done = blend(motion, other, borrowed, priors.load_infiller(command.infiller), settings=settings, rig=rig)
+    done = blend(motion, other, transfer, priors.load_infiller(command.infiller), settings=settings, rig=rig)
     formats.save(done.motion, command.out)
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:

@@ -20,15 +20,15 @@ class Chain(Command):
     out: options.OutFile
     """Where the motion goes, at 30 frames a second."""
     piece: options.Count = 40
-    """Frames that are taken from the middle of every clip."""
+    """Frames of a piece, from the middle of every clip."""
     gap: Annotated[str, arg(metavar="A:B")] = "50:100"
-    """Frames between two pieces: drawn from A to B."""
+    """Frames between two pieces: sampled from A to B."""
     seed: options.Count = 0
-    """Of the gaps' lengths."""
+    """Seed of the gaps' lengths and of what rollouts sample."""
     method: options.Method = "auto"
     """Who proposes, as in `mapctl infill`."""
     no_finish: bool = False
-    """Leave the proposal as it is, on rigid bones: no MAP stage puts the feet down."""
+    """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
     infiller: options.MaybeName = None
     """The file or run folder of a trained infiller; the bundled one if not given."""
     video: options.MaybeFile = None

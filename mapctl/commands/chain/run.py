@@ -15,7 +15,7 @@ from scenes.film import film
 
 
 def run(command: Chain) -> int:
-    """Check everything, chain, write, tell."""
+    """Check everything, chain, write, report."""
     options.check_seed(command.seed)
     results.check_method(command.method, finish=not command.no_finish, infiller=command.infiller)
     results.check_destinations(command.out, command.video, given=command.clips)

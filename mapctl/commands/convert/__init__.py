@@ -23,11 +23,11 @@ class Convert(Command):
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
     rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted, on which the
-    character stands on its floor with planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
+    character has its floor and planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
     get the bones of the canonical body."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     fps: Annotated[str | None, arg(metavar="F")] = None
     """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
     fps_in: Annotated[str | None, arg(metavar="F")] = None
-    """Frames per second of an .amc, which does not say; 120 unless given."""
+    """Frames per second of an .amc, which are not in the file; 120 unless given."""

@@ -12,7 +12,7 @@ from mapctl.retarget.rigs import Rig
 
 
 def run(command: Convert) -> int:
-    """Read, change, write."""
+    """Read, convert, write."""
     formats.check_ending(command.out)
     outputs.check_files([command.out])
     fps = None if command.fps is None else parse_fps(command.fps)
@@ -20,8 +20,8 @@ def run(command: Convert) -> int:
     fps_in = None if command.fps_in is None else parse_fps(command.fps_in)
     motion, notes = inputs.read_motion(command.source, source_rig, fps=fps_in), ()
     if command.rig is not None:
-        carried = transfer_to_rig(motion, command.rig, source_rig)
-        motion, notes = carried.motion, carried.notes
+        retargeted = transfer_to_rig(motion, command.rig, source_rig)
+        motion, notes = retargeted.motion, retargeted.notes
     if fps is not None:
         motion = motion.resample(fps)
     formats.save(motion, command.out)
@@ -33,7 +33,7 @@ def run(command: Convert) -> int:
 
 
 def parse_fps(text: str) -> Fraction:
-    """A frame rate in any of the usual spellings; RequestError for what is none or beyond 1000."""
+    """Parse a frame rate as a number or a fraction; RequestError for what is none or beyond 1000."""
     try:
         fps = Fraction(text)
     except (ValueError, ZeroDivisionError):
@@ -44,14 +44,14 @@ def parse_fps(text: str) -> Fraction:
 
 
 def transfer_to_rig(motion: Motion, rig: str, source_rig: Rig | None = None) -> RetargetedMotion:
-    """The motion on the canonical joints, on a clip's skeleton in that clip's layout, or on a rig that is told; and
-    what could not be kept.
+    """Retarget a motion to the canonical joints, to a clip's skeleton in that clip's layout, or to a named rig; and
+    note what could not be kept.
 
-    RequestError for rigs that are not known. A clip of the same skeleton stays as it is; others stand on their floor
+    RequestError for rigs that are not known. A clip of the same skeleton stays as it is; others get their floor
     (see mapctl.retarget.carry).
     """
     if rig == "canonical":
         return RetargetedMotion(retarget.to_canonical(motion, source_rig)[0])
     body = RiggedCharacter.of(*inputs.read_rig_clip(rig))[1]
-    carried = retarget_motion(motion, body, source_rig)
-    return RetargetedMotion(body.on_rig(carried.motion), carried.notes)
+    retargeted = retarget_motion(motion, body, source_rig)
+    return RetargetedMotion(body.on_rig(retargeted.motion), retargeted.notes)

@@ -12,10 +12,10 @@ class Demo(Command):
     """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report."""
 
     out: options.OutFolder = Path("demo-out")
-    """Folder for figure8.bvh, .mp4, .png and .json; made if it is not there."""
+    """Folder for figure8.bvh, .mp4, .png and .json; made if it does not exist."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
-    """Of everything random."""
+    """Seed of everything random."""
     quiet: bool = False
     """No summary and no progress bar."""

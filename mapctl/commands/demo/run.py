@@ -16,9 +16,9 @@ _SIZE = (960, 540)
 
 
 def run(command: Demo) -> int:
-    """Walk, write, film, tell. Without OpenGL the film shows stick figures and says what is missing.
+    """Walk, write, film, report. Without OpenGL the film shows stick figures and says what is missing.
 
-    Ctrl-C ends the walk; what there is of it is written, without a film.
+    Ctrl-C ends the walk; the motion so far is written, without a film.
     """
     options.check_seed(command.seed)
     outputs.check_folder(command.out)

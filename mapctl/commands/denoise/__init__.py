@@ -1,4 +1,4 @@
-"""`mapctl denoise`: a noisy capture comes back clean, on its own rig."""
+"""`mapctl denoise`: a noisy capture is denoised, on its own rig."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from mapctl.commands.shared.command import Command
 
 @dataclass(frozen=True)
 class Denoise(Command):
-    """A noisy, sliding, gappy capture of any known rig comes back clean: same skeleton, names, frames and rate."""
+    """Denoise a capture with noise, sliding and gaps, of any known rig: same skeleton, names, frames and rate."""
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
     """A motion file; or a folder, every motion below it."""
@@ -21,17 +21,16 @@ class Denoise(Command):
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     mask: options.MaybeFile = None
-    """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is not to be
-    believed. `*` stands for everything, `root position` for where it is. What is nan in IN is not believed either."""
+    """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
+    `*` is everything, `root position` the body's position. What is nan in IN is missing too."""
     sigma_deg: options.MaybeNumber = None
-    """Noise of every joint's angles, degrees; told from the capture, joint by joint, if not given."""
+    """Noise of every joint's angles, degrees; estimated from the capture, joint by joint, if not given."""
     sigma_cm: options.MaybeNumber = None
-    """Noise of the place of the hips, centimetres; told from the capture if not given."""
+    """Noise of the position of the hips, centimetres; estimated from the capture if not given."""
     anchor: bool = False
-    """Let the body go where its planted feet say, for captures in which it drifts against them. The way over the
-    ground changes."""
+    """Correct the trajectory so that planted feet do not travel, for captures in which the body drifts against them."""
     causal: bool = False
-    """As a live capture would be cleaned: a frame is decided at most `--delay` after it came."""
+    """Denoise as for live capture: a frame is decided at most `--delay` after it arrives."""
     delay: options.MaybeNumber = None
     """Seconds within which --causal decides a frame, at any frame rate, but for the compute; 0.2 if not given."""
     denoiser: options.Name = "denoiser"
@@ -46,13 +45,13 @@ class Denoise(Command):
     video: options.MaybeFile = None
     """Film of the capture and the result side by side: .mp4, .gif or .png."""
     jobs: options.Count = 1
-    """Of a folder: how many files at once, each in a process of its own."""
+    """For a folder: number of files at once, each in a process of its own."""
     cluster: Annotated[str | None, arg(metavar="local|ADDRESS")] = None
-    """Of a folder: over a ray cluster instead; `local` starts one on this machine with --jobs workers."""
+    """For a folder: use a ray cluster instead; `local` starts one on this machine with --jobs workers."""
     again: bool = False
-    """Of a folder: do files again whose result is there already."""
+    """For a folder: denoise files again whose result exists already."""
     strict: bool = False
-    """Exit with status 3 where not all that was asked holds: the network was out of its depth for more than half of the
-    frames."""
+    """Exit with status 3 where not all that was requested holds: the network was out of its depth for more than half of
+    the frames."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -1,4 +1,4 @@
-"""`mapctl denoise`: a noisy capture comes back clean, on its own rig."""
+"""`mapctl denoise`: a noisy capture is denoised, on its own rig."""
 
 import priors
 from controllers.denoising.causal import denoise_causal
@@ -13,12 +13,12 @@ from mapctl.recording.masks import load_masks
 from scenes.plots.denoising import plot
 
 _MAX_NAMED = 6
-_LOW_WEIGHT = 0.5  # of a density's weight
+_LOW_WEIGHT = 0.5  # weight of a density below which a window is listed
 _DEFAULT_DELAY = 0.2  # seconds
 
 
 def run(command: Denoise) -> int:
-    """Check everything, denoise, write, tell."""
+    """Check everything, denoise, write, report."""
     if command.source.is_dir():
         return folder.run(command, read_settings(command))
     _check(command)
@@ -42,11 +42,11 @@ def _check(command: Denoise) -> None:
 
 def _run_denoising(command: Denoise) -> DenoiseSolution:
     settings, rig = read_settings(command), inputs.read_rig(command.rig)
-    told = () if command.mask is None else load_masks(command.mask)
+    named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
-    motion, lost, _ = inputs.read_motion_with_gaps(command.source, rig)
-    masks = (*told, *lost)
+    motion, missing_masks, _ = inputs.read_motion_with_gaps(command.source, rig)
+    masks = (*named_masks, *missing_masks)
     with show_progress("denoising", quiet=command.quiet) as progress:
         if command.causal:
             delay = _DEFAULT_DELAY if command.delay is None else command.delay
@@ -59,7 +59,7 @@ def _run_denoising(command: Denoise) -> DenoiseSolution:
 
 
 def read_settings(command: Denoise) -> DenoiseSettings:
-    """What is known of the capture; RequestError for numbers that make no sense."""
+    """Read the settings from the options; RequestError for numbers that make no sense."""
     if command.causal and command.prior is not None:
         raise RequestError("--causal has no time for a density; leave --prior out")
     if command.delay is not None and not command.causal:
@@ -86,7 +86,7 @@ def _tell(command: Denoise, done: DenoiseSolution) -> None:
 
 
 def format_faults(done: DenoiseSolution) -> list[str]:
-    """The faults in a few lines, a line a kind."""
+    """Format the artefacts, a line for each kind."""
     kinds: dict[str, dict[str, list]] = {}
     for fault in done.faults:
         kinds.setdefault(fault.kind, {}).setdefault(fault.joint, []).append(fault)
@@ -105,7 +105,7 @@ def format_faults(done: DenoiseSolution) -> list[str]:
 
 
 def format_densities(done: DenoiseSolution) -> list[str]:
-    """Which densities counted, how likely the motion is under each, and where they were out of their depth."""
+    """Format which densities counted, the likelihood under each, and where they were out of their depth."""
     if not done.density_intervals:
         return []
     frames = {name: 0 for name in done.density_intervals[0].nats}
@@ -115,14 +115,16 @@ def format_densities(done: DenoiseSolution) -> list[str]:
         for name, nats in part.nats.items():
             totals[name] += nats * (part.stop - part.start)
     whole = sum(frames.values())
-    told = ", ".join(f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames)
-    lines = [f"prior: {told} of {whole} frames"]
-    doubted = [part for part in done.density_intervals if part.weight < _LOW_WEIGHT]
-    if doubted:
-        places = ", ".join(f"{part.start}:{part.stop}" for part in doubted[:_MAX_NAMED])
-        rest = len(doubted) - _MAX_NAMED
+    nats_by_density = ", ".join(
+        f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames
+    )
+    lines = [f"prior: {nats_by_density} of {whole} frames"]
+    low_weights = [part for part in done.density_intervals if part.weight < _LOW_WEIGHT]
+    if low_weights:
+        intervals = ", ".join(f"{part.start}:{part.stop}" for part in low_weights[:_MAX_NAMED])
+        rest = len(low_weights) - _MAX_NAMED
         lines.append(
-            f"prior out of its depth, so that it counts for less than half: frames {places}"
+            f"prior out of its depth, so that it counts for less than half: frames {intervals}"
             + (f" and {rest} more windows" if rest > 0 else "")
         )
     return lines

@@ -18,27 +18,27 @@ class FollowCurve(Command):
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     speed: options.Speed = "1.2"
-    """Along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m."""
+    """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m."""
     seconds: options.MaybeNumber = None
-    """How long to walk; once along the curve if not given."""
+    """Duration of the walk; once along the curve if not given."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
-    """Of everything random: the same seed gives the same file."""
+    """Seed of everything random: the same seed gives the same file."""
     rig: options.OutRig = "canonical"
-    """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
     camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None
-    """Of the film; follow if not given."""
+    """Camera of the film; follow if not given."""
     size: options.MaybeSize = None
-    """Of the film's pictures, pixels; 1280x720 if not given."""
+    """Width and height of the film, pixels; 1280x720 if not given."""
     report: options.MaybeFile = None
     """JSON with the request, status, ledger, measures and timing."""
     metres_per_unit: options.MaybeNumber = None
     """Scale of a CSV or SVG file; 1 for a CSV and 0.01 for an SVG if not given."""
     strict: bool = False
-    """Exit with status 3 where not all that was asked holds."""
+    """Exit with status 3 where not all that was requested holds."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -17,12 +17,12 @@ _SIZE = "1280x720"
 
 
 def run(command: FollowCurve) -> int:
-    """Check everything, solve, write, tell. Ctrl-C ends the solve; what it has is written, without a film."""
+    """Check everything, solve, write, report. Ctrl-C ends the solve; the motion so far is written, without a film."""
     _check(command)
     request = parse_follow(inputs.read_curve(command.curve, command.metres_per_unit), command.speed, command.seconds)
-    person, prior = read_character(command.rig), priors.load(command.prior)
+    character, prior = read_character(command.rig), priors.load(command.prior)
     with show_progress("walking", quiet=command.quiet) as progress:
-        done = walk(prior, request, seed=command.seed, progress=progress, person=person)
+        done = walk(prior, request, seed=command.seed, progress=progress, character=character)
     video = None if done.interrupted else command.video
     _write(command, done, video)
     if not command.quiet:

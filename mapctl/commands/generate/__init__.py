@@ -1,4 +1,4 @@
-"""`mapctl generate`: motion drawn from a prior, of any length."""
+"""`mapctl generate`: motion sampled from a prior, of any length."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,34 +11,35 @@ from mapctl.commands.shared.command import Command
 
 @dataclass(frozen=True)
 class Generate(Command):
-    """Motion drawn from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
+    """Motion sampled from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
 
     out: options.OutFolder
-    """Folder for the clips; made if it is not there."""
+    """Folder for the clips; made if it does not exist."""
     seconds: options.Number
     """Length of each clip."""
     count: options.Count = 1
-    """How many clips."""
+    """Number of clips."""
     seed: options.Count = 0
-    """Of everything random; each clip draws its own seed from it. Their starts are spread over the data's speeds."""
+    """Seed of everything random; each clip gets its own seed from it. Initial states are stratified over the data's
+    speeds."""
     temperature: options.Number = 1.0
-    """Spread of the draws, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
+    """Temperature of the samples, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
     start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
-    """A clip (.bvh, .npz, .amc) to go on from, or the number of a start of the prior for all; drawn if not given."""
+    """A clip (.bvh, .npz, .amc) to go on from, or the index of an initial state for all; sampled if not given."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """Gait and style by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior to itself.
-    If not given, motion goes on as the clip does that it begins from."""
+    """Gait and style by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
+    unconditioned. If not given, those of the clip that it begins from."""
     refiner: options.Name = "auto"
-    """A bundled refiner, or the file or run folder of a trained one, to go before the footing pass. auto: the prior's
-    own where there is no footing pass, and none before one, which measures better alone."""
+    """A bundled refiner, or the file or run folder of a trained one, before the foot clean-up. auto: the prior's own
+    where there is no foot clean-up, and none before one, which measures better alone."""
     no_footing: bool = False
-    """Leave out the pass that makes planted feet stand: many times faster, with the refiner's feet."""
+    """Leave out the foot clean-up: many times faster, with the refiner's feet."""
     no_refine: bool = False
-    """Leave the draws as they are: no refiner, and no pass that makes planted feet stand."""
+    """Leave the samples as they are: no refiner, and no foot clean-up."""
     rig: options.OutRig = "canonical"
-    """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     quiet: bool = False
     """No lines on the clips and no progress bar."""

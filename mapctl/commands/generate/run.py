@@ -1,4 +1,4 @@
-"""`mapctl generate`: motion drawn from a prior, of any length."""
+"""`mapctl generate`: motion sampled from a prior, of any length."""
 
 import time
 from collections.abc import Iterable
@@ -31,19 +31,21 @@ def run(command: Generate) -> int:
     prior = priors.load(command.prior)
     if command.style not in (None, "none"):
         prior = prior.conditioned_on([name.strip() for name in command.style.split(",")])
-    wanted = command.refiner != "auto" or (command.no_footing and not command.no_refine)
-    refiner = priors.refiner_of(command.prior, command.refiner) if wanted else None
-    person = read_character(command.rig)
+    use_refiner = command.refiner != "auto" or (command.no_footing and not command.no_refine)
+    refiner = priors.refiner_of(command.prior, command.refiner) if use_refiner else None
+    character = read_character(command.rig)
     if settings.foot_cleanup is not None:
-        footing = replace(settings.foot_cleanup.footing, rest_height=person.toe_rest_height)
+        footing = replace(settings.foot_cleanup.footing, rest_height=character.toe_rest_height)
         settings = replace(settings, foot_cleanup=replace(settings.foot_cleanup, footing=footing))
-    draw = partial(stream, prior, seconds=command.seconds, start_clip=clip, refiner=refiner, skeleton=person.skeleton)
+    draw = partial(
+        stream, prior, seconds=command.seconds, start_clip=clip, refiner=refiner, skeleton=character.skeleton
+    )
     starts = sample_stratified_starts(prior, command.count, torch.Generator().manual_seed(command.seed))
     with outputs.make_folder(command.out) as folder, explain_progress(command.count, "clips") as finished:
         for number, seed in enumerate(_sample_seeds(command)):
             own = settings if settings.start is not None else replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
-            motions = (person.on_rig(piece.motion) for piece in pieces)
+            motions = (character.on_rig(piece.motion) for piece in pieces)
             _write(command, motions, folder / f"generated_{number:03d}.bvh", frames)
             finished(number + 1)
     return 0
@@ -68,9 +70,9 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
 
 
 def _sample_seeds(command: Generate) -> list[int]:
-    """One for each clip; the first clips are the same however many are asked for."""
-    draws = torch.Generator().manual_seed(command.seed)
-    return torch.randint(2**62, (command.count,), generator=draws).tolist()
+    """Sample a seed for each clip; the first ones do not depend on the count."""
+    generator = torch.Generator().manual_seed(command.seed)
+    return torch.randint(2**62, (command.count,), generator=generator).tolist()
 
 
 def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:

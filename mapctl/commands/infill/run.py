@@ -1,4 +1,4 @@
-"""`mapctl infill`: gaps and lost joints of a motion are filled in."""
+"""`mapctl infill`: missing frames and joints of a motion are filled in."""
 
 from collections.abc import Sequence
 
@@ -19,11 +19,11 @@ from mapctl.retarget.rigs import Rig
 
 
 def run(command: Infill) -> int:
-    """Check everything, fill, write, tell."""
+    """Check everything, fill, write, report."""
     _check(command)
     rig = inputs.read_rig(command.rig)
-    motion, marked, holed = inputs.read_motion_with_gaps(command.source, rig)
-    masks = (*marked, *_parse_masks(command, motion)) or (() if holed else find_gaps(motion))
+    motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig)
+    masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps else find_gaps(motion))
     done = _run_infilling(command, motion, masks, rig)
     formats.save(done.motion, command.out)
     if command.report is not None:
@@ -43,7 +43,7 @@ def _check(command: Infill) -> None:
 
 
 def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
-    """What is lost by the options; RequestError for what cannot be."""
+    """Parse the masks of the options; RequestError for impossible ones."""
     if not command.gap and command.joints is None:
         return ()
     gaps = parse_ranges(command.gap, fps=float(motion.fps), frames=motion.num_frames) or [(0, motion.num_frames)]
@@ -59,7 +59,7 @@ def _run_infilling(command: Infill, motion: Motion, masks: Sequence[Mask], rig: 
         settings=InfillSettings(finish=not command.no_finish),
         densities=priors.load_choice(command.prior),
         rig=rig,
-        course=None if command.curve is None else inputs.read_curve(command.curve, None),
+        curve=None if command.curve is None else inputs.read_curve(command.curve, None),
         generator=torch.Generator().manual_seed(command.seed),
     )
 

@@ -17,7 +17,7 @@ class Info(Command):
 
     name: Positional[Annotated[str | None, arg(metavar="NAME|CLIP")]] = None
     """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip (.bvh, .npz), of which
-    rig, joints, unit, axes and length are told."""
+    rig, joints, unit, axes and length are printed."""
     rig: options.MaybeRig = None
     """The clip's rig, where it is not the one that would be recognised."""
     json: bool = False

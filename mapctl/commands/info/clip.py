@@ -1,4 +1,4 @@
-"""What `mapctl info CLIP` tells: the clip's rig and joints, its unit and axes, its length."""
+"""`mapctl info CLIP`: the clip's rig and joints, its unit and axes, its length."""
 
 from pathlib import Path
 from typing import Any
@@ -13,29 +13,29 @@ _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inc
 
 
 def is_clip(name: str) -> bool:
-    """Whether the name is that of a motion file, by its ending."""
+    """Return whether the name is that of a motion file, by its ending."""
     return Path(name).suffix.lower() in formats.READERS
 
 
 def print_clip(path: Path, rig: str | None, *, as_json: bool) -> None:
-    """Print it; RequestError where the rig cannot be told, naming what is missing."""
-    told = describe_clip(path, rig)
+    """Print a clip's description; RequestError where the rig is not recognised, naming what is missing."""
+    described = describe_clip(path, rig)
     if as_json:
-        print(report.to_json(told), end="")
+        print(report.to_json(described), end="")
         return
-    shown = {key: value for key, value in told.items() if key not in ("joints", "unmapped")}
-    shown["fps"] = f"{told['fps']:.6g}"
-    shown["seconds"] = f"{told['seconds']:.2f}"
-    shown["unit"] = _format_unit(told["metres_per_unit"])
-    shown["up"] = f"+{told['up']}" if len(told["up"]) == 1 else told["up"]
+    shown = {key: value for key, value in described.items() if key not in ("joints", "unmapped")}
+    shown["fps"] = f"{described['fps']:.6g}"
+    shown["seconds"] = f"{described['seconds']:.2f}"
+    shown["unit"] = _format_unit(described["metres_per_unit"])
+    shown["up"] = f"+{described['up']}" if len(described["up"]) == 1 else described["up"]
     del shown["metres_per_unit"]
     print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
-    print_table(["canonical", "joint of the rig"], [[c, own] for c, own in told["joints"].items()])
-    print(f"not canonical ({len(told['unmapped'])}): {', '.join(told['unmapped']) or 'none'}")
+    print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
+    print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")
 
 
 def describe_clip(path: Path, rig_text: str | None) -> dict[str, Any]:
-    """By name, everything about a clip that `mapctl info` tells."""
+    """Describe a clip by name and value, as `mapctl info` prints it."""
     rig = inputs.read_rig(rig_text)
     motion = inputs.read_motion(path, rig)
     rigmap = retarget.to_canonical(motion, rig)[1]

@@ -26,9 +26,8 @@ def run(command: Info) -> int:
     elif command.name is not None:
         print(report.to_json(read_prior_card(command.name)), end="")
     elif command.json:
-        print(
-            report.to_json({"priors": list_priors(), "installation": describe_installation(), "notice": NOTICE}), end=""
-        )
+        found = {"priors": list_priors(), "installation": describe_installation(), "notice": NOTICE}
+        print(report.to_json(found), end="")
     else:
         _print_tables()
     return 0
@@ -46,18 +45,18 @@ def _print_tables() -> None:
 
 
 def read_prior_card(name: str) -> dict[str, Any]:
-    """The whole card of a prior, and where it lies; CheckpointError if there is none."""
+    """Read the whole card of a prior, and its path; CheckpointError if there is none."""
     path = checkpoints.locate(name)
     return {"file": str(path), **vars(checkpoints.read_card(path.with_suffix(".json")))}
 
 
 def list_priors() -> list[dict[str, Any]]:
-    """The bundled priors in short."""
+    """List the bundled priors in short."""
     return [_summarise_prior(name, read_prior_card(name)) for name in checkpoints.list_bundled()]
 
 
 def describe_installation() -> dict[str, Any]:
-    """Versions, scenes, rendering back end, threads and cores."""
+    """Describe versions, scenes, rendering back end, threads and cores."""
     threads = {"threads of a solve": 1, "threads of torch": torch.get_num_threads(), "cores": os.cpu_count()}
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return {
@@ -76,5 +75,5 @@ def _summarise_prior(name: str, whole: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _format_speeds(row: Mapping[str, Any]) -> str:
-    able = row["abilities"]
-    return f"{able['slowest']:.1f} to {able['fastest']:.1f} m/s" if able else "-"
+    limits = row["abilities"]
+    return f"{limits['slowest']:.1f} to {limits['fastest']:.1f} m/s" if limits else "-"

@@ -1,4 +1,4 @@
-"""`mapctl live`: characters in the browser, steered as they go."""
+"""`mapctl live`: characters in the browser, steered live."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -14,10 +14,10 @@ class Live(Command):
     """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
 
     port: Annotated[int, arg(metavar="P")] = 8080
-    """Where the page is served, on 127.0.0.1 only; the next free port if this one is taken."""
+    """Port of the page, on 127.0.0.1 only; the next free port if this one is taken."""
     characters: options.Count = 1
-    """How many, side by side; each computes on a core of its own as long as there are cores."""
+    """Number of characters, side by side; each computes on a core of its own as long as there are cores."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
-    """Of the poses that they begin with."""
+    """Seed of the first poses."""

@@ -1,4 +1,4 @@
-"""`mapctl live`: characters in the browser, steered as they go."""
+"""`mapctl live`: characters in the browser, steered live."""
 
 import functools
 from collections.abc import Sequence
@@ -66,10 +66,12 @@ def _check(command: Live) -> None:
 
 def _start_characters(command: Live) -> Sequence[CharacterProcess]:
     load = functools.partial(priors.load, command.prior)
-    places = [(_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)]
+    positions = [
+        (_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)
+    ]
     found: list[CharacterProcess] = []
     try:
-        for number, at in enumerate(places):
+        for number, at in enumerate(positions):
             found.append(CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), command.seed + number, at)))
         for character in found:
             character.wait()

@@ -24,14 +24,14 @@ class Measure(Command):
     reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
     """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
     curve: options.MaybeCurve = None
-    """What it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
+    """Curve that it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
     speed: options.MaybeNumber = None
-    """Speed it was asked for, m/s: adds the progress along the curve."""
+    """Requested speed, m/s: adds the progress along the curve."""
     metres_per_unit: options.MaybeNumber = None
     """Scale of a CSV or SVG file."""
     prior: options.Name = "locomotion"
-    """Whose card has mocap's values."""
+    """Prior whose card has mocap's values."""
     seed: options.Count = 0
-    """Of the network that tells two folders apart."""
+    """Seed of the classifier of the two folders."""
     json: bool = False
     """Print JSON instead of a table."""

@@ -1,4 +1,4 @@
-"""Folders of clips as sets to compare: read whole, with the files named that will not do."""
+"""Folders of clips as sets to compare: read whole, with the files listed that cannot be used."""
 
 import math
 from dataclasses import dataclass
@@ -18,27 +18,27 @@ from mapctl.metrics.realism.gait import PIECE_SECONDS
 from mapctl.motion import Motion
 
 SETTINGS = realism.RealismSettings()
-"""How folders are told apart."""
+"""Settings of the classifier of two folders."""
 
 
 @dataclass(frozen=True, eq=False)
 class _MeasuredClip:
-    """One file of a folder."""
+    """One measured file of a folder."""
 
     motion: Motion
-    """Comparable."""
+    """Motion made comparable."""
     measures: dict[str, float]
-    """By name."""
+    """Measures by name."""
     positions: Tensor
-    """Canonical joints, (frames, joints, 3); nothing unless read with windows."""
+    """Positions of canonical joints, (frames, joints, 3), metres; empty unless read with windows."""
     windows: Tensor
-    """(windows, frames, channels); likewise."""
+    """Windows, (windows, frames, channels); empty unless read with windows."""
     notes: list[str]
-    """What could not be made comparable."""
+    """Notes on what could not be made comparable."""
 
     @staticmethod
     def read(path: Path, *, with_windows: bool) -> "_MeasuredClip":
-        """MapctlError for what cannot be read, measured or cut."""
+        """Read and measure a file; MapctlError for what cannot be read, measured or cut."""
         motion, notes = make_comparable(formats.load(path))
         measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
         if with_windows:
@@ -52,10 +52,10 @@ class ClipSet:
     """Every clip below a folder, in the order of their paths."""
 
     folder: Path
-    """Where they lie."""
+    """Folder of the clips."""
     motions: list[Motion]
-    """On canonical joints and at 30 frames a second at most, so that sets on different rigs compare (see
-    `metrics.comparing`)."""
+    """Motions on canonical joints and at 30 frames/s at most, so that sets on different rigs compare (see
+    `metrics.comparison`)."""
     means: dict[str, float]
     """Mean of each measure over the clips that can give it."""
     positions: list[Tensor]
@@ -63,9 +63,9 @@ class ClipSet:
     windows: list[Tensor]
     """Windows of each clip, (windows, frames, channels); none unless read with windows."""
     skipped: dict[str, str]
-    """Files that were left out, and why, each a sentence that begins with the file."""
+    """Reasons by file that was left out, each a sentence that begins with the file."""
     notes: tuple[str, ...] = ()
-    """What could not be made comparable, each a sentence."""
+    """Notes on what could not be made comparable."""
 
     @staticmethod
     def read(folder: Path, *, with_windows: bool) -> "ClipSet":
@@ -98,9 +98,9 @@ class ClipSet:
         )
 
     def diversity(self) -> realism.Diversity:
-        """Of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
+        """Measure the diversity of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
 
-        Each clip is seen from its own start, so that sets which did not begin in one place can be compared.
+        Each clip is aligned to its own start, so that sets with different starts can be compared.
         """
         frames = round(PIECE_SECONDS * PRIOR_FPS)
         pieces = [align_to_start(clip)[:frames] for clip in self.positions if len(clip) >= frames]
@@ -110,29 +110,28 @@ class ClipSet:
 
 
 def compare_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Realism:
-    """Ours against the reference; RequestError, which says what is left to do, for too few clips."""
+    """Compare our realism with the reference's; RequestError, which says what is left to do, for too few clips."""
     fewest = SETTINGS.min_clips
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
             raise RequestError(
-                f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in "
-                f"each folder{_describe_skipped(clips)} (without --reference a folder of any size is "
-                "measured)"
+                f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in each folder"
+                f"{_describe_skipped(clips)} (without --reference a folder of any size is measured)"
             )
-    draws = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     with show_progress("telling apart") as progress:
         return realism.measure_window_realism(
-            ours.windows, reference.windows, generator=draws, settings=SETTINGS, progress=progress
+            ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
 
 
 def compare_variability(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, float]]:
-    """By measure ours, the reference's and their ratio: standard deviations of gait, average pairwise distances."""
+    """Compare ours and the reference's by measure: standard deviations of gait, average pairwise distances."""
     sides = []
     for clips in (ours, reference):
         gait = {f"std_of_{name}": spread.std for name, spread in realism.measure_gait_spread(clips.motions).items()}
-        apart = clips.diversity()
-        sides.append(gait | {f"pairwise_distance_{name}": value for name, value in apart._asdict().items()})
+        diversity = clips.diversity()
+        sides.append(gait | {f"pairwise_distance_{name}": value for name, value in diversity._asdict().items()})
     mine, theirs = sides
     return {
         name: {"ours": value, "reference": theirs[name], "ratio": value / theirs[name] if theirs[name] else math.nan}
@@ -146,5 +145,5 @@ def _describe_skipped(clips: ClipSet) -> str:
 
 
 def _average_measures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """NaN, a clip that cannot give a measure, is left out."""
+    """Average each measure over the clips that can give it, which are not NaN."""
     return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in rows[0]}

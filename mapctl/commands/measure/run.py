@@ -91,7 +91,7 @@ def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dic
 
 
 def _print_tables(values: Mapping[str, Any]) -> None:
-    """What there is of measures, realism and spread, each as a table."""
+    """Print measures, and realism and spread where there are any, each as a table."""
     reference, mocap = values["reference"], values["mocap"]
     rows = [
         [name, value, reference.get(name), _format_range(mocap.get(name))] for name, value in values["measures"].items()
@@ -103,21 +103,20 @@ def _print_tables(values: Mapping[str, Any]) -> None:
     if "realism" in values:
         _print_realism(values["realism"])
         rows = [[name, *row.values()] for name, row in values["spread"].items()]
-        print_table(
-            ["spread", "ours", "reference", "ratio"], rows, title="how widely the clips spread (in pieces of 3 s)"
-        )
+        title = "how widely the clips spread (in pieces of 3 s)"
+        print_table(["spread", "ours", "reference", "ratio"], rows, title=title)
     for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
         print(line)
 
 
 def _shorten(lines: Sequence[str]) -> list[str]:
-    """The first of them, and how many more there are."""
+    """Shorten a list of lines to the first ones and the number of the others."""
     more = len(lines) - _MAX_LINES
     return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
 
 
 def _load_comparable(path: Path) -> tuple[Motion, list[str]]:
-    """A clip as mocap's values were measured, and what could not be made so."""
+    """Load a clip as mocap's values were measured, and note what could not be made so."""
     motion, notes = make_comparable(formats.load(path))
     return motion, [f"{path}: {note}" for note in notes]
 
@@ -133,7 +132,7 @@ def _print_realism(realism: Mapping[str, Any]) -> None:
 
 
 def _read_mocap_values(prior: str) -> Mapping[str, Any]:
-    """Mocap's values from the prior's card; none where the prior is not there."""
+    """Read mocap's values from the prior's card; none where there is no such prior."""
     try:
         return report.reference_measures(checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality)
     except CheckpointError:

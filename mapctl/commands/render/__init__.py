@@ -20,9 +20,9 @@ class Render(Command):
     out: options.OutFile
     """.mp4, .gif or .png."""
     curve: options.MaybeCurve = None
-    """Drawn on the ground: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
+    """Curve drawn on the ground: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
     camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
-    """Goes along, stands so that all is seen, or looks from above."""
+    """Camera that follows, is fixed with all in view, or looks from above."""
     size: options.Size = "1280x720"
     """Width and height in pixels."""
     metres_per_unit: options.MaybeNumber = None

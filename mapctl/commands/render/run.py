@@ -10,7 +10,7 @@ from scenes.film import film
 
 
 def run(command: Render) -> int:
-    """Check, film, tell."""
+    """Check, film, report."""
     size = options.parse_size(command.size)
     outputs.check_film(command.out, size)
     curve = None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)

@@ -17,9 +17,9 @@ class RunScene(Command):
     scene: Positional[Annotated[str, arg(metavar="SCENE.toml")]]
     """The scene file, or the name of a scene that comes with mapctl (`mapctl info` lists them)."""
     out: options.OutFolder = Path()
-    """Folder for the scene's outputs; made if it is not there."""
+    """Folder for the scene's outputs; made if it does not exist."""
     rig: options.OutRig = "canonical"
-    """Whose body the actors have: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
+    """Body of the actors: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     strict: bool = False
     """Exit with status 3 where not all that was asked of every actor holds."""

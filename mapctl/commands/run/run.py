@@ -46,14 +46,14 @@ def _walk(
     scene: SceneDescription,
     requests: Sequence[PathRequest],
     prior: LstmGmmDensity,
-    person: Character,
+    character: Character,
 ) -> tuple[list[Walk], bool]:
-    """The walks of the first actors, all of them unless Ctrl-C came, and whether it did."""
+    """Solve the walks of the first actors, of all unless Ctrl-C came, and return whether it did."""
     walks: list[Walk] = []
     for actor, request in zip(scene.actors, requests, strict=True):
         try:
             with show_progress(actor.name, quiet=command.quiet) as progress:
-                walks.append(walk(prior, request, seed=actor.seed, progress=progress, person=person))
+                walks.append(walk(prior, request, seed=actor.seed, progress=progress, character=character))
         except KeyboardInterrupt:
             if not walks:
                 raise
@@ -93,7 +93,7 @@ def _film(command: RunScene, scene: SceneDescription, walks: Sequence[Walk], fil
 
 
 def _report(command: RunScene, scene: SceneDescription, walks: Sequence[Walk]) -> dict[str, Any]:
-    """By actor, the report of each walk that has begun."""
+    """Build the report, by actor of each walk that has begun."""
     request = options.describe_request("run", command) | {"title": scene.title}
     actors = {
         actor.name: done.report(options.describe_request("follow", actor))

@@ -1,4 +1,4 @@
-"""What every sub-command is: options that cost nothing to import, and work that is imported when it is asked for."""
+"""Base of sub-commands: options that are cheap to import, and work that is imported when it runs."""
 
 from importlib import import_module
 from typing import ClassVar
@@ -10,7 +10,7 @@ class Command:
     """Base of the frozen dataclasses of options. A command's package holds them; its module `run` does the work."""
 
     work: ClassVar[str] = ""
-    """The module whose `run` takes the options, where it is not `run` beside them."""
+    """Module whose `run` takes the options, where it is not `run` beside them."""
     single_thread: ClassVar[bool] = True
     """Whether one thread computes. One is fastest: on matrices this small two fight each other."""
 

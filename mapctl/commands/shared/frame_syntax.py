@@ -10,7 +10,7 @@ _FRAME = re.compile(r"(\d{1,9})|(\d{1,9}(?:\.\d{0,9})?|\.\d{1,9})s")
 
 
 def parse_frame(text: str, *, fps: float) -> int:
-    """`45` or `1.5s` as a frame of a motion of that rate; RequestError for anything else."""
+    """Parse `45` or `1.5s` as a frame of a motion of that rate; RequestError for anything else."""
     found = _FRAME.fullmatch(text.strip())
     if found is None:
         raise RequestError(f"a frame is a whole number from 0, or seconds as in 1.5s; got {text!r}")
@@ -18,7 +18,7 @@ def parse_frame(text: str, *, fps: float) -> int:
 
 
 def parse_range(text: str, *, fps: float, frames: int, what: str = "gap") -> tuple[int, int]:
-    """`60:120` or `2s:4s` as first frame and one past the last; RequestError unless they lie within the motion."""
+    """Parse `60:120` or `2s:4s` as first frame and one past the last; RequestError unless they are in the motion."""
     start, colon, stop = text.partition(":")
     if not colon:
         raise RequestError(f"a {what} is A:B, frames or seconds as in 60:120 or 2s:4s; got {text!r}")
@@ -29,7 +29,7 @@ def parse_range(text: str, *, fps: float, frames: int, what: str = "gap") -> tup
 
 
 def parse_ranges(texts: Sequence[str], *, fps: float, frames: int) -> list[tuple[int, int]]:
-    """Several, in the order of time; RequestError for two that overlap."""
+    """Parse several ranges, sorted by time; RequestError for two that overlap."""
     ranges = sorted(parse_range(text, fps=fps, frames=frames) for text in texts)
     for (start, stop), (after, end) in pairwise(ranges):
         if after < stop:

@@ -1,4 +1,4 @@
-"""What options name, read: curves, rigs and motions."""
+"""Readers of what options name: curves, rigs and motions."""
 
 import os
 from fractions import Fraction
@@ -14,11 +14,11 @@ from mapctl.retarget import figure, load_rig
 from mapctl.retarget.rigs import Rig
 
 MAX_FRAMES = 3_600_000
-"""Longest motion asked for in one go: 33 hours at the priors' rate."""
+"""Frames of the longest motion in one call: 33 hours at the priors' rate."""
 
 
 def count_frames(seconds: float) -> int:
-    """Frames of a motion of so many seconds at the priors' rate; RequestError for none or too many."""
+    """Convert seconds to frames at the priors' rate; RequestError for none or too many."""
     if not seconds > 0:
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     if seconds * PRIOR_FPS > MAX_FRAMES:
@@ -27,19 +27,19 @@ def count_frames(seconds: float) -> int:
 
 
 def read_curve(text: str, metres_per_unit: float | None) -> Curve:
-    """The curve of a CURVE option. A file that is not there is said to be so, not taken for a shape."""
+    """Read the curve of a CURVE option. A missing file is reported as such, not taken for a shape."""
     if os.sep in text and not Path(text).exists():
         raise RequestError(f"{text}: no such file")
     return curves.read(text, metres_per_unit=metres_per_unit)
 
 
 def read_rig(text: str | None) -> Rig | None:
-    """The rig of a --rig option: a preset, a TOML file, or that of a clip; None where none is asked for."""
+    """Read the rig of a --rig option: a preset, a TOML file, or that of a clip; None without the option."""
     return None if text is None else load_rig(text)
 
 
 def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
-    """Whose skeleton a --rig option asks for: a clip; or a T-pose on the joints of a preset or a TOML file,
+    """Read the clip whose skeleton a --rig option names: a file; or a T-pose on the joints of a preset or a TOML file,
     and its rig."""
     if Path(text).suffix.lower() in formats.READERS:
         return formats.load(text), None
@@ -48,11 +48,11 @@ def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
 
 
 def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None) -> Motion:
-    """A motion in metres, in the rig's unit where it tells one; `fps` is that of an .amc."""
+    """Read a motion in metres, from the rig's unit where it has one; `fps` is that of an .amc."""
     return formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
 
 
 def read_motion_with_gaps(path: Path, rig: Rig | None) -> tuple[Motion, tuple[Mask, ...], bool]:
-    """The same, of a file that may have NaN where something was lost; masks of what was, and whether it has any."""
+    """Read a motion in which missing values may be NaN; also return their masks, and whether there are any."""
     motion, missing = formats.load_with_missing(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
     return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())

@@ -34,13 +34,13 @@ OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
 
 
 def check_seed(seed: int) -> None:
-    """RequestError unless torch can take the seed."""
+    """Raise RequestError unless torch can take the seed."""
     if not 0 <= seed < 2**63:
         raise RequestError(f"the seed must be a whole number from 0 to 2^63 - 1, got {seed}")
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """`1280x720` as width and height in pixels."""
+    """Parse `1280x720` as width and height in pixels."""
     found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     if found is None:
         raise RequestError(f"the size is WIDTHxHEIGHT in pixels, as 1280x720, got {text!r}")
@@ -48,11 +48,11 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def describe_request(name: str, command: Any) -> dict[str, Any]:
-    """A command and its options as a report shows them."""
+    """Describe a command and its options as a report shows them."""
     values = {field.name: getattr(command, field.name) for field in fields(command)}
     return {"command": name} | {key: str(v) if isinstance(v, Path) else v for key, v in values.items()}
 
 
 def collect_paths(*paths: Path | None) -> list[Path]:
-    """The paths that were asked for."""
+    """Collect the paths that are given."""
     return [path for path in paths if path is not None]

@@ -1,4 +1,4 @@
-"""One walk along a curve with its measures and cost: what follow, run and demo have in common."""
+"""Solved walks along curves with their measures and cost, for follow, run and demo."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,21 +26,21 @@ class Walk:
     """A solved walk."""
 
     request: PathRequest
-    """What was asked for."""
+    """Request for the walk."""
     prior: LstmGmmDensity
-    """What moved the character."""
+    """Density of the character's motion."""
     seed: int
     """Seed of everything random."""
     solution: Solution
-    """What came out."""
-    person: Character | None = None
-    """Who walks, where that is not the canonical body."""
+    """Solution of the request."""
+    character: Character | None = None
+    """Character that walks, where that is not the canonical body."""
 
     @property
     def on_rig(self) -> Motion:
-        """The motion on the rig it was asked for."""
+        """Motion on the requested rig."""
         motion = self.solution.motion
-        return motion if self.person is None else self.person.on_rig(motion)
+        return motion if self.character is None else self.character.on_rig(motion)
 
     @property
     def interrupted(self) -> bool:
@@ -49,19 +49,19 @@ class Walk:
 
     @cached_property
     def measures(self) -> Mapping[str, float]:
-        """Measures of the motion, compared with the curve and the arcs wanted along it."""
+        """Measures of the motion against the curve and the requested arc along it."""
         motion = self.solution.motion
         wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
         return report.measure_path(motion, self.request.curve, wanted_m=wanted)
 
     def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The report of this walk; `request` is what the user wrote."""
+        """Build the report of this walk; `request` is what the user wrote."""
         card = self.prior.card
         prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
         return report.build_report(self.solution, request=request, measures=self.measures, seed=self.seed, prior=prior)
 
     def summary(self) -> list[str]:
-        """A few lines for people."""
+        """Format a few lines for the user."""
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
         cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
         motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
@@ -82,12 +82,12 @@ def walk(
     *,
     seed: int,
     progress: Progress | None = None,
-    person: Character | None = None,
+    character: Character | None = None,
 ) -> Walk:
-    """Solve, for a person of any size. Compiling or loading the fast path, once a process, is not counted."""
+    """Solve a walk for a character of any size. Compiling or loading the fast path, once a process, is not counted."""
     prior.warm_up()
-    bones = CANONICAL if person is None else person.skeleton
-    settings = None if person is None else FollowSettings(footing=FootContact(rest_height=person.toe_rest_height))
+    bones = CANONICAL if character is None else character.skeleton
+    settings = None if character is None else FollowSettings(footing=FootContact(rest_height=character.toe_rest_height))
     solution = follow(
         prior,
         request.curve,
@@ -98,11 +98,11 @@ def walk(
         skeleton=bones,
         settings=settings,
     )
-    return Walk(request, prior, seed, solution, person)
+    return Walk(request, prior, seed, solution, character)
 
 
 def parse_follow(curve: Curve, speed: str | float | None, seconds: float | None) -> PathRequest:
-    """The wish, checked: RequestError for speeds and durations that make no sense or take too long."""
+    """Parse and check a request: RequestError for speeds and durations that make no sense or take too long."""
     profile = SpeedProfile.parse(str(1.2 if speed is None else speed))
     request = PathRequest(curve, profile, seconds)
     request.frames(PRIOR_FPS)

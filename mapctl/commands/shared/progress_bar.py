@@ -12,7 +12,7 @@ from mapctl.runtime import progress
 
 @contextmanager
 def show_progress(label: str, *, quiet: bool = False) -> Iterator[progress.Progress | None]:
-    """A function that moves a bar on standard error; None where there is no terminal, or with `quiet`."""
+    """Yield a function that moves a bar on standard error; None where there is no terminal, or with `quiet`."""
     if quiet or not sys.stderr.isatty():
         yield None
         return

@@ -1,4 +1,4 @@
-"""What commands that give a motion back share: checks, models, report, exit status, and a film beside the given one."""
+"""Shared parts of commands that return a motion: checks, models, report, exit status, film."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -23,8 +23,8 @@ _SIZE = (1280, 720)
 
 
 def check_destinations(out: Path, video: Path | None, *others: Path | None, given: Sequence[Path]) -> None:
-    """RequestError unless the motion, its film and the other files can be written, none over a given file; leaves no
-    trace.
+    """Raise RequestError unless the motion, its film and the other files can be written, none over a given file; leaves
+    no trace.
     """
     formats.check_ending(out)
     outputs.check_files(options.collect_paths(out, video, *others), given=given)
@@ -33,7 +33,7 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
 
 
 def check_method(method: str, *, finish: bool, prior: str | None = None, infiller: str | None) -> None:
-    """RequestError for a method that there is not, and for a density or a network that it has no use for."""
+    """Raise RequestError for an unknown method, and for a density or a network that the method does not use."""
     proposers.check_method(method)
     if prior is not None and not finish and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
@@ -42,7 +42,7 @@ def check_method(method: str, *, finish: bool, prior: str | None = None, infille
 
 
 def load_models(infiller: str | None, prior: str | None) -> ModelLoaders:
-    """What in-betweeners load when they need it: the named models, or the bundled ones."""
+    """Build the loaders of the named models, or of the bundled ones."""
     return ModelLoaders(
         partial(priors.load_infiller, infiller or "infiller"), partial(priors.load_choice, prior or "auto")
     )
@@ -56,7 +56,7 @@ def conclude(status: Status, *, strict: bool) -> int:
 
 
 def film_comparison(before: Motion, after: Motion, video: Path | None, *, rig: Rig | None, quiet: bool) -> None:
-    """Both side by side, if a film is asked for."""
+    """Film both motions side by side, if a film is requested."""
     if video is None:
         return
     with show_progress("filming", quiet=quiet) as progress:

@@ -1,4 +1,4 @@
-"""What there is of work that ended early, and how it goes on, in one line."""
+"""Messages on work that ended early: what is saved, and how to resume."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ from mapctl.errors import WriteError
 
 @contextmanager
 def explain_end(describe: Callable[[], str]) -> Iterator[None]:
-    """What Ctrl-C, SIGTERM or a full disk ends within says what `describe` then finds saved, and what to type."""
+    """Add to the message of Ctrl-C, SIGTERM or a full disk within what `describe` finds saved, and what to type."""
     try:
         yield
     except KeyboardInterrupt as stop:
@@ -19,12 +19,12 @@ def explain_end(describe: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
-    """Yield a function that takes how many are finished; Ctrl-C, SIGTERM and a full disk say it, and what to do
-    `then`.
+    """Yield a function that takes the number of finished items; add it to the message of Ctrl-C, SIGTERM or a full disk
+    within, and what to do `then`.
     """
     finished = 0
 
-    def tell(number: int) -> None:
+    def set_finished(number: int) -> None:
         nonlocal finished
         finished = number
 
@@ -32,7 +32,7 @@ def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable
         return (f"{finished} of {count} {what} are finished", then) if finished else ()
 
     try:
-        yield tell
+        yield set_finished
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(_join_sentences(str(stop), *kept())) from stop
     except WriteError as error:

@@ -16,36 +16,36 @@ _TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
 
 @dataclass(frozen=True)
 class Steer(Command):
-    """A character obeys a script of speeds and directions, answered as live steering would."""
+    """A character follows a script of speeds and directions, as in live steering."""
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
-    strafing, turn_deg_s to turn on and on, step_m for a step length, gait and style as the prior knows them. The last
-    line's time is the end."""
+    strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style as the prior knows them. The
+    last line's time is the end."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
-    cannot keep up the script's time goes slower than the clock's, and the summary says so."""
+    cannot keep up the script's time runs slower than the clock's, and the summary says so."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     rig: options.OutRig = "canonical"
-    """Whose body moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
     seed: options.Count = 0
-    """Of the pose that it begins with."""
+    """Seed of the first pose."""
     acceleration: options.Number = SteeringLimits.acceleration
-    """Most that the wanted speed rises by, m/s^2."""
+    """Largest acceleration of the target speed, m/s^2."""
     braking: options.Number = SteeringLimits.braking
-    """Most that it falls by, m/s^2."""
+    """Largest deceleration of the target speed, m/s^2."""
     turn_rate: options.Number = _TURN_RATE_DEG
-    """Most that the wanted direction turns by, degrees/s."""
+    """Largest turn rate of the target direction, degrees/s."""
     report: options.MaybeFile = None
     """JSON with each command's response, timing, ledger and measures."""
     plot: options.MaybeFile = None
-    """PNG of wanted and got speed and direction over time."""
+    """PNG of target and actual speed and direction over time."""
     strict: bool = False
-    """Exit with status 3 where not all that was asked holds: a speed was lowered to what the prior can do, or a frame
-    was late."""
+    """Exit with status 3 where not all that was requested holds: a speed was lowered to what the prior can do, or a
+    frame was late."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -31,16 +31,16 @@ _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is
 
 
 def run(command: Steer) -> int:
-    """Check everything, steer, write, tell. Ctrl-C ends the script early; what was steered is written."""
+    """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
     _check(command)
     track = read_commands(command.commands)
-    person, prior = read_character(command.rig), priors.load(command.prior)
+    character, prior = read_character(command.rig), priors.load(command.prior)
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
     for labels in {wanted.told for wanted in track.commands if wanted.told}:
-        prior.conditioned_on(labels)  # what it does not know is said now
-    recorder, records, frames = _run_steering(command, prior, track, person)
+        prior.conditioned_on(labels)  # unknown labels are refused now
+    recorder, records, frames = _run_steering(command, prior, track, character)
     motion = recorder.motion(frames)
-    person.on_rig(motion).save(command.out)
+    character.on_rig(motion).save(command.out)
     arrivals = [time for time in track.times[1:] if time < motion.seconds]
     timing = summarise_step_timing(records, arrivals) | {"peak_memory_mb": report.peak_memory_mb()}
     done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
@@ -67,17 +67,17 @@ def _limits(command: Steer) -> SteeringLimits:
 
 
 def _run_steering(
-    command: Steer, prior: LstmGmmDensity, track: CommandTrack, person: Character
+    command: Steer, prior: LstmGmmDensity, track: CommandTrack, character: Character
 ) -> tuple[Recorder, list[StepRecord], int]:
     first, recorder = track.commands[0], Recorder()
     frames = inputs.count_frames(track.times[-1] + (_LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0))
-    footing = FootContact(rest_height=person.toe_rest_height)
+    footing = FootContact(rest_height=character.toe_rest_height)
     settings = steer.SteerSettings(limits=_limits(command), footing=footing)
     generator = torch.Generator().manual_seed(command.seed)
-    state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=person.skeleton)
+    state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=character.skeleton)
     recorder.show(pose, 0.0)
     for wanted in (first, *{wanted.told: wanted for wanted in track.commands}.values()):
-        steer.step(state, wanted)  # what is compiled, loaded or told on first use must not cost frames
+        steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
         displays = [recorder] if progress is None else [recorder, _ProgressDisplay(progress, frames)]
@@ -88,7 +88,7 @@ def _run_steering(
 def _conclude_steering(
     motion: Motion, recorder: Recorder, lowered: Sequence[str], timing: Mapping[str, Any], *, interrupted: bool
 ) -> Solution:
-    """Sum up all steps: commands that the prior cannot do and frames that came late did not hold."""
+    """Sum up all steps; lowered commands and late frames make the status infeasible."""
     late = timing["late_frames"]
     notes = [*lowered, *([f"{late} frames came after they were due"] if late else [])]
     status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
@@ -130,13 +130,9 @@ def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str
         turned = "" if off is None else f", {off:+.1f} degrees off"
         turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
         turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
-        way = (
-            f"to {row['heading_deg']:.0f} degrees"
-            if row["turn_deg_s"] is None
-            else (f"turning {row['turn_deg_s']:.0f} degrees/s")
-        )
-        asked = f"{row['speed_mps']:.2f} m/s {way}"
-        lines.append(f"{row['time_s']:6.1f} s  {asked}: {reached}{steady}{turned}")
+        turn = row["turn_deg_s"]
+        direction = f"to {row['heading_deg']:.0f} degrees" if turn is None else f"turning {turn:.0f} degrees/s"
+        lines.append(f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}")
     cost, latency = found["timing"], found["timing"]["command_latency_s"]
     waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
     slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""

@@ -1,4 +1,4 @@
-"""`mapctl tween`: a few keys to a whole motion."""
+"""`mapctl tween`: a motion through keyframes."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,8 +11,8 @@ from mapctl.commands.shared.command import Command
 
 @dataclass(frozen=True)
 class Tween(Command):
-    """Frames of a clip are keys, or poses that a file puts in time and place, and the motion between them is made anew.
-    On any known rig."""
+    """Make the motion between keyframes: frames of a clip, or poses that a file sets in time and space. On any known
+    rig."""
 
     source: options.InFile
     """A motion file; or a TOML file of [[key]] tables: a frame or seconds, a pose (a motion file and a pose_frame of
@@ -21,22 +21,23 @@ class Tween(Command):
     out: options.OutFile
     """Where the motion goes: as long as IN, or until the last key."""
     keyframes: Annotated[str | None, arg(metavar="F,F,...")] = None
-    """Of a motion file, frames that stay, or seconds as in 1.5s; the first and the last one are whole poses."""
+    """Keyframes of a motion file, or seconds as in 1.5s; the first and the last one are whole poses."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """Keys between the first and the last only tell where these hands or feet are: canonical names or the rig's own."""
+    """Keys between the first and the last give only the positions of these hands or feet: canonical names or the rig's
+    own."""
     root_only: bool = False
-    """Keys between the first and the last only tell where the hips are and which way they face."""
+    """Keys between the first and the last give only the position and the facing of the hips."""
     suggest_timing: bool = False
-    """Tell how many frames the way from each whole pose to the next takes in mocap, beside what is given; the motion
-    keeps the given timing."""
+    """Print how many frames mocap takes from each whole pose to the next, beside what is given; the motion keeps the
+    given timing."""
     timing: options.MaybeName = None
     """The file or run folder of a trained keyframe timing for --suggest-timing; the bundled one if not given."""
     method: options.Method = "auto"
-    """Who proposes. auto: the infiller, or a density that is rolled through gaps so long that the infiller would slide,
-    or nobody where the body stands still; a note tells for every gap who. rollouts: a density, wherever nothing is
-    known. slerp: interpolation."""
+    """Method that proposes. auto: the infiller, a density's rollout through gaps so long that the infiller would slide,
+    or a held pose where the body stands still; a note on each gap names it. rollouts: a density's rollouts, wherever
+    nothing is known. slerp: interpolation."""
     no_finish: bool = False
-    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage puts the feet down."""
+    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     rig: options.MaybeRig = None
     """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
     infiller: options.MaybeName = None
@@ -45,19 +46,18 @@ class Tween(Command):
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
     variations: options.Count = 1
-    """How many different motions to make, as OUT_000.bvh, OUT_001.bvh, ...: the first is what one would be, in the
-    others densities (--prior, or auto) are drawn from and steered from key to key."""
+    """Number of different motions, as OUT_000.bvh, OUT_001.bvh, ...: the first is what a single one would be, the
+    others are rollouts of densities (--prior, or auto) that are steered from key to key."""
     best_of: options.Count = 1
-    """Of so many answers the one with the least energy is kept: from the infiller's proposal, slerp's, and rollouts of
-    densities (--prior, or auto) that are steered from key to key."""
+    """Number of motions of which the one with the lowest energy is kept: from the infiller's proposal, slerp's, and
+    rollouts of densities (--prior, or auto) that are steered from key to key."""
     seed: options.Count = 0
-    """Of everything that is drawn; the first variations are the same however many are asked for."""
+    """Seed of everything that is sampled; the first variations do not depend on their number."""
     report: options.MaybeFile = None
-    """JSON with the keys, what is missed at them, contacts, ledger, measures, compute and suggested timing."""
+    """JSON with the keys, the errors at them, contacts, ledger, measures, compute and suggested timing."""
     video: options.MaybeFile = None
     """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
     strict: bool = False
-    """Exit with status 3 where not all that was asked holds: keys that nobody could meet in time, limbs out of
-    reach."""
+    """Exit with status 3 where not all that was requested holds: keys too close in time, limbs out of reach."""
     quiet: bool = False
     """No summary and no progress bar."""

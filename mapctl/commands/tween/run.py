@@ -1,4 +1,4 @@
-"""`mapctl tween`: a few keys to a whole motion."""
+"""`mapctl tween`: a motion through keyframes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,30 +28,30 @@ from mapctl.retarget.rigs import Rig
 
 
 def run(command: Tween) -> int:
-    """Check everything, make, write, tell."""
+    """Check everything, make, write, report."""
     request = _read_key_request(command)
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
-    asked = _read_keyframe_clip(command, request)
-    models, make = results.load_models(command.infiller, command.prior), _prepare_tweening(command, asked)
+    clip = _read_keyframe_clip(command, request)
+    models, make = results.load_models(command.infiller, command.prior), _prepare_tweening(command, clip)
     if command.variations > 1:
-        ok = variations.run_variations(command, asked, make, models)
+        ok = variations.run_variations(command, clip, make, models)
         return exit_status.NOT_SATISFIED if command.strict and not ok else 0
-    intervals = _suggest_timing(command, asked)
+    intervals = _suggest_timing(command, clip)
     if command.best_of > 1:
         done = variations.tween_lowest_energy(command, make, models)
     else:
         done = make(build_inbetweener(command.method, models), torch.Generator().manual_seed(command.seed))
     formats.save(done.motion, command.out)
     if command.report is not None:
-        report.write_report(_build_report(command, done, asked, intervals), command.report)
-    results.film_comparison(asked.motion, done.motion, command.video, rig=asked.rig, quiet=command.quiet)
+        report.write_report(_build_report(command, done, clip, intervals), command.report)
+    results.film_comparison(clip.motion, done.motion, command.video, rig=clip.rig, quiet=command.quiet)
     if not command.quiet:
-        _tell(command, done, asked, intervals)
+        _tell(command, done, clip, intervals)
     return results.conclude(done.status, strict=command.strict)
 
 
-def _tell(command: Tween, done: InbetweenSolution, asked: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:
-    ms, count = 1000 * done.seconds / done.motion.num_frames, len(asked.keys.frames)
+def _tell(command: Tween, done: InbetweenSolution, clip: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:
+    ms, count = 1000 * done.seconds / done.motion.num_frames, len(clip.keys.frames)
     print(f"{command.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
     for note in (*done.notes, *done.gap_notes):
         print(note)
@@ -60,15 +60,15 @@ def _tell(command: Tween, done: InbetweenSolution, asked: KeyframeClip, interval
         print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
 
 
-def _suggest_timing(command: Tween, asked: KeyframeClip) -> list[KeyInterval]:
+def _suggest_timing(command: Tween, clip: KeyframeClip) -> list[KeyInterval]:
     if not command.suggest_timing:
         return []
     timing = priors.load_keyframe_timing(command.timing or "keyframe-timing")
-    return suggest_intervals(asked.motion, asked.keys, timing, asked.rig)
+    return suggest_intervals(clip.motion, clip.keys, timing, clip.rig)
 
 
 def _is_key_file(command: Tween) -> bool:
-    """Whether the keys are those of a TOML file."""
+    """Return whether the keys are those of a TOML file."""
     return command.source.suffix.lower() == ".toml"
 
 
@@ -77,32 +77,25 @@ def _read_key_request(command: Tween) -> KeyRequest | None:
 
 
 def _check(command: Tween, given: Sequence[Path]) -> None:
-    """Of the options; files that are given are read, and so not written."""
+    """Check the options; the given files are read, so they must not be written."""
     if command.timing is not None and not command.suggest_timing:
         raise RequestError("--timing is what --suggest-timing asks; without that it does nothing")
     if command.joints is not None and command.root_only:
         raise RequestError("--joints and --root-only are two kinds of keys; choose one")
-    idle = [
-        name
-        for name, value in (
-            ("--keyframes", command.keyframes),
-            ("--joints", command.joints),
-            ("--root-only", command.root_only or None),
-        )
-        if value is not None
-    ]
-    if _is_key_file(command) and idle:
-        raise RequestError(f"{idle[0]} is for motion files; {command.source} says itself what its keys are")
+    options = {"--keyframes": command.keyframes, "--joints": command.joints, "--root-only": command.root_only or None}
+    unused = [name for name, value in options.items() if value is not None]
+    if _is_key_file(command) and unused:
+        raise RequestError(f"{unused[0]} is for motion files; {command.source} says itself what its keys are")
     if not _is_key_file(command) and command.keyframes is None:
         raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
     variations.check_answers(command, given)
-    # Variations are rolled by a density whatever the method.
+    # Variations are rollouts of a density with every method.
     prior = command.prior if command.variations == command.best_of == 1 else None
     results.check_method(command.method, finish=not command.no_finish, prior=prior, infiller=command.infiller)
 
 
 def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:
-    """The motion that holds the keys, these, and its rig where it is known."""
+    """Read the motion that holds the keys, the keys, and its rig where it is known."""
     rig = inputs.read_rig(command.rig)
     if request is not None:
         return _load_key_file(command, request, rig)
@@ -124,19 +117,19 @@ def _load_key_file(command: Tween, request: KeyRequest, rig: Rig | None) -> Keyf
         raise FileFormatError(command.source, str(error)) from error
 
 
-def _prepare_tweening(command: Tween, asked: KeyframeClip) -> Tweening:
-    """Prepare everything but who proposes."""
+def _prepare_tweening(command: Tween, clip: KeyframeClip) -> Tweening:
+    """Bind everything but the in-betweener and the generator."""
     densities = priors.load_choice(command.prior)
     settings = InfillSettings(finish=not command.no_finish)
 
     def make(inbetweener: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
         return tween(
-            asked.motion,
-            asked.keys,
+            clip.motion,
+            clip.keys,
             inbetweener,
             settings=settings,
             densities=densities,
-            rig=asked.rig,
+            rig=clip.rig,
             generator=generator,
         )
 
@@ -144,8 +137,8 @@ def _prepare_tweening(command: Tween, asked: KeyframeClip) -> Tweening:
 
 
 def _build_report(
-    command: Tween, done: InbetweenSolution, asked: KeyframeClip, intervals: Sequence[KeyInterval]
+    command: Tween, done: InbetweenSolution, clip: KeyframeClip, intervals: Sequence[KeyInterval]
 ) -> dict[str, Any]:
-    errors = measure_keyframe_errors(done.motion, asked.motion, asked.keys, asked.rig)
+    errors = measure_keyframe_errors(done.motion, clip.motion, clip.keys, clip.rig)
     timing = {"key_timing": [interval.summary() for interval in intervals]} if command.suggest_timing else {}
     return results.build_report("tween", command, done) | {"keys": errors, **timing}

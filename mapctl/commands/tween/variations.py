@@ -19,16 +19,16 @@ from mapctl.commands.tween import Tween
 from mapctl.errors import RequestError
 
 _MAX_ANSWERS = 1000
-_FIRST_SAMPLED = 3  # answers before it are the infiller's and slerp's
+_FIRST_SAMPLED = 3  # the motions before it are the infiller's and slerp's
 
 
 def number_paths(path: Path, count: int) -> list[Path]:
-    """walk_000.bvh, walk_001.bvh, ... of walk.bvh."""
+    """Number the paths of variations: walk_000.bvh, walk_001.bvh, ... for walk.bvh."""
     return [path.with_name(f"{path.stem}_{number:03d}{path.suffix}") for number in range(count)]
 
 
 def check_answers(command: Tween, given: Sequence[Path]) -> None:
-    """RequestError for what several answers cannot be made of, and files that cannot be written."""
+    """Raise RequestError for options that exclude several motions, and files that cannot be written."""
     options.check_seed(command.seed)
     for name, count in (("--variations", command.variations), ("--best-of", command.best_of)):
         if not 1 <= count <= _MAX_ANSWERS:
@@ -53,29 +53,27 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
 
 
 def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) -> InbetweenSolution:
-    """Keep the likeliest of several answers."""
+    """Make several motions and keep the one with the lowest energy."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("answers", quiet=command.quiet) as progress:
         rollouts = RolloutInbetweener(models.densities(), models.infiller())
         return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
 
 
-def run_variations(command: Tween, asked: KeyframeClip, make: Tweening, models: ModelLoaders) -> bool:
-    """Make, write, tell; the report names every file with its energy. Return whether all that was asked holds."""
+def run_variations(command: Tween, clip: KeyframeClip, make: Tweening, models: ModelLoaders) -> bool:
+    """Make, write, report; the report lists every file with its energy. Return whether all that was requested holds."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("variations", quiet=command.quiet) as progress:
-        first, rollouts = (
-            build_inbetweener(command.method, models),
-            RolloutInbetweener(models.densities(), models.infiller()),
-        )
+        first = build_inbetweener(command.method, models)
+        rollouts = RolloutInbetweener(models.densities(), models.infiller())
         found = sample_variations(make, first, rollouts, command.variations, generator=generator, progress=progress)
     files = number_paths(command.out, command.variations)
     for one, file in zip(found.each, files, strict=True):
         formats.save(one.solution.motion, file)
     if command.report is not None:
-        report.write_report(_report_variations(command, asked, found, files), command.report)
+        report.write_report(_report_variations(command, clip, found, files), command.report)
     if not command.quiet:
-        _tell(found, files, len(asked.keys.frames))
+        _tell(found, files, len(clip.keys.frames))
     return all(one.solution.status.ok for one in found.each)
 
 
@@ -96,12 +94,12 @@ def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:
 
 
 def _report_variations(
-    command: Tween, asked: KeyframeClip, found: Variations, files: Sequence[Path]
+    command: Tween, clip: KeyframeClip, found: Variations, files: Sequence[Path]
 ) -> dict[str, object]:
     rows = []
     for one, file in zip(found.each, files, strict=True):
         made = one.solution
-        errors = measure_keyframe_errors(made.motion, asked.motion, asked.keys, asked.rig)
+        errors = measure_keyframe_errors(made.motion, clip.motion, clip.keys, clip.rig)
         own = {"file": str(file), "energy_nats": one.energy, "energy": one.ledger.summary(), "keys": errors}
         rows.append(own | results.build_report("tween", command, made))
     shared = ("mapctl", "request", "versions")
