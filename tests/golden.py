@@ -77,6 +77,8 @@ COMMANDS = {
     " --infiller infiller.safetensors --prior tiny.safetensors",
     "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --infiller infiller.safetensors",
     "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method slerp --no-finish",
+    "infill by rollouts": "infill walk.bvh -o rolled.bvh --gap 10:22 --method rollouts --infiller infiller.safetensors"
+    " --prior tiny.safetensors --seed 2",
     "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --infiller infiller.safetensors --report tweened.json",
     "tween file": "tween keys.toml -o keyed.bvh --infiller infiller.safetensors --prior tiny.safetensors",
     "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --infiller infiller.safetensors --suggest-timing"

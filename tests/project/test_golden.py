@@ -12,6 +12,7 @@ LONG = {
     "denoise with a prior",
     "denoise causal",
     "infill joints",
+    "infill by rollouts",
     "tween file",
     "tween variations",
     "tween best",
