@@ -17,6 +17,7 @@ from controllers.inbetweening.refine import INFILL_REFINEMENT, refine_gaps
 from controllers.inbetweening.solution import InbetweenSolution
 from mapctl import contacts
 from mapctl.curves.curve import Curve
+from mapctl.errors import RequestError
 from mapctl.inbetweening import Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets, compute_target_errors, reach_effector_targets
 from mapctl.inbetweening.missing import MissingMask
@@ -59,9 +60,12 @@ def fill(
     """Fill missing values of a motion.
 
     `targets` are positions of the rig's hands and feet in frames in which they are missing; the hips follow `curve`
-    while they are. The MAP stage adds `terms`, and the likeliest of `densities` its likelihood.
+    while they are. The MAP stage adds `terms`, and the likeliest of `densities` its likelihood; RequestError for terms
+    where it is left out.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
+    if terms and not settings.finish:
+        raise RequestError("terms belong to the MAP stage, which is left out")
     generator = generator or torch.Generator().manual_seed(0)
     clip = CanonicalClip.of(motion, missing, rig)
     if curve is not None:

@@ -7,6 +7,7 @@ import torch
 from captures import noisy, on_rig
 from helpers import generator, walk
 from linear_inbetweener import LinearInbetweener
+from methods import UNFINISHED
 from tiny_denoiser import tiny_denoiser
 from toy_density import toy_density
 
@@ -171,7 +172,9 @@ def test_terms_of_a_generated_motion_see_where_it_is_in_the_world(start):
     torch.testing.assert_close(entry.residual.double(), away, atol=2e-3, rtol=0)
 
 
-def test_terms_without_a_clean_up_to_join_are_refused():
+def test_terms_without_a_map_stage_to_join_are_refused():
+    with pytest.raises(RequestError, match="terms belong to the MAP stage"):
+        tween(WALKER, Keys((0, 39)), LinearInbetweener(), settings=UNFINISHED, terms=[HandHeight(1.0)])
     with pytest.raises(RequestError, match="terms belong to the foot clean-up"):
         generate(
             TOY, seconds=1, generator=generator(), settings=GenerateSettings(foot_cleanup=None), terms=[HandHeight(1.0)]
