@@ -75,7 +75,7 @@ def assert_it_arrives(folder, left):
 
 
 def assert_it_is_named(folder, left):
-    assert left["eased"].gap_notes[0].endswith("ease in and out")
+    assert ": ease in and out" in left["eased"].gap_notes[0]
 
 
 def assert_filmed(folder, left):

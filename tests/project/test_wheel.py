@@ -78,7 +78,7 @@ def test_packages_import_from_the_wheel(clean, tmp_path):
 def test_every_source_and_data_file_is_held(held):
     wanted = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]
     wanted += [file for pattern in DATA for file in ROOT.glob(pattern)]
-    names = {file.relative_to(ROOT).as_posix() for file in wanted if not file.name.startswith(".")}
+    names = {file.relative_to(ROOT).as_posix() for file in wanted if file.is_file() and not file.name.startswith(".")}
     assert names - held == set()
 
 
