@@ -92,6 +92,7 @@ def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_pa
     assert "skate_cm_s" in told["measures"]
 
 
+@pytest.mark.slow
 def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_path):
     report, prior = tmp_path / "r.json", save_tiny_prior(tmp_path / "prior.safetensors")
     words = ["--keyframes", "0,20,44", "--joints", "Hand_L", "--report", report, "--prior", prior, "--quiet"]

@@ -159,6 +159,7 @@ def test_a_pose_on_a_skeleton_that_is_no_body_is_refused(poses, tmp_path):
         build_keyframe_clip(request)
 
 
+@pytest.mark.slow
 def test_limbs_that_no_one_could_bring_there_in_time_are_named_with_numbers(poses):
     start, stop = first_and_last(poses["bandai"])
     reaches = (

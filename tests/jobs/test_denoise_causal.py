@@ -64,6 +64,7 @@ def test_all_frames_come_back_once_and_within_the_delay(rig, fps, delay):
     assert torch.equal(captured, motion.local_quat_xyzw)
 
 
+@pytest.mark.slow
 def test_what_comes_after_the_delay_changes_nothing_that_was_given():
     motion = noisy(on_rig("daz", 54))
     quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
@@ -113,6 +114,7 @@ def test_nothing_pushed_gives_nothing():
     assert stream().finish() is None
 
 
+@pytest.mark.slow
 def test_masks_count_from_the_first_frame_of_all():
     truth = on_rig("daz", 60)
     given = noisy(truth, 1.0, 0.3)
@@ -163,6 +165,7 @@ def test_what_is_due_before_noise_can_be_told_is_said_once_and_only_then():
     assert not any("before noise could be told" in note for note in later.notes)
 
 
+@pytest.mark.slow
 def test_a_joint_that_is_lost_for_longer_than_a_pass_looks_back_is_made_up_from_what_was_given():
     truth = on_rig("daz", 75, fps=30)
     joint = truth.skeleton.index("lForeArm")

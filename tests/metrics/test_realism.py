@@ -118,6 +118,7 @@ def test_basis_holds_the_largest_variances(count):
     torch.testing.assert_close(basis.axes.T @ basis.axes, torch.eye(6), atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
     mocap, alike = clip_set(24), clip_set(24, seed=1)
     shaky = [trembling(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
@@ -132,6 +133,7 @@ def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
     assert (same.made_windows, same.mocap_windows) == (24 * 4, 24 * 4)
 
 
+@pytest.mark.slow
 def test_a_quicker_gait_is_far_in_frechet_distance():
     mocap = clip_set(8)
     quick = [walk(61, cadence=1.5, seed=50 + k) for k in range(8)]

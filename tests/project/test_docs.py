@@ -20,10 +20,17 @@ INLINE = [line for page in pages.PAGES for line in pages.inline_commands(page)]
 NOT_RUN = re.compile(r"mapctl (live|bench|demo)\b|DATA|ADDRESS")
 LONG = re.compile(
     r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))"
-    "|--(causal|best-of|variations|reference|jobs)|auto"
+    "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init)|auto|denoise .*--video|7s:8.5s"
 )
 PYTHON = [block for page in pages.PAGES for block in pages.blocks(page, "python")]
-LONG_PYTHON = ("README.md-python-0", "docs/infilling.md-python-0", "docs/denoising.md-python-0")
+LONG_PYTHON = {
+    "README.md-python-0",
+    "README.md-python-1",
+    "docs/infilling.md-python-0",
+    "docs/denoising.md-python-0",
+    "docs/adding-a-term.md-python-0",
+    "docs/adding-a-job.md-python-0",
+}
 
 
 def fill_in(line: str) -> str:

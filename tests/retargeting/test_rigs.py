@@ -128,6 +128,7 @@ def test_every_preset_there_and_back(preset, version, rest):
     root=st.sampled_from([None, "Reference"]),
     data=st.data(),
 )
+@pytest.mark.slow
 def test_whatever_the_rest_pose_it_comes_back(preset, size, arms, zup, quarters, extras, root, data):
     wish = Make(names_of(preset), size, arms, zup=zup, turned_deg=90.0 * quarters, extras=extras, root=root)
     made, wanted = make(wish), person(size, 5)
