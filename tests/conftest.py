@@ -134,3 +134,8 @@ def fails(tmp_path, capsys, monkeypatch):
         return told.err
 
     return check
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files whose processes take longest: the last file that a worker takes, it takes alone."""
+    items.sort(key=lambda item: "steering_live" not in item.nodeid)

@@ -199,7 +199,11 @@ def test_an_end_that_is_wanted_is_no_failure(load):
     ("breaking", "said"),
     [
         (lambda load: functools.partial(priors.load, "nobody"), r"no prior 'nobody'"),
-        (lambda load: functools.partial(trapped, load, 40), r"ZeroDivisionError: .*\(rollout, line \d+\)$"),
+        pytest.param(
+            lambda load: functools.partial(trapped, load, 40),
+            r"ZeroDivisionError: .*\(rollout, line \d+\)$",
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["no such prior", "an error that nobody thought of"],
 )
