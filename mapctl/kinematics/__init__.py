@@ -1,6 +1,7 @@
 """Forward kinematics and heading: pure functions, differentiable, any batch shape."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -21,24 +22,39 @@ def forward_kinematics(
     `offsets` are the joints in their parents' frames; they may carry the batch's shape where bones are animated.
     Parents must precede their children.
     """
-    positions, world = [root_position], [local_quat_xyzw[..., 0, :]]
-    for joint in range(1, len(parents)):
-        parent = parents[joint]
-        offset = offsets[..., joint, :].expand_as(root_position)
-        positions.append(positions[parent] + rotations.rotate(world[parent], offset))
-        world.append(rotations.multiply(world[parent], local_quat_xyzw[..., joint, :]))
-    return torch.stack(positions, dim=-2), torch.stack(world, dim=-2)
+    offsets = offsets.expand(*root_position.shape[:-1], *offsets.shape[-2:])
+    position, rotation = root_position[..., None, :], local_quat_xyzw[..., :1, :]
+    levels, order = _group_by_depth(tuple(parents))
+    positions, world = [position], [rotation]
+    for joints, rows in levels:
+        above = rotation[..., rows, :]
+        position = position[..., rows, :] + rotations.rotate(above, offsets[..., joints, :])
+        rotation = rotations.multiply(above, local_quat_xyzw[..., joints, :])
+        positions.append(position)
+        world.append(rotation)
+    return torch.cat(positions, dim=-2)[..., order, :], torch.cat(world, dim=-2)[..., order, :]
+
+
+@lru_cache(maxsize=256)
+def _group_by_depth(parents: tuple[int, ...]) -> tuple[list[tuple[list[int], list[int]]], list[int]]:
+    """Group joints below the root by depth: each level's joints, and their parents' rows in the level above; also
+    returns where each joint stands in the levels one after another.
+
+    All joints of one depth are then computed at once: a dozen tensor operations for a body instead of one a joint.
+    """
+    levels, above, standing = [], [0], [0]
+    while joints := [joint for joint, parent in enumerate(parents) if joint and parent in above]:
+        levels.append((joints, [above.index(parents[joint]) for joint in joints]))
+        above, standing = joints, standing + joints
+    return levels, sorted(range(len(parents)), key=standing.__getitem__)
 
 
 def local_from_world(
     parents: Sequence[int], world_quat_xyzw: Float[Tensor, "*batch joints 4"]
 ) -> Float[Tensor, "*batch joints 4"]:
     """Return rotations of every joint in its parent's frame, from world rotations."""
-    local = [world_quat_xyzw[..., 0, :]]
-    for joint in range(1, len(parents)):
-        parent = world_quat_xyzw[..., parents[joint], :]
-        local.append(rotations.multiply(rotations.inverse(parent), world_quat_xyzw[..., joint, :]))
-    return torch.stack(local, dim=-2)
+    above = rotations.inverse(world_quat_xyzw[..., list(parents[1:]), :])
+    return torch.cat([world_quat_xyzw[..., :1, :], rotations.multiply(above, world_quat_xyzw[..., 1:, :])], dim=-2)
 
 
 def heading(hips_world_quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
@@ -49,20 +65,14 @@ def heading(hips_world_quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*
 def positions_from_matrices(
     skeleton: Skeleton, local_matrix: Float[Tensor, "*batch joints 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:
-    """Return the joint positions (metres) relative to the root at the origin, from local rotation matrices.
-
-    All joints of one depth are multiplied at once: a window of frames then takes a dozen tensor operations.
-    """
+    """Return the joint positions (metres) relative to the root at the origin, from local rotation matrices."""
     offsets = skeleton.offsets.to(local_matrix.dtype)
-    order, world, positions = [0], local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, :, 0])
-    above_world, above_positions, above = world, positions, [0]
-    collected = [positions]
-    while level := [j for j, parent in enumerate(skeleton.parents) if parent in above]:
-        rows = [above.index(skeleton.parents[j]) for j in level]
-        parent_world = above_world[..., rows, :, :]
-        above_positions = above_positions[..., rows, :] + (parent_world @ offsets[level].unsqueeze(-1)).squeeze(-1)
-        above_world = parent_world @ local_matrix[..., level, :, :]
-        collected.append(above_positions)
-        order, above = order + level, level
-    inverse = torch.argsort(torch.tensor(order))
-    return torch.cat(collected, dim=-2)[..., inverse, :]
+    world, position = local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, :, 0])
+    levels, order = _group_by_depth(skeleton.parents)
+    positions = [position]
+    for joints, rows in levels:
+        above = world[..., rows, :, :]
+        position = position[..., rows, :] + (above @ offsets[joints].unsqueeze(-1)).squeeze(-1)
+        world = above @ local_matrix[..., joints, :, :]
+        positions.append(position)
+    return torch.cat(positions, dim=-2)[..., order, :]
