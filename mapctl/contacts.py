@@ -10,6 +10,9 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 
+CERTAIN_LOGIT = 4.0
+"""Logit of a contact that is as good as certain."""
+
 
 @dataclass(frozen=True)
 class ContactSettings:
@@ -25,6 +28,11 @@ class ContactSettings:
     """Contacts shorter than this are dropped, seconds: 3 frames at 30 fps."""
     speed_window: float = 1 / 30
     """Toe speed is the mean over about this time, seconds, or a fast camera's noise looks like motion."""
+
+
+def to_logits(planted: Bool[Tensor, "*frames feet"]) -> Float[Tensor, "*frames feet"]:
+    """Return the logits of contacts that are as good as certain."""
+    return CERTAIN_LOGIT * (2 * planted.float() - 1)
 
 
 def detect_contacts(

@@ -12,7 +12,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import Mask, expand_masks, resolve_joint_names
-from mapctl.retarget import to_canonical
+from mapctl.retarget import identify_rig
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
 
@@ -40,7 +40,7 @@ def infill(
     masks = resolve_joint_names(motion, masks, rig)
     # The rig must not be identified from values within a gap.
     shown = interpolate_missing(motion, MissingMask(*expand_masks(motion, masks)))
-    missing = MissingMask.of_masks(motion, masks, to_canonical(shown, rig)[1])
+    missing = MissingMask.of_masks(motion, masks, identify_rig(shown.skeleton, rig, motion=shown))
     if curve is not None and not missing.root.any():
         raise RequestError("the hips follow a curve where they are missing, and they never are; leave it out")
     return fill(

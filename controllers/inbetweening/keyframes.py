@@ -12,7 +12,7 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, rig_joint_positions, to_canonical
+from mapctl.retarget import RigMap, identify_rig, rig_joint_positions
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, LIMBS
 
@@ -68,7 +68,7 @@ def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) ->
 
 def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
     """Raise RequestError for a name that is no hand or foot of the motion's rig."""
-    rigmap = to_canonical(motion, rig)[1]
+    rigmap = identify_rig(motion.skeleton, rig, motion=motion)
     for name in names:
         effector_joint(name, rigmap)
 

@@ -20,7 +20,6 @@ from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, Limb
 _JITTER_SIGMA, _POWER_SIGMA = 0.8, 10  # frames at the prior's rate
 _MIN_CHANGE = 0.005  # metres
 _SWAY_SIGMA, _DRIFT_PASSES = 10, 4  # frames at the prior's rate: slower than a step
-_KNOWN_CONTACT_LOGIT = 4.0  # of contacts that are known
 _MIN_SWING_SPEED = 0.5  # m/s from which a proposed toe swings, whatever its logit: held, it would jerk the leg
 
 
@@ -34,11 +33,11 @@ def propose_from_positions(
     shown, missing = query.motion, query.missing
     body = query.to_unit_size(shown)
     positions = body.joint_positions()
-    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS).float()
+    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS)
     image = PositionImage.of_world(
         positions.float()[None],
         heading(shown.local_quat_xyzw[:, 0]).float()[None],
-        planted[None],
+        planted.float()[None],
         known=query.known_positions[None],
         present=torch.ones(1, len(positions), dtype=torch.bool),
         toes=TOE_JOINTS,
@@ -57,9 +56,9 @@ def propose_from_positions(
     root = blend_seams_in_positions(root * query.scale, missing.root, fps=PRIOR_FPS)
     motion = replace(shown, root_position=root, local_quat_xyzw=quats)
     slow = _compute_toe_speeds(motion) < _MIN_SWING_SPEED * query.scale
-    logits = torch.where(slow, answer.contacts[0], -_KNOWN_CONTACT_LOGIT)
+    logits = torch.where(slow, answer.contacts[0], -contacts.CERTAIN_LOGIT)
     known = image.known[0][:, list(TOE_JOINTS)]
-    return Proposal(motion, torch.where(known, _KNOWN_CONTACT_LOGIT * (2 * planted - 1), logits), source)
+    return Proposal(motion, torch.where(known, contacts.to_logits(planted), logits), source)
 
 
 def _select_limbs(missing: Bool[Tensor, "frames joints"]) -> list[Limb]:

@@ -14,8 +14,6 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
-_CERTAIN_LOGIT = 4.0
-
 
 @dataclass(frozen=True, eq=False)
 class GapQuery:
@@ -102,5 +100,4 @@ class Proposal:
 
 def estimate_contact_logits(motion: Motion) -> Float[Tensor, "frames 2"]:
     """Estimate contact logits of a canonical motion from how low and slow its toes are."""
-    planted = contacts.detect_contacts(motion.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS)
-    return _CERTAIN_LOGIT * (2 * planted.float() - 1)
+    return contacts.to_logits(contacts.detect_contacts(motion.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS))

@@ -34,7 +34,6 @@ STANDING_STILL = "standing still"
 _TOES = CANONICAL.indices(TOES)
 _EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
 _SKATE_HEIGHT = 0.025  # metres
-_STANDING_CONTACT_LOGIT = 4.0
 
 
 @dataclass(frozen=True)
@@ -108,11 +107,10 @@ class AutoInbetweener(Inbetweener):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the candidate with the lowest cost in each gap, one after the other in time, without sampling."""
         first = self.infiller.propose(query, generator=generator)
-        roller = Roller.of(query, first, self.densities) if self.densities else None
+        gaps = [gap for gap in query.enclosed_gaps if not _has_enough_context(query, *gap, self.settings)]
+        roller = Roller.of(query, first, self.densities) if self.densities and gaps else None
         best, others = _Candidate(first.motion, first.contact_logits, first.source, 0.0), list(first.others)
-        for start, stop in query.enclosed_gaps:
-            if _has_enough_context(query, start, stop, self.settings):
-                continue
+        for start, stop in gaps:
             before = replace(best, by=first.source)
             best = _choose_candidate(query, before, roller, (start, stop), self.settings)
             others.append(GapSource(start, stop, best.by))
@@ -218,6 +216,5 @@ def _hold_pose(query: GapQuery, before: _Candidate, gap: tuple[int, int]) -> _Ca
     root[part], quats[part] = query.motion.root_position[part], query.motion.local_quat_xyzw[part]
     body = replace(body, root_position=root, local_quat_xyzw=quats)
     toes = body.joint_positions()[part, _TOES, 1]
-    planted = torch.where(toes < toes.amin() + 0.025, _STANDING_CONTACT_LOGIT, -_STANDING_CONTACT_LOGIT)
-    logits[part] = planted.to(logits)
+    logits[part] = contacts.to_logits(toes < toes.amin() + _SKATE_HEIGHT).to(logits)
     return _Candidate(body, logits, STANDING_STILL, 0.0)

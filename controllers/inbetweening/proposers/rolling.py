@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import contacts, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.motion import Motion
@@ -18,7 +18,6 @@ from mapctl.problem.window_solvers import SolvedWindow
 from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL
 
-_ROLLOUT_CONTACT_LOGIT = 4.0
 _PAST_FRAMES = 3  # frames before a gap that terms look back on
 
 
@@ -82,7 +81,7 @@ def insert_rollout(
     new[start:stop] = True
     root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
     quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
-    logits[start:stop] = _ROLLOUT_CONTACT_LOGIT * (2 * planted[:count].to(logits) - 1)
+    logits[start:stop] = contacts.to_logits(planted[:count]).to(logits)
     return replace(body, root_position=root, local_quat_xyzw=quats), logits, missed
 
 

@@ -98,6 +98,8 @@ class RolloutInbetweener(Inbetweener):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a different motion for each sample; gaps too short or too long are left to the fallback."""
         base = self.fallback.propose(query, generator=generator)
+        if not query.enclosed_gaps:
+            return base
         roller, others = Roller.of(query, base, self.densities), list(base.others)
         generator, settings = generator or torch.Generator().manual_seed(0), self.settings
         for start, stop in query.enclosed_gaps:

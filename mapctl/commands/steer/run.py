@@ -92,7 +92,7 @@ def _conclude_steering(
     late = timing["late_frames"]
     notes = [*lowered, *([f"{late} frames came after they were due"] if late else [])]
     status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
-    return Solution(motion, status, recorder.ledger)
+    return Solution(motion, status, recorder.ledger, seconds=sum(piece.seconds for piece in recorder.pieces))
 
 
 def _build_report(
