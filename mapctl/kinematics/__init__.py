@@ -66,13 +66,25 @@ def positions_from_matrices(
     skeleton: Skeleton, local_matrix: Float[Tensor, "*batch joints 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:
     """Return the joint positions (metres) relative to the root at the origin, from local rotation matrices."""
-    offsets = skeleton.offsets.to(local_matrix.dtype)
+    return chain_matrices(skeleton.offsets.to(local_matrix.dtype), skeleton.parents, local_matrix)[0]
+
+
+def chain_matrices(
+    offsets: Float[Tensor, "*shape joints 3"],
+    parents: Sequence[int],
+    local_matrix: Float[Tensor, "*batch joints 3 3"],
+) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch joints 3 3"]]:
+    """Return the joint positions (metres) relative to the root at the origin, and the world rotation matrices.
+
+    `offsets` are the joints in their parents' frames; they may carry a shape that broadcasts with the batch's.
+    """
+    levels, order = _group_by_depth(tuple(parents))
     world, position = local_matrix[..., :1, :, :], torch.zeros_like(local_matrix[..., :1, :, 0])
-    levels, order = _group_by_depth(skeleton.parents)
-    positions = [position]
+    positions, worlds = [position], [world]
     for joints, rows in levels:
         above = world[..., rows, :, :]
-        position = position[..., rows, :] + (above @ offsets[joints].unsqueeze(-1)).squeeze(-1)
+        position = position[..., rows, :] + (above @ offsets[..., joints, :].unsqueeze(-1)).squeeze(-1)
         world = above @ local_matrix[..., joints, :, :]
         positions.append(position)
-    return torch.cat(positions, dim=-2)[..., order, :]
+        worlds.append(world)
+    return torch.cat(positions, dim=-2)[..., order, :], torch.cat(worlds, dim=-3)[..., order, :, :]

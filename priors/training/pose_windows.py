@@ -1,0 +1,151 @@
+"""Windows of a corpus as whole poses: of bodies and tempos that vary, and half of them mirrored."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.features import LAYOUT, GroundPose, integrate_root
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
+from mapctl.pose import BodyPose
+from mapctl.skeleton import CANONICAL
+from priors.training.corpus import Corpus
+
+_CHUNK_FRAMES = 50_000  # frames
+_WIDTHS = (("Shoulder", "UpperArm"), ("UpperLeg",))
+_LENGTHS = (("spine", "chest", "neck", "head"), ("LowerArm",), ("Hand",))
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How bodies and tempos vary. Legs keep their length, the unit of all others."""
+
+    tempo: float = 0.1
+    """Largest change of tempo, as a share."""
+    bones: float = 0.15
+    """Largest change of the widths of shoulders and hips and of the lengths of trunk, forearms and hands."""
+    share: float = 0.5
+    """Share of windows that vary."""
+
+
+class PoseWindows:
+    """Draws windows from a corpus."""
+
+    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
+        """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
+        frames, 1 the same number of each kind.
+        """
+        self.lengths = torch.tensor(corpus.lengths)
+        self.starts = torch.cumsum(self.lengths, 0) - self.lengths
+        origin = GroundPose(torch.zeros(2), torch.zeros(()))
+        roots = [integrate_root(clip, origin) for clip in corpus.clips()]
+        self.ground = torch.cat([ground for ground, _ in roots])
+        self.heading = torch.cat([heading for _, heading in roots])
+        self.height = LAYOUT.pick(corpus.features, "root_height")
+        self.contacts = LAYOUT.pick(corpus.features, "contacts")
+        poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
+        self.quats = torch.cat([rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses])
+        kind = torch.tensor([_find_kind(name, kinds) for name in corpus.names])
+        share = torch.zeros(len(kinds) + 1).index_add(0, kind, self.lengths.float())
+        self.weights = share[kind] ** -evenness
+
+    def draw(
+        self, batch: int, frames: int, generator: torch.Generator, *, variation: Variation | None = None
+    ) -> PartialMotion:
+        """So many windows of so many frames, of which everything is known; the longest clip alone where none is."""
+        tempo = torch.ones(batch)
+        if variation is not None:
+            chosen = torch.rand(batch, generator=generator) < variation.share
+            change = variation.tempo * (2 * torch.rand(batch, generator=generator) - 1)
+            tempo = torch.where(chosen, 1 + change, 1.0)
+        span = 1 + ((frames - 1) * tempo).ceil().long()
+        room = (self.lengths - int(span.max()) + 1).clamp_min(0).float()
+        clip = torch.multinomial(room * self.weights, batch, replacement=True, generator=generator)
+        first = (torch.rand(batch, generator=generator) * (self.lengths[clip] - span + 1)).long()
+        window = self.at(clip, first, frames, tempo)
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        window = _choose(mirrored, window.mirrored(), window)
+        if variation is None:
+            return window
+        return _reshape_bodies(window, variation, generator)
+
+    def at(
+        self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], frames: int, tempo: Float[Tensor, " batch"]
+    ) -> PartialMotion:
+        """From these frames of these clips on, in steps of `tempo` frames."""
+        time = first[:, None] + torch.arange(frames) * tempo[:, None].double()
+        low = time.floor().long()
+        weight = (time - low).float()
+        last = self.lengths[clip][:, None] - 1
+        one, other = (self.starts[clip][:, None] + at.minimum(last) for at in (low, low + 1))
+        nearest = torch.where(weight < 0.5, one, other)
+        quats, after = self.quats[one], self.quats[other]
+        after = torch.where((quats * after).sum(dim=-1, keepdim=True) < 0, -after, after)
+        quats = torch.nn.functional.normalize(torch.lerp(quats, after, weight[..., None, None]), dim=-1)
+        ground = torch.lerp(self.ground[one], self.ground[other], weight[..., None])
+        height = torch.lerp(self.height[one], self.height[other], weight[..., None])
+        root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
+        heading = torch.lerp(self.heading[one], self.heading[other], weight)
+        batch = len(clip)
+        offsets = CANONICAL.offsets.float().expand(batch, -1, -1)
+        known = KnownParts.whole(torch.ones(batch, frames, dtype=torch.bool))
+        targets = torch.zeros(batch, frames, len(EFFECTORS), 3)
+        return PartialMotion(root, heading, quats, self.contacts[nearest], targets, offsets, known)
+
+    def mean_quats(self) -> Float[Tensor, "joints 4"]:
+        """Mean rotation of each joint, of a motion and its mirror image."""
+        sample = self.quats[:: max(1, len(self.quats) // 20_000)]
+        both = torch.cat([sample, _mirror(sample)])
+        return torch.stack([_average(both[:, joint]) for joint in range(CANONICAL.num_joints)])
+
+
+def _average(quats: Float[Tensor, "count 4"]) -> Float[Tensor, " 4"]:
+    """Return the mean rotation: the first eigenvector of the quaternions' second moment (Markley et al. 2007)."""
+    mean = torch.linalg.eigh(quats.double().T @ quats.double())[1][:, -1].float()
+    return mean if mean[3] >= 0 else -mean
+
+
+def _mirror(quats: Tensor) -> Tensor:
+    from mapctl.inbetweening.partial_motion import mirror_quats
+
+    return mirror_quats(quats)
+
+
+def _find_kind(name: str, kinds: Sequence[str]) -> int:
+    return next((number for number, kind in enumerate(kinds) if re.search(kind, name)), len(kinds))
+
+
+def _choose(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> PartialMotion:
+    """Take rows of one where they are chosen, of the other elsewhere; both know everything."""
+
+    def pick(name: str) -> Tensor:
+        first = getattr(one, name)
+        return torch.where(chosen.view(-1, *[1] * (first.ndim - 1)), first, getattr(other, name))
+
+    names = ("root_position", "heading", "quats", "contacts", "targets", "offsets")
+    return replace(other, **{name: pick(name) for name in names})
+
+
+def _reshape_bodies(window: PartialMotion, variation: Variation, generator: torch.Generator) -> PartialMotion:
+    """Give bodies other widths and lengths, the same on both sides."""
+    batch = len(window.offsets)
+    factors = torch.ones(batch, CANONICAL.num_joints, 3)
+    chosen = (torch.rand(batch, generator=generator) < variation.share)[:, None, None]
+    for names, axes in [(names, (0,)) for names in _WIDTHS] + [(names, (0, 1, 2)) for names in _LENGTHS]:
+        factor = 1 + variation.bones * (2 * torch.rand(batch, generator=generator) - 1)
+        for joint, name in enumerate(CANONICAL.names):
+            if name.endswith(names) and name not in ("leftShoulder", "rightShoulder") or "Shoulder" in names and name.endswith("Shoulder"):
+                factors[:, joint, list(axes)] = factor[:, None]
+    return replace(window, offsets=torch.where(chosen, window.offsets * factors, window.offsets))
+
+
+def add_targets(motion: PartialMotion) -> PartialMotion:
+    """Aim hands and feet at where they are."""
+    matrices = rotations.to_matrix(motion.quats)
+    local, _ = kinematics.chain_matrices(motion.offsets[:, None], CANONICAL.parents, matrices)
+    world = rotations.rotate_about_y(local, motion.heading[..., None]) + motion.root_position[..., None, :]
+    return replace(motion, targets=world[..., list(EFFECTORS), :])

@@ -1,0 +1,274 @@
+"""Training of the pose transformer: windows of which parts are hidden, and how far from them it comes back."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
+
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from priors.config import require_at_least
+from priors.pose_transformer.network import (
+    QUANTILES,
+    PoseTransformerConfig,
+    PoseTransformerNetwork,
+    ProposedPoses,
+    from_six,
+    to_six,
+)
+from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
+from priors.training.corpus import Corpus, Split
+from priors.training.pose_windows import PoseWindows, Variation, add_targets
+from priors.training.recipe import NetworkRecipe
+from priors.training.trainer import GradientTrainer
+
+VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
+"""Gaps that are validated, frames."""
+_VALIDATED_WINDOWS = 128
+_MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
+
+
+@dataclass(frozen=True)
+class PoseTransformerSettings:
+    """How a pose transformer is trained."""
+
+    steps: int = 40_000
+    """Updates."""
+    batch: int = 2400
+    """Frames an update; windows of one update are equally long."""
+    window: int = 200
+    """Frames of the longest window."""
+    shortest: int = 8
+    """Frames of the shortest window."""
+    learning_rate: float = 8e-4
+    """At its highest; it falls to nothing along a cosine."""
+    places: float = 10.0
+    """Weight of the mean distance of joints from their true places, metres."""
+    pace: float = 20.0
+    """Weight of the error of joints' steps, metres a frame."""
+    turns: float = 0.5
+    """Weight of the error of world rotations: norm of the difference of matrices."""
+    hips: float = 5.0
+    """Weight of the distance of the hips, metres."""
+    feet: float = 5.0
+    """Weight of the planted toes' steps, metres a frame."""
+    contacts: float = 0.05
+    """Weight of the contacts' cross entropy, nats."""
+    spread: float = 1.0
+    """Weight of the quantile loss of the spread, which only its own layers learn from."""
+    ease: float = 0.5
+    """How much windows count for more whose interpolation errs little: 0 all alike, 1 by the share of its error."""
+    evenness: float = 0.6
+    """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
+    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
+    """Kinds, as patterns of names; clips of none of these are another kind."""
+    parts: PartSettings = field(default_factory=PartSettings)
+    """What stays known."""
+    variation: Variation = field(default_factory=Variation)
+    """How bodies and tempos vary."""
+    bfloat16: bool = False
+    """The network computes in bfloat16; weights and loss stay in float32."""
+    seed: int = 1
+    """Seed of weights, windows and what stays known."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps", "batch")
+        if not 4 <= self.shortest < self.window:
+            raise RequestError(f"windows must reach from 4 frames to more, got {self.shortest} to {self.window}")
+
+
+class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
+    """Draws windows, hides parts of them, and brings the network nearer to proposing them."""
+
+    def __init__(self, config: PoseTransformerConfig, settings: PoseTransformerSettings, corpus: Corpus):
+        self.settings = settings
+        self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
+        self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
+        super().__init__(
+            lambda: PoseTransformerNetwork(config, bfloat16=settings.bfloat16),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
+        _set_moments(self.network, self.windows)
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch."""
+        settings = self.settings
+        share = float(torch.rand((), generator=self.generator))
+        frames = round(settings.shortest * (self.longest / settings.shortest) ** share)
+        batch = max(1, settings.batch // frames)
+        truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=settings.variation))
+        hidden = sample_known_parts(truth, settings.parts, self.generator)
+        return compute_losses(self.network, truth, hidden, settings)
+
+    @torch.no_grad()
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Error of gaps in unseen windows after 10 frames and after one, before one frame, cm and share of the
+        interpolation's; and of lost arms."""
+        windows = PoseWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
+        row: dict[str, Any] = {}
+        for past in (10, 1):
+            for gap in VALIDATED_GAPS:
+                frames = past + gap + 1
+                if frames > int(windows.lengths.max()):
+                    continue
+                truth = windows.draw(_VALIDATED_WINDOWS, frames, torch.Generator().manual_seed(gap))
+                told = torch.ones(truth.heading.shape, dtype=torch.bool)
+                told[:, past : past + gap] = False
+                error, share = measure_error(self.network, truth, KnownParts.whole(told))
+                row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
+        truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), torch.Generator().manual_seed(1))
+        known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
+        lost = known.rotations.clone()
+        lost[..., [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]] = False
+        error, share = measure_error(self.network, truth, replace(known, rotations=lost))
+        return row | {"error_arm_cm": error, "share_arm": share}
+
+
+@dataclass(frozen=True)
+class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformerSettings, PoseTransformerTrainer]):
+    """What to train a pose transformer on, and how."""
+
+    kind = "pose-transformer"
+    config: PoseTransformerConfig = field(default_factory=PoseTransformerConfig)
+    """The network."""
+    settings: PoseTransformerSettings = field(default_factory=PoseTransformerSettings)
+    """How it is trained."""
+
+    def make_untaught(self, parts: Split) -> PoseTransformerTrainer:
+        """The trainer, its weights drawn."""
+        return PoseTransformerTrainer(self.config, self.settings, parts.train)
+
+
+def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotion:
+    """Interpolate what is not known, and forget contacts of toes that are not."""
+    toes = motion.known.positions[..., list(TOE_JOINTS)]
+    shown = replace(motion, contacts=torch.where(toes, motion.contacts, 0.5))
+    return interpolate_partial_motion(shown, network.mean_quats, float(network.mean_position[0, 1]))
+
+
+@torch.no_grad()
+def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: KnownParts) -> tuple[float, float]:
+    """Measure the mean distance of unknown joints from their true places, cm, and as a share of the interpolation's."""
+    shown = hide(network, replace(truth, known=known))
+    unknown = ~known.positions
+    places = _poses(truth)[0]
+    errors = [
+        float(((made - places).norm(dim=-1) * unknown).sum() / unknown.sum())
+        for made in (network(shown).poses(truth.offsets)[0], _poses(shown)[0])
+    ]
+    return 100 * errors[0], errors[0] / errors[1]
+
+
+def compute_losses(
+    network: PoseTransformerNetwork, truth: PartialMotion, hidden: PartialMotion, settings: PoseTransformerSettings
+) -> dict[str, Tensor]:
+    """Compute the loss, and in plain units the errors it is made of.
+
+    Distances, not squares, window by window divided by how many joints in how many frames are unknown: two lost joints
+    count as much as a gap. They are the same however the motion is turned. Windows that interpolation nearly solves
+    count for more, or the network learns to fidget where nobody moves.
+    """
+    shown, known = hide(network, hidden), hidden.known
+    proposed = network(shown)
+    wanted, wanted_world = _poses(truth)
+    guess = _poses(shown)[0]
+    made, made_world = proposed.poses(truth.offsets)
+    unknown, turned = ~known.positions, ~known.world_rotations
+    count = unknown.sum(dim=(1, 2)).clamp_min(1)
+    weight = _weigh_windows((guess - wanted).norm(dim=-1), unknown, settings.ease)
+    wrong = made - wanted
+    distance = _length(wrong)
+    places = (distance * unknown).sum(dim=(1, 2)) / count
+    slip = torch.diff(wrong, dim=1)
+    slipping = unknown[:, 1:] | unknown[:, :-1]
+    pace = (_length(slip) * slipping).sum(dim=(1, 2)) / count
+    twist = _length((made_world - wanted_world).flatten(-2))
+    turns = (twist * turned).sum(dim=(1, 2)) / turned.sum(dim=(1, 2)).clamp_min(1)
+    lost = unknown[..., 0]
+    hips = (distance[..., 0] * lost).sum(dim=1) / lost.sum(dim=1).clamp_min(1)
+    toes = list(TOE_JOINTS)
+    planted = truth.contacts[:, 1:] * truth.contacts[:, :-1] * slipping[..., toes]
+    feet = (_length(slip[..., toes, :]) * planted).sum(dim=(1, 2)) / planted.sum(dim=(1, 2)).clamp_min(1)
+    unsure = unknown[..., toes]
+    nats = cross_entropy(proposed.contacts, truth.contacts, reduction="none")
+    contacts = (nats * unsure).sum() / unsure.sum().clamp_min(1)
+    spread = _quantile_loss(proposed, distance.detach(), unknown)
+    terms = (
+        settings.places * places
+        + settings.pace * pace
+        + settings.turns * turns
+        + settings.hips * hips
+        + settings.feet * feet
+    )
+    loss = (weight * terms).mean() + settings.contacts * contacts + settings.spread * spread
+    return {
+        "loss": loss,
+        "places_cm": 100 * places.mean(),
+        "share": (places / ((guess - wanted).norm(dim=-1) * unknown).sum(dim=(1, 2)).clamp_min(1e-3) * count).mean(),
+        "pace_cm": 100 * pace.mean(),
+        "turns": turns.mean(),
+        "feet_cm": 100 * feet.mean(),
+        "contacts_nats": contacts,
+        "spread": spread,
+    }
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """Norm whose gradient is finite at zero."""
+    return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
+
+
+def _poses(motion: PartialMotion) -> tuple[Tensor, Tensor]:
+    """World positions and rotation matrices."""
+    local = rotations.to_matrix(
+        torch.cat(
+            [
+                rotations.multiply(rotations.about_y(motion.heading), motion.quats[..., 0, :])[..., None, :],
+                motion.quats[..., 1:, :],
+            ],
+            dim=-2,
+        )
+    )
+    none = motion.heading.new_zeros(())
+    return ProposedPoses(motion.root_position, local, none, none).poses(motion.offsets)
+
+
+def _weigh_windows(error: Tensor, unknown: Tensor, ease: float) -> Float[Tensor, " batch"]:
+    """Weigh windows by the mean error of the interpolation, metres: 1 at 5 cm."""
+    mean = (error * unknown).sum(dim=(1, 2)) / unknown.sum(dim=(1, 2)).clamp_min(1)
+    return ((0.05 + 0.01) / (mean + 0.01)) ** ease
+
+
+def _quantile_loss(proposed: ProposedPoses, distance: Tensor, unknown: Tensor) -> Tensor:
+    """Pinball loss of the logarithm of the error (Koenker and Bassett 1978)."""
+    over = torch.log(distance + 1e-4)[..., None] - proposed.log_spread
+    share = over.new_tensor(QUANTILES)
+    loss = torch.maximum(share * over, (share - 1) * over).sum(dim=-1)
+    return (loss * unknown).sum() / unknown.sum().clamp_min(1)
+
+
+def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
+    """Mean and spread of rotations and places of the data and its mirror image."""
+    batch = windows.draw(4000, 4, torch.Generator().manual_seed(0))
+    both = [batch, batch.mirrored()]
+    quats = torch.cat([each.quats for each in both]).flatten(0, 1)
+    six = to_six(rotations.to_matrix(quats))
+    mean = windows.mean_quats()
+    network.mean_quats.copy_(mean)
+    network.mean_rotation.copy_(six.mean(dim=0))
+    network.std_rotation.copy_(six.std(dim=0).clamp_min(_MIN_STD_ROTATION))
+    places = torch.cat(
+        [_poses(replace(each, heading=torch.zeros_like(each.heading)))[0] for each in both]
+    )
+    ground = torch.cat([each.root_position for each in both]) * places.new_tensor([1.0, 0.0, 1.0])
+    places = (places - ground[..., None, :]).flatten(0, 1)
+    network.mean_position.copy_(places.mean(dim=0))
+    network.std_position.copy_(places.std(dim=0).clamp_min(_MIN_STD_POSITION))
