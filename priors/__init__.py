@@ -9,6 +9,8 @@ from priors.keyframe_timing import model as keyframe_timing
 from priors.keyframe_timing.model import KeyframeTiming
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
+from priors.pose_transformer import inbetweener as pose_transformer
+from priors.pose_transformer.inbetweener import PoseTransformer
 from priors.refiner import network as refiner_network
 from priors.refiner.network import LstmRefiner
 
@@ -41,6 +43,11 @@ def load_denoiser(name: str = "denoiser") -> ConvDenoiser:
 def load_infiller(name: str = "infiller") -> ConvInfiller:
     """The bundled infiller, or a trained one by its file or run folder."""
     return infiller_network.load(name)
+
+
+def load_transformer(name: str = "transformer") -> PoseTransformer:
+    """The bundled pose transformer, or a trained one by its file or run folder."""
+    return pose_transformer.load(name)
 
 
 def load_keyframe_timing(name: str = "keyframe-timing") -> KeyframeTiming:

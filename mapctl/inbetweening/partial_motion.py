@@ -99,6 +99,15 @@ class PartialMotion:
     known: KnownParts
     """What is known."""
 
+    def slice(self, start: int, stop: int) -> "PartialMotion":
+        """Return frames start to stop."""
+        part, known = slice(start, stop), self.known
+        return PartialMotion(
+            *(each[:, part] for each in (self.root_position, self.heading, self.quats, self.contacts, self.targets)),
+            self.offsets,
+            KnownParts(**{name: values[:, part] for name, values in vars(known).items()}),
+        )
+
     def mirrored(self) -> "PartialMotion":
         """Exchange left and right."""
         flip = self.root_position.new_tensor([-1.0, 1.0, 1.0])

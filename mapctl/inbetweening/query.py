@@ -90,6 +90,9 @@ class Proposal:
     """Name of the in-betweener that proposed what `others` did not."""
     others: tuple[GapSource, ...] = ()
     """Gaps that others proposed, or that were left to `source` for a reason."""
+    spread: Float[Tensor, "frames joints 2"] | None = None
+    """Distances, metres, within which a joint's true position lies in half and in nine of ten of cases; None from an
+    in-betweener that does not know how sure it is."""
 
     def attribute(self, query: GapQuery) -> tuple[GapSource, ...]:
         """Name the source of each gap with known frames on both sides, and of the others' gaps, in temporal order."""

@@ -1,7 +1,7 @@
 """`mapctl bench TABLE`: what the solver costs on this machine, and what each job is worth; a sub-command a table."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
@@ -146,6 +146,26 @@ class Timing(MocapTable):
     work = "mapctl.commands.bench.timing"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Transitions(Table):
+    """Gaps of such clips by LaFAN1's protocol: errors beside slerp and retrieval, feet, jitter and the worst frame."""
+
+    work = "mapctl.commands.bench.transitions"
+
+    data: options.DataFolder
+    """The folder that was trained on, for the clips that were held out."""
+    count: options.Count = 100
+    """Clips, spread over the kinds."""
+    past: Annotated[Literal["1", "10", "all"], arg(metavar="1|10|all")] = "10"
+    """Frames that are known before a gap, one being known after it; all shows the whole clip."""
+    transformer: options.Name = "transformer"
+    """The bundled pose transformer, or the file or run folder of a trained one."""
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = "infiller"
+    """Other in-betweeners to compare, bundled or trained."""
+    raw: bool = False
+    """Leave out the rows that a MAP stage finishes."""
+
+
 @dataclass(frozen=True)
 class Bench(Command):
     """Cost of the solver on this machine (`mapctl bench` alone), and what the jobs are worth: a table each."""
@@ -162,6 +182,7 @@ TABLES: dict[str, type[Table]] = {
     "infill": Infill,
     "tween": Tween,
     "gaps": Gaps,
+    "transitions": Transitions,
     "timing": Timing,
 }
 """By the name the user types; the first is what `mapctl bench` alone measures."""

@@ -12,9 +12,17 @@ from mapctl.commands.train.infiller import TrainInfiller
 from mapctl.commands.train.keyframe_timing import TrainKeyframeTiming
 from mapctl.commands.train.lstm_gmm import TrainDensity
 from mapctl.commands.train.options import TrainOptions
+from mapctl.commands.train.pose_transformer import TrainPoseTransformer
 from mapctl.commands.train.refiner import TrainRefiner
 
-MODELS: tuple[type[TrainOptions], ...] = (TrainDensity, TrainRefiner, TrainDenoiser, TrainInfiller, TrainKeyframeTiming)
+MODELS: tuple[type[TrainOptions], ...] = (
+    TrainDensity,
+    TrainRefiner,
+    TrainDenoiser,
+    TrainPoseTransformer,
+    TrainInfiller,
+    TrainKeyframeTiming,
+)
 """Whatever can be trained: the options of each recipe in `priors.training.recipes`."""
 
 if TYPE_CHECKING:

@@ -1,0 +1,41 @@
+"""`mapctl train pose-transformer`: the options of a pose transformer."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from mapctl.commands.shared import options
+from mapctl.commands.train.options import TunableOptions
+
+if TYPE_CHECKING:
+    from priors.training.recipes.pose_transformer import PoseTransformerRecipe
+
+
+@dataclass(frozen=True)
+class TrainPoseTransformer(TunableOptions):
+    """Train the pose transformer that infill, tween, blend and chain begin with; --batch is in frames."""
+
+    model = "pose-transformer"
+    used_by = "use it with --transformer"
+
+    width: options.MaybeCount = None
+    """Numbers of a frame's token; a multiple of twice the heads."""
+    layers: options.MaybeCount = None
+    """Layers of attention."""
+
+    def recipe(self) -> "PoseTransformerRecipe":
+        """The options as the trainer takes them; RequestError for numbers that make no sense."""
+        from priors.training.recipes.pose_transformer import (
+            PoseTransformerConfig,
+            PoseTransformerRecipe,
+            PoseTransformerSettings,
+        )
+
+        common = self.common()
+        given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
+        return PoseTransformerRecipe(
+            **common,
+            config=replace(PoseTransformerConfig(), **self.select_given("width", "layers")),
+            settings=replace(PoseTransformerSettings(), bfloat16=self.bfloat16, **given),
+            skip_first=self.skip_first,
+            init=self.init,
+        )

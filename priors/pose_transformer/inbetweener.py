@@ -1,0 +1,210 @@
+"""The pose transformer as an in-betweener: from a query to a proposal on the character's bones, of any length."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import contacts, rotations
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.partial_motion import (
+    EFFECTORS,
+    KnownParts,
+    PartialMotion,
+    interpolate_partial_motion,
+)
+from mapctl.inbetweening.query import GapSource
+from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.numerics.intervals import true_intervals
+from mapctl.protocols import Inbetweener
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from priors import checkpoints
+from priors.pose_transformer.network import (
+    PoseTransformerConfig,
+    PoseTransformerNetwork,
+    ProposedPoses,
+    from_six,
+    to_six,
+)
+
+SOURCE = "transformer"
+"""Name of the in-betweener in notes."""
+MAX_GAP_FRAMES = 180
+"""Frames of the longest gap that it fills; longer ones it leaves interpolated, and says so."""
+_CONTEXT = 24  # frames on either side of what is unknown that the network sees
+_MAX_WINDOW, _OVERLAP = 240, 60  # frames of the longest window, and of two windows that share frames
+_PARTNERS = CANONICAL.mirror_partners()
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTransformer(Inbetweener):
+    """A trained pose transformer."""
+
+    name: str
+    """Name under which it was loaded."""
+    network: PoseTransformerNetwork
+    """Network in evaluation mode."""
+    card: checkpoints.Card
+    """Card of the weights."""
+
+    @property
+    def takes_partial_keys(self) -> bool:
+        """It is told places of hands, feet and hips in single frames."""
+        return True
+
+    @torch.no_grad()
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose the mean of the outputs for the query and for its mirror image, without sampling.
+
+        Gaps of more than MAX_GAP_FRAMES in which nothing is known stay interpolated.
+        """
+        motion = self._show(query)
+        poses = _average_mirrored(self._propose_windows(motion), self._propose_windows(motion.mirrored()))
+        root = poses.root_position[0].double() * query.scale
+        quats = rotations.from_matrix(poses.local_matrix[0].double())
+        shown, missing = query.motion, query.missing
+        too_long = _find_too_long(query)
+        # What is known keeps the query's own numbers.
+        root = torch.where((missing.root & ~too_long)[:, None], root, shown.root_position)
+        turned = missing.joints & ~too_long[:, None]
+        quats = torch.where(turned[..., None], quats, shown.local_quat_xyzw)
+        quats = blend_seams_in_rotations(quats, turned, fps=PRIOR_FPS)
+        root = blend_seams_in_positions(root, missing.root & ~too_long, fps=PRIOR_FPS)
+        logits = torch.where(
+            motion.known.positions[0][:, list(TOE_JOINTS)], contacts.to_logits(motion.contacts[0] > 0.5), poses.contacts[0]
+        )
+        reason = f"longer than the {MAX_GAP_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} fills"
+        others = tuple(
+            GapSource(start, stop, "interpolation", reason) for _, start, stop in true_intervals(too_long[:, None])
+        )
+        spread = poses.log_spread[0].exp() * query.scale
+        return Proposal(
+            replace(shown, root_position=root, local_quat_xyzw=quats), logits, SOURCE, others, spread
+        )
+
+    def _show(self, query: GapQuery) -> PartialMotion:
+        """Return the query as the network takes it, of unit size, and interpolated anew as in its training."""
+        body, missing = query.motion, query.missing
+        heading, tilt = rotations.split_heading(body.local_quat_xyzw[:, 0])
+        quats = torch.cat([tilt[:, None], body.local_quat_xyzw[:, 1:]], dim=1)
+        nowhere = torch.zeros_like(missing.root)
+        targets, wanted = torch.zeros(len(quats), len(EFFECTORS), 3), nowhere[:, None].expand(-1, len(EFFECTORS))
+        known = KnownParts(
+            ~missing.joints[None],
+            ~missing.joints[None, :, 0],
+            ~missing.root[None],
+            ~missing.root[None],
+            (missing.root if query.keep_trajectory else nowhere)[None],
+            wanted[None],
+        )
+        if query.effector_targets is not None:
+            targets = (query.effector_targets.places[:, list(EFFECTORS)] / query.scale).float()
+            wanted = query.effector_targets.wanted[:, list(EFFECTORS)][None] & ~known.positions[..., list(EFFECTORS)]
+            known = replace(known, effectors=wanted)
+        toes = body.joint_positions()[:, list(TOE_JOINTS)] / query.scale
+        planted = torch.where(
+            known.positions[0][:, list(TOE_JOINTS)], contacts.detect_contacts(toes, PRIOR_FPS).float(), 0.5
+        )
+        motion = PartialMotion(
+            (body.root_position / query.scale).float()[None],
+            rotations.unwrap_angle(heading).float()[None],
+            quats.float()[None],
+            planted[None],
+            targets[None],
+            (body.skeleton.offsets / query.scale).float()[None],
+            known,
+        )
+        return interpolate_partial_motion(motion, self.network.mean_quats, float(self.network.mean_position[0, 1]))
+
+    def _propose_windows(self, motion: PartialMotion) -> ProposedPoses:
+        """Propose window by window; where two overlap, one fades into the other."""
+        frames = motion.heading.shape[1]
+        joined, weights = _rows_of(motion), torch.zeros(frames)
+        for first, stop in _lay_windows(~motion.known.everything[0]):
+            rows = _pack(self.network(motion.slice(first, stop)))
+            fade = _fade_in(first, weights, stop)
+            joined[first:stop] = torch.lerp(joined[first:stop], rows, fade[:, None])
+            weights[first:stop] = 1.0
+        return _unpack(joined)
+
+
+def _lay_windows(unknown: Bool[Tensor, " frames"]) -> Iterator[tuple[int, int]]:
+    """Yield first frame and one past the last of windows around what is unknown."""
+    frames = len(unknown)
+    near = unknown.clone()
+    for _, start, stop in true_intervals(unknown[:, None]):
+        near[max(0, start - _CONTEXT // 2) : stop + _CONTEXT // 2] = True
+    for _, start, stop in true_intervals(near[:, None]):
+        first, stop = max(0, start - _CONTEXT // 2), min(frames, stop + _CONTEXT // 2)
+        while stop - first > _MAX_WINDOW:
+            yield first, first + _MAX_WINDOW
+            first += _MAX_WINDOW - _OVERLAP
+        yield first, stop
+
+
+def _fade_in(first: int, weights: Float[Tensor, " frames"], stop: int) -> Float[Tensor, " window"]:
+    """Return the share of a window by frame: rising where another one has been before."""
+    shared = int(weights[first:stop].sum())
+    fade = torch.ones(stop - first)
+    if shared > 1:
+        fade[:shared] = torch.linspace(0, 1, shared)
+    return fade
+
+
+def _find_too_long(query: GapQuery) -> Bool[Tensor, " frames"]:
+    """Return frames of gaps in which nothing is told and that are longer than the network knows."""
+    silent = query.nothing_known
+    if query.effector_targets is not None:
+        silent = silent & ~query.effector_targets.wanted.any(dim=1)
+    if query.keep_trajectory:
+        silent = silent & ~query.missing.root
+    found = torch.zeros_like(silent)
+    for _, start, stop in true_intervals(silent[:, None]):
+        found[start:stop] = stop - start > MAX_GAP_FRAMES
+    return found
+
+
+def _rows_of(motion: PartialMotion) -> Float[Tensor, "frames rows"]:
+    """Return rows as of a proposal that is the motion itself."""
+    hips = rotations.multiply(rotations.about_y(motion.heading), motion.quats[..., 0, :])
+    local = rotations.to_matrix(torch.cat([hips.unsqueeze(-2), motion.quats[..., 1:, :]], dim=-2))
+    logits = contacts.to_logits(motion.contacts > 0.5)
+    spread = motion.root_position.new_full((*motion.heading.shape, CANONICAL.num_joints, 2), -9.0)
+    return _pack(ProposedPoses(motion.root_position, local, logits, spread))
+
+
+def _pack(poses: ProposedPoses) -> Float[Tensor, "frames rows"]:
+    parts = (poses.root_position, to_six(poses.local_matrix).flatten(-2), poses.contacts, poses.log_spread.flatten(-2))
+    return torch.cat(parts, dim=-1)[0]
+
+
+def _unpack(rows: Float[Tensor, "frames rows"]) -> ProposedPoses:
+    joints = CANONICAL.num_joints
+    root, six, logits, spread = rows[None].split([3, 6 * joints, 2, 2 * joints], dim=-1)
+    return ProposedPoses(root, from_six(six.unflatten(-1, (joints, 6))), logits, spread.unflatten(-1, (joints, 2)))
+
+
+def _average_mirrored(one: ProposedPoses, other: ProposedPoses) -> ProposedPoses:
+    """Return the mean of a proposal and the mirror image of another."""
+    flip = one.root_position.new_tensor([-1.0, 1.0, 1.0])
+    signs = flip[:, None] * flip
+    local = other.local_matrix[..., _PARTNERS, :, :] * signs
+    return ProposedPoses(
+        (one.root_position + other.root_position * flip) / 2,
+        from_six((to_six(one.local_matrix) + to_six(local)) / 2),
+        (one.contacts + other.contacts.flip(-1)) / 2,
+        (one.log_spread + other.log_spread[..., _PARTNERS, :]) / 2,
+    )
+
+
+def load(name: str = "transformer") -> PoseTransformer:
+    """Load the bundled pose transformer, or a trained one by its file or run folder; CheckpointError for anything
+    else.
+    """
+    with checkpoints.open_checkpoint(name, "pose-transformer") as (tensors, card):
+        network = PoseTransformerNetwork(PoseTransformerConfig.of_card(card.config))
+        network.load_state_dict(tensors)
+    return PoseTransformer(name, network.eval().requires_grad_(False), card)
