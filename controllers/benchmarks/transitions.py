@@ -88,7 +88,9 @@ def benchmark_transitions(
                 began = time.process_time()
                 filled = [_fill(method, gap) for gap in gaps]
                 cost = 1000 * (time.process_time() - began) / (length * len(gaps))
-                here.append({"method": name, **_compare(filled, gaps, std), **_measure_motion(filled), "frame_ms": cost})
+                here.append(
+                    {"method": name, **_compare(filled, gaps, std), **_measure_motion(filled), "frame_ms": cost}
+                )
                 made[name] += [_cut(motion) for motion in filled] if length == _REALISM_LENGTH else []
                 if progress is not None:
                     progress(min(total, len(rows) + len(found) + len(here)), total)
@@ -99,9 +101,7 @@ def benchmark_transitions(
     return rows
 
 
-def of_inbetweener(
-    inbetweener: Inbetweener, densities: Sequence[Density] = (), *, finish: bool = True
-) -> Method:
+def of_inbetweener(inbetweener: Inbetweener, densities: Sequence[Density] = (), *, finish: bool = True) -> Method:
     """Return the method of an in-betweener, raw or finished by MAP, as `mapctl infill` runs it."""
 
     def method(part: Motion, start: int, stop: int) -> Motion:

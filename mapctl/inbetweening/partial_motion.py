@@ -18,9 +18,7 @@ from mapctl.skeleton import CANONICAL, LIMBS, mirror_name
 EFFECTORS = tuple(limb.end for limb in LIMBS.values())
 """Canonical joints that may have a target: hands and feet."""
 _PARTNERS = CANONICAL.mirror_partners()
-_EFFECTOR_PARTNERS = [
-    EFFECTORS.index(CANONICAL.index(mirror_name(CANONICAL.names[joint]))) for joint in EFFECTORS
-]
+_EFFECTOR_PARTNERS = [EFFECTORS.index(CANONICAL.index(mirror_name(CANONICAL.names[joint]))) for joint in EFFECTORS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,11 @@ class PartialMotion:
         """Return frames start to stop."""
         part, known = slice(start, stop), self.known
         return PartialMotion(
-            *(each[:, part] for each in (self.root_position, self.heading, self.quats, self.contacts, self.targets)),
+            self.root_position[:, part],
+            self.heading[:, part],
+            self.quats[:, part],
+            self.contacts[:, part],
+            self.targets[:, part],
             self.offsets,
             KnownParts(**{name: values[:, part] for name, values in vars(known).items()}),
         )

@@ -70,9 +70,7 @@ def positions_from_matrices(
 
 
 def chain_matrices(
-    offsets: Float[Tensor, "*shape joints 3"],
-    parents: Sequence[int],
-    local_matrix: Float[Tensor, "*batch joints 3 3"],
+    offsets: Float[Tensor, "*shape joints 3"], parents: Sequence[int], local_matrix: Float[Tensor, "*batch joints 3 3"]
 ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch joints 3 3"]]:
     """Return the joint positions (metres) relative to the root at the origin, and the world rotation matrices.
 

@@ -10,12 +10,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.partial_motion import (
-    EFFECTORS,
-    KnownParts,
-    PartialMotion,
-    interpolate_partial_motion,
-)
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.numerics.intervals import true_intervals
@@ -74,16 +69,16 @@ class PoseTransformer(Inbetweener):
         quats = blend_seams_in_rotations(quats, turned, fps=PRIOR_FPS)
         root = blend_seams_in_positions(root, missing.root & ~too_long, fps=PRIOR_FPS)
         logits = torch.where(
-            motion.known.positions[0][:, list(TOE_JOINTS)], contacts.to_logits(motion.contacts[0] > 0.5), poses.contacts[0]
+            motion.known.positions[0][:, list(TOE_JOINTS)],
+            contacts.to_logits(motion.contacts[0] > 0.5),
+            poses.contacts[0],
         )
         reason = f"longer than the {MAX_GAP_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} fills"
         others = tuple(
             GapSource(start, stop, "interpolation", reason) for _, start, stop in true_intervals(too_long[:, None])
         )
         spread = poses.log_spread[0].exp() * query.scale
-        return Proposal(
-            replace(shown, root_position=root, local_quat_xyzw=quats), logits, SOURCE, others, spread
-        )
+        return Proposal(replace(shown, root_position=root, local_quat_xyzw=quats), logits, SOURCE, others, spread)
 
     def _show(self, query: GapQuery) -> PartialMotion:
         """Return the query as the network takes it, of unit size, and interpolated anew as in its training."""

@@ -26,9 +26,11 @@ _ROTATION_ROWS = 6 * _JOINTS
 _FLAG_ROWS = _JOINTS + 4
 _TARGET_ROWS = 4 * len(EFFECTORS)
 _TIME_ROWS = 3 * 2 * 3
-_ROWS = _ROTATION_ROWS + 6 * _JOINTS + 1 + _FLAG_ROWS + _TARGET_ROWS + 2 + _TIME_ROWS
+_TRAVEL_ROWS = 4
+_ROWS = _ROTATION_ROWS + 6 * _JOINTS + 1 + _FLAG_ROWS + _TARGET_ROWS + 2 + _TIME_ROWS + _TRAVEL_ROWS
 _OUT_ROWS = _ROTATION_ROWS + 3 + 2
 _STEP_UNIT, _TURN_UNIT, _TARGET_UNIT, _BONE_UNIT, _HIPS_UNIT = 0.05, 0.05, 0.2, 0.03, 0.1  # metres, radians
+_TRAVEL_UNIT = 2.0  # metres
 _NEAR_FRAMES, _FAR_FRAMES = 5.0, 120.0  # frames: scales of the time to a known frame
 QUANTILES = (0.5, 0.9)
 """Shares of errors that the two spreads are to contain."""
@@ -44,12 +46,14 @@ class PoseTransformerConfig(NetworkConfig):
     """Layers of attention."""
     heads: int = 6
     """Heads of each."""
-    kernel: int = 0
-    """Frames of a convolution in each layer before its attention; 0 for none."""
+    kernel: int = 5
+    """Frames of each layer's convolution, one number at a time, before its attention; odd, 0 for none."""
 
     def __post_init__(self):
         if min(self.width, self.layers, self.heads) < 1 or self.width % (2 * self.heads):
             raise RequestError(f"a pose transformer needs layers and a width of whole pairs a head, got {self}")
+        if self.kernel and self.kernel % 2 == 0:
+            raise RequestError(f"a pose transformer's kernel must be odd, got {self.kernel}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,20 +132,27 @@ class PoseTransformerNetwork(nn.Module):
         world = rotations.rotate_about_y(local, motion.heading[..., None]) + ground
         step = rotations.rotate_about_y(_difference(world), -motion.heading[..., None]) / _STEP_UNIT
         turn = _difference(motion.heading[..., None]) / _TURN_UNIT
-        aim = rotations.rotate_about_y(
-            motion.targets - world[..., list(EFFECTORS), :], -motion.heading[..., None]
-        )
+        aim = rotations.rotate_about_y(motion.targets - world[..., list(EFFECTORS), :], -motion.heading[..., None])
         aim = torch.where(known.effectors[..., None], aim / _TARGET_UNIT, 0.0)
         places = (local - self.mean_position) / self.std_position
         flags = _encode_flags(known)
         return torch.cat(
-            [six.flatten(-2), places.flatten(-2), step.flatten(-2), turn, aim.flatten(-2), 2 * motion.contacts - 1]
-            + [flags.to(six), _encode_times(known).to(six)],
+            [
+                *(each.flatten(-2) for each in (six, places, step, aim)),
+                turn,
+                2 * motion.contacts - 1,
+                flags,
+                _encode_times(known),
+                _encode_travel(motion),
+            ],
             dim=-1,
         )
 
     def _decode_rotations(
-        self, out: Float[Tensor, "batch frames rows"], shown: Float[Tensor, "batch frames joints 3 3"], motion: PartialMotion
+        self,
+        out: Float[Tensor, "batch frames rows"],
+        shown: Float[Tensor, "batch frames joints 3 3"],
+        motion: PartialMotion,
     ) -> Float[Tensor, "batch frames joints 3 3"]:
         """Return local rotations with corrections where they are not known; the hips' in the world."""
         six = to_six(shown) + out.unflatten(-1, (_JOINTS, 6)) * self.std_rotation
@@ -230,6 +241,14 @@ def _encode_flags(known: KnownParts) -> Float[Tensor, "batch frames flags"]:
     return torch.cat([known.rotations, told, known.effectors], dim=-1).float()
 
 
+def _encode_travel(motion: PartialMotion) -> Float[Tensor, "batch frames 4"]:
+    """Encode where the hips are and face, seen from the first frame."""
+    ground, facing = motion.root_position[..., ::2], motion.heading
+    travelled = rotations.rotate_ground(ground - ground[:, :1], -facing[:, :1]) / _TRAVEL_UNIT
+    turned = facing - facing[:, :1]
+    return torch.cat([travelled, torch.sin(turned)[..., None], torch.cos(turned)[..., None]], dim=-1)
+
+
 def _encode_times(known: KnownParts) -> Float[Tensor, "batch frames times"]:
     """Encode frames since and until a rotation, the hips' place, and a target were known, each on three scales."""
     told = (known.rotations.any(dim=-1), known.ground, known.effectors.any(dim=-1))
@@ -240,6 +259,8 @@ def _encode_distance(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batc
     frame = torch.arange(known.shape[1], device=known.device)
     before, after = frame - last_observed(known), next_observed(known) - frame
     none = ~known.any(dim=1)[:, None]
-    far = torch.stack([torch.where((each < 0) | none, 2 * _FAR_FRAMES, each.float()) for each in (before, after)], dim=-1)
+    far = torch.stack(
+        [torch.where((each < 0) | none, 2 * _FAR_FRAMES, each.float()) for each in (before, after)], dim=-1
+    )
     near = torch.exp(-far / _NEAR_FRAMES)
     return torch.cat([far.clamp(max=2 * _FAR_FRAMES) / _FAR_FRAMES, torch.log1p(far) / 3 - 0.7, near], dim=-1)

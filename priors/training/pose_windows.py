@@ -10,14 +10,20 @@ from torch import Tensor
 
 from mapctl import kinematics, rotations
 from mapctl.features import LAYOUT, GroundPose, integrate_root
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL
 from priors.training.corpus import Corpus
 
 _CHUNK_FRAMES = 50_000  # frames
-_WIDTHS = (("Shoulder", "UpperArm"), ("UpperLeg",))
-_LENGTHS = (("spine", "chest", "neck", "head"), ("LowerArm",), ("Hand",))
+_VARIED = (
+    (("leftShoulder", "rightShoulder", "leftUpperArm", "rightUpperArm"), 1),
+    (("leftUpperLeg", "rightUpperLeg"), 1),
+    (("spine", "chest", "neck", "head"), 3),
+    (("leftLowerArm", "rightLowerArm"), 3),
+    (("leftHand", "rightHand"), 3),
+)
+"""Joints whose bones vary together, and how many of their axes: widths along x alone, lengths along all."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,7 @@ class PoseWindows:
     def mean_quats(self) -> Float[Tensor, "joints 4"]:
         """Mean rotation of each joint, of a motion and its mirror image."""
         sample = self.quats[:: max(1, len(self.quats) // 20_000)]
-        both = torch.cat([sample, _mirror(sample)])
+        both = torch.cat([sample, mirror_quats(sample)])
         return torch.stack([_average(both[:, joint]) for joint in range(CANONICAL.num_joints)])
 
 
@@ -107,12 +113,6 @@ def _average(quats: Float[Tensor, "count 4"]) -> Float[Tensor, " 4"]:
     """Return the mean rotation: the first eigenvector of the quaternions' second moment (Markley et al. 2007)."""
     mean = torch.linalg.eigh(quats.double().T @ quats.double())[1][:, -1].float()
     return mean if mean[3] >= 0 else -mean
-
-
-def _mirror(quats: Tensor) -> Tensor:
-    from mapctl.inbetweening.partial_motion import mirror_quats
-
-    return mirror_quats(quats)
 
 
 def _find_kind(name: str, kinds: Sequence[str]) -> int:
@@ -134,12 +134,10 @@ def _reshape_bodies(window: PartialMotion, variation: Variation, generator: torc
     """Give bodies other widths and lengths, the same on both sides."""
     batch = len(window.offsets)
     factors = torch.ones(batch, CANONICAL.num_joints, 3)
-    chosen = (torch.rand(batch, generator=generator) < variation.share)[:, None, None]
-    for names, axes in [(names, (0,)) for names in _WIDTHS] + [(names, (0, 1, 2)) for names in _LENGTHS]:
+    for joints, axes in _VARIED:
         factor = 1 + variation.bones * (2 * torch.rand(batch, generator=generator) - 1)
-        for joint, name in enumerate(CANONICAL.names):
-            if name.endswith(names) and name not in ("leftShoulder", "rightShoulder") or "Shoulder" in names and name.endswith("Shoulder"):
-                factors[:, joint, list(axes)] = factor[:, None]
+        factors[:, CANONICAL.indices(joints), :axes] = factor[:, None, None]
+    chosen = (torch.rand(batch, generator=generator) < variation.share)[:, None, None]
     return replace(window, offsets=torch.where(chosen, window.offsets * factors, window.offsets))
 
 

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -76,15 +76,15 @@ class GradientTrainer(Trainer[Network]):
         super().__init__(steps=steps, seed=seed)
         self.learning_rate = learning_rate
         self.network = draw_weights(make, seed)
-        self.optimiser = self.make_optimiser()
+        self._optimisers = self.make_optimisers()
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch: `loss`, and its parts in plain units."""
 
-    def make_optimiser(self) -> torch.optim.Optimizer:
-        """For the network's weights."""
-        return torch.optim.AdamW(self.network.parameters(), lr=self.learning_rate, weight_decay=1e-4)
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """For the network's weights, by their names in checkpoints; all have the same learning rate."""
+        return {"optimiser": make_adam(self.network.parameters(), self.learning_rate)}
 
     def compute_learning_rate(self) -> float:
         """At the current step."""
@@ -96,21 +96,29 @@ class GradientTrainer(Trainer[Network]):
 
     def train_step(self) -> dict[str, float]:
         """One update; the parts of its loss. MapctlError, and no update, where that is no number."""
-        for group in self.optimiser.param_groups:
+        optimisers = self._optimisers.values()
+        for group in [group for optimiser in optimisers for group in optimiser.param_groups]:
             group["lr"] = self.compute_learning_rate()
         parts = self.losses()
         if not torch.isfinite(parts["loss"]):
             raise make_divergence_error(self.step + 1, f"the loss is {parts['loss'].item()}")
-        self.optimiser.zero_grad(set_to_none=True)
+        for optimiser in optimisers:
+            optimiser.zero_grad(set_to_none=True)
         parts["loss"].backward()
         self.limit_gradients()
-        self.optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         self.step += 1
         return {name: float(value.detach()) for name, value in parts.items()}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """The one."""
-        return {"optimiser": self.optimiser}
+        """All."""
+        return self._optimisers
+
+
+def make_adam(weights: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
+    """The usual optimiser."""
+    return torch.optim.AdamW(weights, lr=learning_rate, weight_decay=1e-4)
 
 
 Drawn = TypeVar("Drawn")

@@ -21,6 +21,8 @@ class TrainPoseTransformer(TunableOptions):
     """Numbers of a frame's token; a multiple of twice the heads."""
     layers: options.MaybeCount = None
     """Layers of attention."""
+    plain: bool = False
+    """The plainest network of the kind, to compare: no convolutions, AdamW for all weights."""
 
     def recipe(self) -> "PoseTransformerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -32,10 +34,11 @@ class TrainPoseTransformer(TunableOptions):
 
         common = self.common()
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
+        plain = ({"kernel": 0}, {"optimiser": "adam", "learning_rate": 8e-4}) if self.plain else ({}, {})
         return PoseTransformerRecipe(
             **common,
-            config=replace(PoseTransformerConfig(), **self.select_given("width", "layers")),
-            settings=replace(PoseTransformerSettings(), bfloat16=self.bfloat16, **given),
+            config=replace(PoseTransformerConfig(), **plain[0], **self.select_given("width", "layers")),
+            settings=replace(PoseTransformerSettings(), bfloat16=self.bfloat16, **{**plain[1], **given}),
             skip_first=self.skip_first,
             init=self.init,
         )

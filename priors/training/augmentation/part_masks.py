@@ -1,5 +1,4 @@
-"""What stays known of training windows: gaps between runs of whole poses, parts and targets in them, lost joints, keys.
-"""
+"""What stays known of training windows: gaps between runs of poses, what is told in them, lost joints, and keys."""
 
 import math
 from dataclasses import dataclass, replace
@@ -129,8 +128,8 @@ def _tell_parts(
     single = chosen(0.5, 0.72) & (draw.uniform(draw.frames) < draw.uniform(1) ** 2 * 0.15)
     hips = (throughout & stretch) | single
     heading = known.heading | (hips & (draw.uniform(1) < 0.7))
-    rotations[..., 0] |= known.rotations[..., 0] | (hips & heading & (draw.uniform(1) < 0.6))
-    ground, height = (known.__getattribute__(n) | (hips & (draw.uniform(1) < 0.85)) for n in ("ground", "height"))
+    rotations[..., 0] |= hips & heading & (draw.uniform(1) < 0.6)
+    ground, height = (each | (hips & (draw.uniform(1) < 0.85)) for each in (known.ground, known.height))
     path = chosen(0.35, 0.5) & ~ground
     reached = draw.uniform(draw.frames, 1) < draw.uniform(1, 1) ** 2 * 0.12
     held = draw.mark(draw.uniform() * draw.frames, 1 + draw.uniform() * 12)[..., None]

@@ -163,12 +163,13 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         warm = min(1.0, (self.step + 1) / 200)
         return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / settings.steps)))
 
-    def make_optimiser(self) -> torch.optim.Optimizer:
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """The recipe's own."""
         settings, parameters = self.settings, self.network.parameters()
         if settings.optimiser == "rmsprop":
-            return torch.optim.RMSprop(parameters, lr=settings.learning_rate, alpha=0.9)
-        return torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+            return {"optimiser": torch.optim.RMSprop(parameters, lr=settings.learning_rate, alpha=0.9)}
+        decay = settings.weight_decay
+        return {"optimiser": torch.optim.AdamW(parameters, lr=settings.learning_rate, weight_decay=decay)}
 
     def validate(self, corpus: Corpus) -> dict[str, float]:
         """Likelihood and the health of free runs: likelihood does not predict stability."""
