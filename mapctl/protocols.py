@@ -251,6 +251,13 @@ class Inbetweener(Protocol):
         """A cheaper in-betweener whose trajectory foretells this one's. Default: itself."""
         return self
 
+    @property
+    def takes_partial_keys(self) -> bool:
+        """Whether it makes a motion through effector targets, and through hips that are known alone in single frames.
+        Default: no; such keys are then hidden from it, and reached by the motion that it proposes without them.
+        """
+        return False
+
     @abstractmethod
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a motion of the query's frames without gaps; what is drawn is drawn from the generator, or from a

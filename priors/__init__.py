@@ -45,6 +45,12 @@ def load_infiller(name: str = "infiller") -> ConvInfiller:
     return infiller_network.load(name)
 
 
+def load_inbetweener(name: str = "transformer") -> ConvInfiller | PoseTransformer:
+    """The bundled in-betweener of that name, or a trained one of either kind by its file or run folder."""
+    kind = checkpoints.read_card(checkpoints.locate(name).with_suffix(".json")).kind
+    return load_infiller(name) if kind == "infiller" else load_transformer(name)
+
+
 def load_transformer(name: str = "transformer") -> PoseTransformer:
     """The bundled pose transformer, or a trained one by its file or run folder."""
     return pose_transformer.load(name)

@@ -7,6 +7,7 @@ from helpers import generator, tiny_density, tiny_model, walk
 from linear_inbetweener import LinearInbetweener
 from tiny_infiller import tiny_infiller
 from tiny_refiner import refiner_of
+from tiny_transformer import tiny_transformer
 from toy_density import toy_density
 
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
@@ -143,10 +144,12 @@ _QUICK = RolloutSettings(
     ahead=4, method=LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=8))
 )
 INBETWEENERS: dict[str, Inbetweener] = {
+    "transformer": tiny_transformer(drawn=0.05),
     "infiller": tiny_infiller(drawn=0.02),
     "slerp": SlerpInbetweener(),
     "rollouts": RolloutInbetweener([tiny_density()], SlerpInbetweener(), _QUICK),
     "auto": AutoInbetweener(tiny_infiller(drawn=0.02), [tiny_density()]),
+    "auto with the transformer": AutoInbetweener(tiny_transformer(drawn=0.05), [tiny_density()]),
     "linear": LinearInbetweener(),
 }
 """One of each method, and one that knows only `mapctl.protocols`."""

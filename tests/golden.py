@@ -72,25 +72,26 @@ COMMANDS = {
     "denoise with a prior": "denoise noisy.bvh -o clean-2.bvh --denoiser denoiser.safetensors --prior tiny.safetensors"
     " --mask mask.csv --anchor",
     "denoise causal": "denoise noisy.bvh -o causal.bvh --denoiser denoiser.safetensors --causal",
-    "infill": "infill walk.bvh -o filled.bvh --gap 10:22 --infiller infiller.safetensors --report filled.json",
+    "infill": "infill walk.bvh -o filled.bvh --gap 10:22 --inbetweener infiller.safetensors --report filled.json",
     "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand"
-    " --infiller infiller.safetensors --prior tiny.safetensors",
-    "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --infiller infiller.safetensors",
+    " --inbetweener infiller.safetensors --prior tiny.safetensors",
+    "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --inbetweener infiller.safetensors",
     "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method slerp --no-finish",
-    "infill by rollouts": "infill walk.bvh -o rolled.bvh --gap 10:22 --method rollouts --infiller infiller.safetensors"
-    " --prior tiny.safetensors --seed 2",
-    "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --infiller infiller.safetensors --report tweened.json",
-    "tween file": "tween keys.toml -o keyed.bvh --infiller infiller.safetensors --prior tiny.safetensors",
-    "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --infiller infiller.safetensors --suggest-timing"
-    " --method infiller --no-finish",
-    "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,24 --infiller infiller.safetensors"
+    "infill by rollouts": "infill walk.bvh -o rolled.bvh --gap 10:22 --method rollouts"
+    " --inbetweener infiller.safetensors --prior tiny.safetensors --seed 2",
+    "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
+    " --report tweened.json",
+    "tween file": "tween keys.toml -o keyed.bvh --inbetweener infiller.safetensors --prior tiny.safetensors",
+    "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
+    " --suggest-timing --method infiller --no-finish",
+    "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,24 --inbetweener infiller.safetensors"
     " --prior tiny.safetensors --variations 2",
-    "tween best": "tween walk.bvh -o best.bvh --keyframes 0,16 --infiller infiller.safetensors --prior tiny.safetensors"
-    " --best-of 2",
+    "tween best": "tween walk.bvh -o best.bvh --keyframes 0,16 --inbetweener infiller.safetensors"
+    " --prior tiny.safetensors --best-of 2",
     "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp --no-finish",
     "blend": "blend walk.bvh --from other.bvh --joints leftHand --frames 5:15 --at 12 -o blended.bvh"
-    " --infiller infiller.safetensors",
-    "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --infiller infiller.safetensors",
+    " --inbetweener infiller.safetensors",
+    "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --inbetweener infiller.safetensors",
     "convert": "convert walk.bvh canonical.npz --rig canonical",
     "convert rate": "convert walk.bvh slower.glb --fps 24",
     "measure": "measure follow.bvh --curve wave:0.5x2 --reference walk.bvh --prior tiny.safetensors --json",

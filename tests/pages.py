@@ -24,10 +24,10 @@ _TINY = {
     "steer": {"--prior": "prior.safetensors"},
     "measure": {"--prior": "prior.safetensors"},
     "denoise": {"--denoiser": "denoiser.safetensors"},
-    "infill": {"--infiller": "infiller.safetensors", "--prior": "prior.safetensors"},
-    "tween": {"--infiller": "infiller.safetensors", "--prior": "prior.safetensors"},
-    "blend": {"--infiller": "infiller.safetensors"},
-    "chain": {"--infiller": "infiller.safetensors"},
+    "infill": {"--inbetweener": "infiller.safetensors", "--prior": "prior.safetensors"},
+    "tween": {"--inbetweener": "infiller.safetensors", "--prior": "prior.safetensors"},
+    "blend": {"--inbetweener": "infiller.safetensors"},
+    "chain": {"--inbetweener": "infiller.safetensors"},
 }
 _NAMED_MODELS = ("--prior", "--init", "--density")
 _TRAINING = {

@@ -40,7 +40,7 @@ def tiny_infiller(*, drawn: float = 0.0, seed: int = 0) -> ConvInfiller:
 
 
 def save_tiny_infiller(path: Path, *, drawn: float = 0.0) -> Path:
-    """Write the weights and the card; returns the path for --infiller."""
+    """Write the weights and the card; returns the path for --inbetweener."""
     path.parent.mkdir(parents=True, exist_ok=True)
     checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
     return path

@@ -32,7 +32,7 @@ def benchmark_denoising(
     clips: Sequence[CleanClip],
     denoiser: Denoiser,
     *,
-    infiller: Inbetweener | None = None,
+    inbetweener: Inbetweener | None = None,
     densities: Sequence[Density] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
@@ -43,7 +43,7 @@ def benchmark_denoising(
         found = []
         for number, clip in enumerate(clips):
             corrupted = corrupt(clip.motion, torch.Generator().manual_seed(number))
-            found.append(evaluate_clip(clip.motion, corrupted, denoiser, densities, infiller))
+            found.append(evaluate_clip(clip.motion, corrupted, denoiser, densities, inbetweener))
             if name == STANDARD_CONDITION:
                 by_kind.setdefault(clip.kind, []).append(found[-1])
             done += 1
@@ -69,14 +69,14 @@ def evaluate_clip(
     corrupted: CorruptedClip,
     denoiser: Denoiser,
     densities: Sequence[Density] = (),
-    infiller: Inbetweener | None = None,
+    inbetweener: Inbetweener | None = None,
 ) -> Row:
     """Measure the mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside
-    mocap's, milliseconds a frame; where joints are masked and there is an infiller, its error too.
+    mocap's, milliseconds a frame; where joints are masked and there is an in-betweener, its error too.
     """
     filled = float("nan")
-    if infiller is not None and corrupted.masks:
-        filled = _mean_joint_error_cm(truth, infill(corrupted.motion, infiller, corrupted.masks).motion)
+    if inbetweener is not None and corrupted.masks:
+        filled = _mean_joint_error_cm(truth, infill(corrupted.motion, inbetweener, corrupted.masks).motion)
     began = time.perf_counter()
     done = denoise(corrupted.motion, denoiser, masks=corrupted.masks, densities=densities)
     seconds = time.perf_counter() - began

@@ -22,7 +22,7 @@ _CONTEXT_LENGTHS = (1, 10)  # known frames on either side
 
 def benchmark_gaps(
     kinds: Mapping[str, Sequence[Motion]],
-    infiller: Inbetweener,
+    inbetweener: Inbetweener,
     densities: Sequence[Density],
     *,
     progress: Callable[[int, int], None] | None = None,
@@ -36,7 +36,7 @@ def benchmark_gaps(
     for number, clip in enumerate(clips):
         for length in GAP_LENGTHS:
             for context in _CONTEXT_LENGTHS:
-                row = _evaluate_gap(clip, length, context, infiller, densities)
+                row = _evaluate_gap(clip, length, context, inbetweener, densities)
                 if row is not None:
                     by = row.pop("by").split(" ")[0]
                     found.setdefault((by, row.pop("what"), context, length), []).append(row)
@@ -49,7 +49,7 @@ def benchmark_gaps(
 
 
 def _evaluate_gap(
-    clip: Motion, length: int, context: int, infiller: Inbetweener, densities: Sequence[Density]
+    clip: Motion, length: int, context: int, inbetweener: Inbetweener, densities: Sequence[Density]
 ) -> Row | None:
     """Measure one gap of a clip; None for a clip that is too short."""
     if clip.num_frames < length + 2 * context:
@@ -59,7 +59,7 @@ def _evaluate_gap(
     free = torch.zeros(part.num_frames, dtype=torch.bool)
     free[context : context + length] = True
     missing = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
-    done = fill(part, missing, AutoInbetweener(infiller, densities))
+    done = fill(part, missing, AutoInbetweener(inbetweener, densities))
     errors = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = CANONICAL.indices(TOES)
     unsupported, mocap = (

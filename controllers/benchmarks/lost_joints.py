@@ -23,7 +23,7 @@ MISSING_LIMBS = {
 """Missing joints by name, as in Kaufmann et al. 2020, figure 8."""
 
 
-def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], infiller: Inbetweener) -> list[Row]:
+def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], inbetweener: Inbetweener) -> list[Row]:
     """Measure joints that are missing throughout up to 240 frames, by kind of clip: their mean error in the world, cm,
     by MAP and by two mean poses: that of all these clips, and the clip's own, which no user knows.
     """
@@ -37,7 +37,7 @@ def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], infiller: In
             found = []
             for clip in clips:
                 masks = [Mask(joint, 0, clip.num_frames) for joint in joints]
-                made = infill(clip, AutoInbetweener(infiller), masks).motion
+                made = infill(clip, AutoInbetweener(inbetweener), masks).motion
                 poses = (mean_pose, mean_rotations([clip]))
                 candidates = [*(replace_joint_rotations(clip, joints, pose) for pose in poses), made]
                 found.append([_mean_joint_distance(motion, clip, joints) for motion in candidates])

@@ -32,13 +32,13 @@ _NUM_ALTERNATIVES = 4  # answers
 
 def benchmark_tweening(
     kinds: Mapping[str, Sequence[Motion]],
-    infiller: Inbetweener,
+    inbetweener: Inbetweener,
     densities: Sequence[Density],
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Measure by kind of clip (canonical, at the prior's rate): means over 6 s of the default tween, of a rollout and
-    of the best of four, and over 4 s of ends of 1 and 2 s by the infiller and by a density.
+    of the best of four, and over 4 s of ends of 1 and 2 s by the network and by a density.
     """
     rows, draws = [], torch.Generator().manual_seed(0)
     for number, (kind, clips) in enumerate(kinds.items()):
@@ -48,7 +48,7 @@ def benchmark_tweening(
             inner = (1 + torch.randperm(TWEEN_FRAMES - 2, generator=draws)[:_INNER_KEYS]).tolist()
             keys = Keys((0, *inner, TWEEN_FRAMES - 1))
             for method, made in zip(
-                by_method, _tween_by_all_methods(clip, keys, infiller, densities, draws), strict=True
+                by_method, _tween_by_all_methods(clip, keys, inbetweener, densities, draws), strict=True
             ):
                 by_method[method].append(_evaluate_tween(made.motion, clip, keys.frames, made.seconds))
         rows += [
@@ -58,8 +58,8 @@ def benchmark_tweening(
         ]
         shown = [clip.slice(0, _END_SOURCE_FRAMES) for clip in clips if clip.num_frames >= _END_SOURCE_FRAMES]
         for count in _END_LENGTHS:
-            for by, inbetweener in (("infiller", infiller), ("density", AutoInbetweener(infiller, densities))):
-                each = [_evaluate_end(clip, count, inbetweener) for clip in shown]
+            for by, way in (("network", inbetweener), ("density", AutoInbetweener(inbetweener, densities))):
+                each = [_evaluate_end(clip, count, way) for clip in shown]
                 if each:
                     told_end = {"kind": kind, "what": f"end of {count} frames", "by": by, "clips": len(each)}
                     rows.append({**told_end, **average_rows(each)})
@@ -69,17 +69,17 @@ def benchmark_tweening(
 
 
 def _tween_by_all_methods(
-    clip: Motion, keys: Keys, infiller: Inbetweener, densities: Sequence[Density], draws: torch.Generator
+    clip: Motion, keys: Keys, inbetweener: Inbetweener, densities: Sequence[Density], draws: torch.Generator
 ) -> Iterator[InbetweenSolution]:
     """Tween by the default method, by a rollout, and by the lowest energy of several answers."""
 
     def make(inbetweener: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
         return tween(clip, keys, inbetweener, generator=generator)
 
-    yield make(AutoInbetweener(infiller, densities), draws)
+    yield make(AutoInbetweener(inbetweener, densities), draws)
     density = select_likeliest_density(densities, to_canonical(clip)[0])
-    yield make(RolloutInbetweener([density], infiller), draws)
-    yield lowest_energy(make, RolloutInbetweener(densities, infiller), _NUM_ALTERNATIVES, generator=draws)
+    yield make(RolloutInbetweener([density], inbetweener), draws)
+    yield lowest_energy(make, RolloutInbetweener(densities, inbetweener), _NUM_ALTERNATIVES, generator=draws)
 
 
 def _evaluate_tween(made: Motion, clip: Motion, keys: Sequence[int], seconds: float) -> Row:

@@ -112,17 +112,19 @@ def refine(
     targets: EffectorTargets | None = None,
     terms: Sequence[Term] = (),
     first_frame: int = 0,
+    trust: Float[Tensor, "frames joints"] | None = None,
 ) -> RefinedMotion:
     """Refine a proposal with these contact logits; `capture` holds the observation mask and the noise. `targets` are
     positions that joints are to reach, `terms` join the others in every window and see the first frame of the proposal
-    as `first_frame` of the whole motion.
+    as `first_frame` of the whole motion. `trust` multiplies the sigmas of what was not observed, by joint: where the
+    proposal is surer than usual it is below 1.
 
     In each window the density counts under which the proposal is likeliest, and less where it is out of its depth.
     """
     planted = debounced(contacts > 0)
     pose = BodyPose.of_motion(proposal)
     start = _extrapolate_backward(pose)
-    sigma = _compute_proposal_sigma(capture, settings)
+    sigma = _compute_proposal_sigma(capture, settings, trust)
     ensemble = DensityEnsemble(
         [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
     )
@@ -207,15 +209,18 @@ def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> 
     return float(planted.median() if len(planted) else heights.quantile(0.05))
 
 
-def _compute_proposal_sigma(capture: Capture, settings: RefinementSettings) -> Float[Tensor, "frames width"]:
+def _compute_proposal_sigma(
+    capture: Capture, settings: RefinementSettings, trust: Float[Tensor, "frames joints"] | None
+) -> Float[Tensor, "frames width"]:
     """Compute the sigmas of root, heading and angles by frame (see `BodyPose.pack`)."""
     ramp, ramp_root = (
         _ramp_from_observed(observed, settings.uncertainty_ramp)
         for observed in (capture.seen[0], capture.seen_root[0][:, None])
     )
-    unobserved = math.radians(settings.unobserved_sigma_deg) * ramp
+    factor = torch.ones(ramp.shape) if trust is None else trust
+    unobserved = math.radians(settings.unobserved_sigma_deg) * ramp * factor
     angle = torch.where(capture.seen[0], settings.share * capture.sigma[0], unobserved).clamp_min(1e-4)
-    unobserved_root = settings.unobserved_sigma_cm / 100 * ramp_root[:, 0]
+    unobserved_root = settings.unobserved_sigma_cm / 100 * ramp_root[:, 0] * factor[:, 0]
     root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], unobserved_root)
     hips = angle[:, :1]
     # Feet are planted even in a capture without noise, if only by half a millimetre.

@@ -79,12 +79,17 @@ class ErrorEstimate:
     """Median over held-out clips, cm."""
     percentile_90_cm: float
     """90th percentile over held-out clips, cm."""
-    clips: int
-    """Number of these clips."""
+    clips: int | None
+    """Number of these clips; None where the proposer itself tells how sure it is, of each joint and frame."""
 
     @property
     def text(self) -> str:
         """The estimate in words."""
+        if self.clips is None:
+            return (
+                f"by its own estimate joints within {self.median_cm:.1f} cm of the truth in half of cases and within"
+                f" {self.percentile_90_cm:.1f} cm in nine of ten"
+            )
         if self.clips < _MIN_CLIPS:
             return (
                 f"joints about {self.median_cm:.0f} cm from mocap's in the only {self.clips} unseen clips of the kind"

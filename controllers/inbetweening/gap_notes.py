@@ -18,7 +18,7 @@ from controllers.inbetweening.error_estimates import (
 from controllers.inbetweening.proposers.auto import STANDING_STILL
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening import GapQuery
+from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import GapSource
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
@@ -29,23 +29,28 @@ _MORPH_RATIO, _MIN_MORPH_FRAMES = 1.3, 45
 _STILL_SPEED = 0.12  # m/s of the joints below which a body is still: there is no motion to miss
 
 
-def compose_gap_notes(query: GapQuery, made: Motion, sources: Sequence[GapSource], *, fps: float) -> tuple[str, ...]:
-    """Compose a line for each gap, in frames of the motion at `fps`; gaps without remarks share one by proposer."""
+def compose_gap_notes(query: GapQuery, made: Motion, answer: Proposal, *, fps: float) -> tuple[str, ...]:
+    """Compose a line for each gap of a proposal, in frames of the motion at `fps`; gaps without remarks share one by
+    proposer.
+    """
+    sources = answer.attribute(query)
     lines: list[str] = []
     plain: dict[str, list[GapSource]] = {}
     for source in sources:
         remarks = _describe_gap(query, made, source)
-        if not remarks and source.by == INFILLER:
+        if not remarks and source.by == answer.source:
             plain.setdefault(source.by, []).append(source)
         else:
-            lines.append(_join_remarks([source], query, remarks, fps))
-    return (*lines, *(_join_remarks(each, query, [], fps) for each in plain.values()))
+            lines.append(_join_remarks([source], query, answer, remarks, fps))
+    return (*lines, *(_join_remarks(each, query, answer, [], fps) for each in plain.values()))
 
 
-def _join_remarks(sources: Sequence[GapSource], query: GapQuery, remarks: Sequence[str], fps: float) -> str:
+def _join_remarks(
+    sources: Sequence[GapSource], query: GapQuery, answer: Proposal, remarks: Sequence[str], fps: float
+) -> str:
     """Join the frames, the proposer, the error estimate (of the gap with the largest), and further remarks."""
     where = ", ".join(_format_frames(query, source, fps) for source in sources)
-    found = [estimate for source in sources if (estimate := _estimate_gap_error(query, source)) is not None]
+    found = [estimate for source in sources if (estimate := _estimate_gap_error(query, answer, source))]
     sure = [max(found, key=lambda one: one.percentile_90_cm).text] if found else []
     return f"frames {where}: {', '.join([sources[0].by, *sure, *remarks])}"
 
@@ -57,7 +62,10 @@ def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
     return f"{round(start * fps) + 1}:{round(stop * fps)}"
 
 
-def _estimate_gap_error(query: GapQuery, source: GapSource) -> ErrorEstimate | None:
+def _estimate_gap_error(query: GapQuery, answer: Proposal, source: GapSource) -> ErrorEstimate | None:
+    if answer.spread is not None and source.by == answer.source:
+        median, percentile_90 = (100 * answer.spread[source.start : source.stop]).mean(dim=(0, 1)).tolist()
+        return ErrorEstimate(median, percentile_90, None)
     known = ~query.missing.frames
     before = known[max(0, source.start - _MIN_CONTEXT_FRAMES) : source.start]
     after = known[source.stop : source.stop + _MIN_CONTEXT_FRAMES]

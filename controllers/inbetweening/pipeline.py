@@ -78,7 +78,6 @@ def fill(
     done, unreached = _reach_targets(clip, clip.back(made, query), targets)
     status = Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer))
     status = status.with_notes(unreached, infeasible=bool(unreached))
-    sources = answer.attribute(query)
     return InbetweenSolution(
         done,
         status,
@@ -88,8 +87,8 @@ def fill(
         missing=missing,
         rig=as_rig(clip.rigmap),
         contacts=contacts.debounced(answer.contact_logits > 0),
-        sources=sources,
-        gap_notes=compose_gap_notes(query, made, sources, fps=float(motion.fps)),
+        sources=answer.attribute(query),
+        gap_notes=compose_gap_notes(query, made, answer, fps=float(motion.fps)),
     )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, refine
@@ -22,6 +22,8 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Term
 
 _CONTEXT_FRAMES = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
+_USUAL_ERROR = 0.03  # metres: median error of a joint at which the sigmas below hold
+_TRUST_RANGE = (0.3, 1.5)
 INFILL_REFINEMENT = RefinementSettings(
     uncertainty_ramp=8.0,
     unobserved_sigma_deg=2.0,
@@ -47,6 +49,7 @@ def refine_gaps(
     """Refine a proposal gap by gap; also returns the ledger and the cost of its windows."""
     motion, missing = proposal.motion, query.missing
     quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    trust = None if proposal.spread is None else _compute_trust(proposal.spread)
     ledger, windows = Ledger(), []
     for first, last in _find_gap_windows(missing.frames):
         if last - first < 2:
@@ -68,11 +71,17 @@ def refine_gaps(
             targets=None if targets is None else EffectorTargets(targets.places[part], targets.wanted[part]),
             terms=terms,
             first_frame=first,
+            trust=None if trust is None else trust[part],
         )
         quats[part] = torch.where(part_missing.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
         root[part] = torch.where(part_missing.root[:, None], refined.motion.root_position, root[part])
         ledger, windows = ledger.join(refined.ledger), [*windows, *refined.windows]
     return replace(motion, root_position=root, local_quat_xyzw=quats), ledger, tuple(windows)
+
+
+def _compute_trust(spread: Float[Tensor, "frames joints 2"]) -> Float[Tensor, "frames joints"]:
+    """Compute by which factor the sigmas of a proposal change: its median error beside the usual one."""
+    return (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
 
 
 def _find_gap_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:

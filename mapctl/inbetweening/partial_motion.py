@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import kinematics, rotations
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle, last_observed, next_observed
 from mapctl.skeleton import CANONICAL, LIMBS, mirror_name
 
@@ -97,6 +97,16 @@ class PartialMotion:
     known: KnownParts
     """What is known."""
 
+    def local_matrices(self) -> Float[Tensor, "batch frames joints 3 3"]:
+        """Return local rotation matrices; the hips' is their world rotation."""
+        hips = rotations.multiply(rotations.about_y(self.heading), self.quats[..., 0, :])
+        return rotations.to_matrix(torch.cat([hips.unsqueeze(-2), self.quats[..., 1:, :]], dim=-2))
+
+    def world_poses(self) -> tuple[Float[Tensor, "batch frames joints 3"], Float[Tensor, "batch frames joints 3 3"]]:
+        """Return world positions, metres, and world rotation matrices of all joints."""
+        positions, world = kinematics.chain_matrices(self.offsets[:, None], CANONICAL.parents, self.local_matrices())
+        return positions + self.root_position[..., None, :], world
+
     def slice(self, start: int, stop: int) -> "PartialMotion":
         """Return frames start to stop."""
         part, known = slice(start, stop), self.known
@@ -118,8 +128,8 @@ class PartialMotion:
             -self.heading,
             mirror_quats(self.quats),
             self.contacts.flip(-1),
-            self.targets[..., _EFFECTOR_PARTNERS, :] * flip,
-            self.offsets[..., _PARTNERS, :] * flip,
+            self.targets[..., _EFFECTOR_PARTNERS, :] * flip.to(self.targets),
+            self.offsets[..., _PARTNERS, :] * flip.to(self.offsets),
             self.known.mirrored(),
         )
 

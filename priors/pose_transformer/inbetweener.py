@@ -164,11 +164,9 @@ def _find_too_long(query: GapQuery) -> Bool[Tensor, " frames"]:
 
 def _rows_of(motion: PartialMotion) -> Float[Tensor, "frames rows"]:
     """Return rows as of a proposal that is the motion itself."""
-    hips = rotations.multiply(rotations.about_y(motion.heading), motion.quats[..., 0, :])
-    local = rotations.to_matrix(torch.cat([hips.unsqueeze(-2), motion.quats[..., 1:, :]], dim=-2))
     logits = contacts.to_logits(motion.contacts > 0.5)
     spread = motion.root_position.new_full((*motion.heading.shape, CANONICAL.num_joints, 2), -9.0)
-    return _pack(ProposedPoses(motion.root_position, local, logits, spread))
+    return _pack(ProposedPoses(motion.root_position, motion.local_matrices(), logits, spread))
 
 
 def _pack(poses: ProposedPoses) -> Float[Tensor, "frames rows"]:

@@ -83,6 +83,7 @@ class PoseTransformerNetwork(nn.Module):
     std_rotation: Tensor
     mean_position: Tensor
     std_position: Tensor
+    spread_shift: Tensor
 
     def __init__(self, config: PoseTransformerConfig, *, bfloat16: bool = False):
         """Compute attention and perceptrons in bfloat16 if so asked; what they are given and give back is not."""
@@ -93,6 +94,7 @@ class PoseTransformerNetwork(nn.Module):
         self.register_buffer("std_rotation", torch.ones(_JOINTS, 6))
         self.register_buffer("mean_position", torch.zeros(_JOINTS, 3))
         self.register_buffer("std_position", torch.ones(_JOINTS, 3))
+        self.register_buffer("spread_shift", torch.zeros(2))
         width = config.width
         self.bones = nn.Linear(3 * _JOINTS, width, bias=False)
         self.embed = nn.Sequential(nn.Linear(_ROWS, width), nn.GELU(), nn.Linear(width, width))
@@ -120,7 +122,7 @@ class PoseTransformerNetwork(nn.Module):
         keep = torch.stack([motion.known.ground, motion.known.height, motion.known.ground], dim=-1)
         root = motion.root_position + torch.where(keep, 0.0, moved)
         logits = 4 * out[..., -2:]
-        return ProposedPoses(root, change, logits, spread.unflatten(-1, (_JOINTS, 2)) - 3.0)
+        return ProposedPoses(root, change, logits, spread.unflatten(-1, (_JOINTS, 2)) - 3.0 + self.spread_shift)
 
     def _encode(self, motion: PartialMotion, shown: Float[Tensor, "batch frames joints 3 3"]) -> Tensor:
         """Encode what is shown and what is known, in about unit size."""

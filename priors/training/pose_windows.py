@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
@@ -143,7 +143,4 @@ def _reshape_bodies(window: PartialMotion, variation: Variation, generator: torc
 
 def add_targets(motion: PartialMotion) -> PartialMotion:
     """Aim hands and feet at where they are."""
-    matrices = rotations.to_matrix(motion.quats)
-    local, _ = kinematics.chain_matrices(motion.offsets[:, None], CANONICAL.parents, matrices)
-    world = rotations.rotate_about_y(local, motion.heading[..., None]) + motion.root_position[..., None, :]
-    return replace(motion, targets=world[..., list(EFFECTORS), :])
+    return replace(motion, targets=motion.world_poses()[0][..., list(EFFECTORS), :])

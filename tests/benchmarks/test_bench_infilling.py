@@ -163,7 +163,17 @@ def folder(tmp_path):
 
 def test_the_command_compares_networks_on_the_clips_kept_from_training(folder, capsys):
     other = save_tiny_infiller(folder / "other.safetensors")
-    words = ["--infiller", folder / "ours.safetensors", "--data", folder / "data", "--count", 10, "--json"]
+    words = [
+        "--infiller",
+        folder / "ours.safetensors",
+        "--inbetweener",
+        folder / "ours.safetensors",
+        "--data",
+        folder / "data",
+        "--count",
+        10,
+        "--json",
+    ]
     assert run("bench", "infill", *words, "--baselines", other) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["bench"] == "infill"

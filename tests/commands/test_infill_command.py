@@ -38,7 +38,7 @@ def recording(tmp_path_factory):
 @pytest.fixture
 def infill(tiny):
     """Runs the command, with the tiny network where the method asks one; returns the exit status."""
-    return lambda *words: run("infill", *words, *([] if "slerp" in words else ["--infiller", tiny]))
+    return lambda *words: run("infill", *words, *([] if "slerp" in words else ["--inbetweener", tiny]))
 
 
 def rows(path):
@@ -194,11 +194,11 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, rec
     Path("in.bvh").write_bytes(recording().read_bytes())
     Path("link.bvh").symlink_to("in.bvh")
     Path("folder.bvh").mkdir()
-    assert said in fails("infill", *words, "--infiller", tiny)
+    assert said in fails("infill", *words, "--inbetweener", tiny)
 
 
 def test_a_network_that_the_method_knows_none_of_is_refused(recording, tmp_path, capsys):
     words = ["infill", recording(), "-o", tmp_path / "a.bvh", "--gap", "5:9", "--method", "slerp"]
-    assert run(*words, "--infiller", "infiller") == 2
-    assert capsys.readouterr().err == "mapctl: --method slerp knows no network; leave --infiller out\n"
+    assert run(*words, "--inbetweener", "infiller") == 2
+    assert capsys.readouterr().err == "mapctl: --method slerp knows no network; leave --inbetweener out\n"
     assert not (tmp_path / "a.bvh").exists()

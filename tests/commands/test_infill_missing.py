@@ -27,7 +27,7 @@ def infilled(tiny, tmp_path):
     """Runs the command, which must do; returns the text of what it writes."""
 
     def made(source, *words, method="infiller"):
-        asked = () if method == "slerp" else ("--infiller", tiny)
+        asked = () if method == "slerp" else ("--inbetweener", tiny)
         assert run("infill", source, "-o", tmp_path / "out.bvh", *words, *words_of(method), *asked, "--quiet") == 0
         return (tmp_path / "out.bvh").read_text()
 
@@ -110,7 +110,7 @@ def test_where_something_is_nan_nothing_else_is_looked_for(tiny, clip, tmp_path)
     lines[-25:-15] = [lines[-26]] * 10
     (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
     lossy = without(tmp_path / "frozen.bvh", tmp_path / "lossy.bvh", [("", 5, 9)])
-    words = [*words_of("infiller"), "--infiller", tiny, "--report", tmp_path / "r.json", "--quiet"]
+    words = [*words_of("infiller"), "--inbetweener", tiny, "--report", tmp_path / "r.json", "--quiet"]
     assert run("infill", lossy, "-o", tmp_path / "out.bvh", *words) == 0
     (gap,) = json.loads((tmp_path / "r.json").read_text())["gaps"]
     assert (gap["start"], gap["stop"]) == (5, 9)
@@ -139,7 +139,7 @@ def test_an_archive_with_nan_is_filled(infilled, tmp_path):
 )
 def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, said):
     lossy = without(clip("bandai"), tmp_path / "lossy.bvh", lost)
-    assert run("infill", lossy, "-o", tmp_path / "out.bvh", "--infiller", tiny) == 2
+    assert run("infill", lossy, "-o", tmp_path / "out.bvh", "--inbetweener", tiny) == 2
     told = capsys.readouterr()
     assert told.err.startswith("mapctl: ")
     assert told.err.count("\n") == 1

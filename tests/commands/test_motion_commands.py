@@ -16,7 +16,7 @@ import mapctl
 WORDS = {"denoise": [], "infill": ["--gap", "5:9"], "tween": ["--keyframes", "0,5,11"]}
 PLAIN = {"infill": [*WORDS["infill"], *words_of("slerp")], "tween": [*WORDS["tween"], *words_of("slerp")]}
 """Without a network."""
-NETWORK = {"denoise": "--denoiser", "infill": "--infiller", "tween": "--infiller"}
+NETWORK = {"denoise": "--denoiser", "infill": "--inbetweener", "tween": "--inbetweener"}
 COMMANDS = sorted(WORDS)
 
 
@@ -26,7 +26,7 @@ def tiny(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiny")
     files = {
         "--denoiser": save_tiny_denoiser(folder / "denoiser.safetensors"),
-        "--infiller": save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02),
+        "--inbetweener": save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02),
     }
     return {command: (option, files[option]) for command, option in NETWORK.items()}
 

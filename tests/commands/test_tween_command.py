@@ -31,7 +31,7 @@ def source(tmp_path_factory):
 @pytest.fixture
 def tween(tiny):
     """Runs the command, with the tiny network where the method asks one; returns the exit status."""
-    return lambda *words: run("tween", *words, *([] if "slerp" in words else ["--infiller", tiny]))
+    return lambda *words: run("tween", *words, *([] if "slerp" in words else ["--inbetweener", tiny]))
 
 
 def away_cm(source, out, frames):
@@ -130,4 +130,4 @@ def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_pat
 )
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, source, words, said):
     Path("in.bvh").write_bytes(source.read_bytes())
-    assert said in fails("tween", *words, "--infiller", tiny)
+    assert said in fails("tween", *words, "--inbetweener", tiny)

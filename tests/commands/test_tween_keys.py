@@ -54,7 +54,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def models(tiny, prior):
     """By method, the options that name what it needs."""
-    return {"map": ["--infiller", tiny, "--prior", prior], "infiller": ["--infiller", tiny], "slerp": []}
+    return {"map": ["--inbetweener", tiny, "--prior", prior], "infiller": ["--inbetweener", tiny], "slerp": []}
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_the_example_runs_on_a_clip_of_its_name(models, tiny, folder, method):
     walk(120).save(clip)
     (folder / "keys" / "example.toml").write_text(text)
     words = (folder / "keys" / "example.toml", "-o", "out.bvh", "--report", "r.json", "--quiet")
-    more = ["--infiller", tiny] if method == "bundled" else ["--method", method, *models[method]]
+    more = ["--inbetweener", tiny] if method == "bundled" else ["--method", method, *models[method]]
     assert run("tween", *words, *more) == 0
     told = json.loads(Path("r.json").read_text())
     assert {row["what"] for row in told["keys"]} == {"pose", "limbs", "root"}

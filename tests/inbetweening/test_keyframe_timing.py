@@ -150,8 +150,8 @@ def test_the_bench_takes_clips_that_were_kept_from_training(tmp_path, capsys):
     retarget.from_canonical(walk_made, retarget.identify_rig(walk_made.skeleton)).save(path)
     told = replace(card(), data={"held_out": {"validation": [], "test": ["bandai/a_walk_0.bvh"]}})
     checkpoints.save(network().state_dict(), told, tmp_path / "ours.safetensors")
-    words = ["--infiller", tmp_path / "ours.safetensors", "--data", tmp_path / "data", "--json"]
+    words = ["--inbetweener", tmp_path / "ours.safetensors", "--data", tmp_path / "data", "--json"]
     assert run("bench", "timing", *words) == 0
     assert {row["method"] for row in json.loads(capsys.readouterr().out)["rows"]} >= {"suggested"}
-    assert run("bench", "timing", "--infiller", tmp_path / "ours.safetensors") == 2
+    assert run("bench", "timing", "--inbetweener", tmp_path / "ours.safetensors") == 2
     assert "Missing from mapctl bench timing: --data DIR" in capsys.readouterr().err

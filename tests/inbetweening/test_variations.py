@@ -66,7 +66,7 @@ def source(tmp_path_factory):
 @pytest.fixture
 def command(tmp_path_factory, prior_file):
     infiller = save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.02)
-    return lambda *words: run("tween", *words, "--infiller", infiller, "--prior", prior_file)
+    return lambda *words: run("tween", *words, "--inbetweener", infiller, "--prior", prior_file)
 
 
 INFILLER = tiny_infiller(drawn=0.02)

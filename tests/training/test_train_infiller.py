@@ -143,6 +143,6 @@ def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
     words = ["--steps", 2, "--batch", 2, "--window", 32, "--architecture", "manifold", "--quiet"]
     assert run("train", "infiller", "--data", data, "-o", tmp_path / "run", *words) == 0
     on_rig("daz", 45).save(tmp_path / "in.bvh")
-    words = ["--gap", "20:30", "--infiller", tmp_path / "run", "--quiet"]
+    words = ["--gap", "20:30", "--inbetweener", tmp_path / "run", "--quiet"]
     assert run("infill", tmp_path / "in.bvh", "-o", tmp_path / "out.bvh", *words) == 0
     assert mapctl.load(tmp_path / "out.bvh").num_frames == 45

@@ -24,16 +24,17 @@ __all__ = [
 class ModelLoaders:
     """Loaders of the models that an in-betweener needs, called when it needs them."""
 
-    infiller: Callable[[], Inbetweener]
-    """Loader of the infiller."""
+    network: Callable[[str], Inbetweener]
+    """Loader of the network that a method asks for: `infiller`, `transformer`, or `auto` for whichever is given."""
     densities: Callable[[], Sequence[Density]]
     """Loader of the densities for rollouts."""
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
-    "auto": lambda models: AutoInbetweener(models.infiller(), models.densities()),
-    "infiller": lambda models: models.infiller(),
-    "rollouts": lambda models: RolloutInbetweener(models.densities(), models.infiller()),
+    "auto": lambda models: AutoInbetweener(models.network("auto"), models.densities()),
+    "transformer": lambda models: models.network("transformer"),
+    "infiller": lambda models: models.network("infiller"),
+    "rollouts": lambda models: RolloutInbetweener(models.densities(), models.network("auto")),
     "slerp": lambda models: SlerpInbetweener(),
 }
 """Builders of in-betweeners by the name of the method."""

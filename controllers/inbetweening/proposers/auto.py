@@ -1,7 +1,7 @@
-"""Choice of the proposer of each gap: the infiller with enough context, a rollout where the infiller would slide, a
-held pose where the body stands still.
+"""Choice of the proposer of each gap: a network with enough context, a rollout where the network would slide, a held
+pose where the body stands still.
 
-Between poses that are seconds apart the infiller's proposal is the mean of many motions: feet float and slide. The
+Between poses that are seconds apart a network's proposal is the mean of many motions: feet float and slide. The
 likelihood does not show it, since a mean is likely; visible artefacts do: skating feet, a detour of the body, a limb
 that jumps.
 """
@@ -41,11 +41,11 @@ class ChoiceSettings:
     """Thresholds at which other proposers are tried, and weights of the cost of a proposal."""
 
     max_bare_frames: int = 30
-    """Frames of the longest gap with little context in which only the infiller is tried."""
+    """Frames of the longest gap with little context in which only the network is tried."""
     context: int = 8
-    """Known frames on both sides of a gap that are enough context for the infiller."""
+    """Known frames on both sides of a gap that are enough context for the network."""
     known: int = 60
-    """Frames of the longest gap with enough context in which only the infiller is tried: its mean training length."""
+    """Frames of the longest gap with enough context in which only the network is tried."""
     acceptable_cost: float = 0.2
     """Cost, m/s, of a proposal below which no other one is tried."""
     tempos: tuple[float, ...] = (1.0, 0.94, 1.06)
@@ -64,7 +64,7 @@ class ChoiceSettings:
     missed: float = 0.3
     """Weight of a rollout's error at arrival, per second of the gap: m/s for a metre."""
     max_step_ratio: float = 1.3
-    """Largest ratio of the step of hands and feet in a frame to that of the infiller's proposal, which is calm."""
+    """Largest ratio of the step of hands and feet in a frame to that of the network's proposal, which is calm."""
     step: float = 0.08
     """Step of hands and feet in a frame that is always allowed, metres."""
     excess_step_weight: float = 8.0
@@ -88,11 +88,11 @@ class ChoiceSettings:
 
 @dataclass(frozen=True, eq=False)
 class AutoInbetweener(Inbetweener):
-    """In-betweener that takes the infiller's proposal, except in gaps where a rollout or a held pose has a lower cost;
+    """In-betweener that takes a network's proposal, except in gaps where a rollout or a held pose has a lower cost;
     the end is extrapolated by a density.
     """
 
-    infiller: Inbetweener
+    network: Inbetweener
     """In-betweener that proposes first, and fills gaps in which something is known."""
     densities: Sequence[Density] = ()
     """Densities for rollouts; without any nothing is rolled."""
@@ -101,19 +101,28 @@ class AutoInbetweener(Inbetweener):
 
     @property
     def rough(self) -> Inbetweener:
-        """Rough in-betweener of the infiller."""
-        return self.infiller.rough
+        """Rough in-betweener of the network."""
+        return self.network.rough
+
+    @property
+    def takes_partial_keys(self) -> bool:
+        """Whether the network does; rollouts then leave gaps with such keys to it."""
+        return self.network.takes_partial_keys
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the candidate with the lowest cost in each gap, one after the other in time, without sampling."""
-        first = self.infiller.propose(query, generator=generator)
+        first = self.network.propose(query, generator=generator)
         gaps = [gap for gap in query.enclosed_gaps if not _has_enough_context(query, *gap, self.settings)]
+        if self.takes_partial_keys:
+            gaps = [gap for gap in gaps if not _has_partial_keys(query, *gap)]
         roller = Roller.of(query, first, self.densities) if self.densities and gaps else None
         best, others = _Candidate(first.motion, first.contact_logits, first.source, 0.0), list(first.others)
+        unfilled = {other.start: other.by for other in first.others}
         for start, stop in gaps:
-            before = replace(best, by=first.source)
+            before = replace(best, by=unfilled.get(start, first.source))
             best = _choose_candidate(query, before, roller, (start, stop), self.settings)
-            others.append(GapSource(start, stop, best.by))
+            reason = next((other.reason for other in first.others if other.start == start), "")
+            others.append(GapSource(start, stop, best.by, reason))
             if roller is not None:
                 roller.body, roller.contact_logits = query.to_unit_size(best.body), best.contact_logits
         chosen = replace(first, motion=best.body, contact_logits=best.contact_logits, others=tuple(others))
@@ -139,10 +148,18 @@ def _has_enough_context(query: GapQuery, start: int, stop: int, settings: Choice
     return stop - start <= (settings.known if beside >= settings.context else settings.max_bare_frames)
 
 
+def _has_partial_keys(query: GapQuery, start: int, stop: int) -> bool:
+    """Return whether a hand or a foot has a target in a gap, or a frame beside it is known in part."""
+    targets, missing = query.effector_targets, query.missing
+    edges = [start - 1, stop]
+    partly = missing.joints[edges].any() | missing.root[edges].any()
+    return bool(partly) or (targets is not None and bool(targets.wanted[start:stop].any()))
+
+
 def _choose_candidate(
     query: GapQuery, before: _Candidate, roller: Roller | None, gap: tuple[int, int], settings: ChoiceSettings
 ) -> _Candidate:
-    """Choose the least costly of the infiller's proposal, standing still, and rollouts of several tempos."""
+    """Choose the least costly of the network's proposal, standing still, and rollouts of several tempos."""
     start, stop = gap
     first = replace(before, cost=compute_artefact_cost(before.body, before.contact_logits, gap, settings))
     calm = settings.max_step_ratio * max(settings.step, _find_largest_step(before.body, gap))

@@ -1,7 +1,8 @@
 """Proposals through partial keys, which give only positions of hands, feet or hips.
 
-An in-betweener that gets the position of one hand in one frame meets it in that frame and ignores it in the frames
-beside. So partial keys are hidden from it. It proposes twice: first freely, from which the trajectory follows on which
+An in-betweener that was trained with partial keys makes its motion through them. Another that gets the position of one
+hand in one frame meets it in that frame and ignores it in the frames beside: partial keys are hidden from it. It
+proposes twice: first freely, from which the trajectory follows on which
 the targets can be met; then along that trajectory. The error left at the key's frame is met by the smallest motion of
 the whole body (see `mapctl.inbetweening.whole_body`), which goes there and back at a usual acceleration.
 """
@@ -55,6 +56,8 @@ def propose_through_keys(
     wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
     if not bool((hips | wanted).any()):
         return inbetweener.propose(query, generator=generator), targets
+    if inbetweener.takes_partial_keys:
+        return _reach_exactly(query, inbetweener.propose(query, generator=generator), wanted)
     joints = query.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
     blind = replace(query, missing=MissingMask(joints, query.missing.root | hips), effector_targets=None)
     guided = blind
@@ -71,6 +74,21 @@ def propose_through_keys(
     posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
     there = replace(answer, motion=_blend_key_poses(made, posed, hips | wanted, blind))
+    return there, EffectorTargets(reached, targets.wanted)
+
+
+def _reach_exactly(
+    query: GapQuery, answer: Proposal, wanted: Bool[Tensor, " frames"]
+) -> tuple[Proposal, EffectorTargets | None]:
+    """Move a motion that was made through effector targets onto them, by the little that it misses them."""
+    targets = query.effector_targets
+    if targets is None:
+        return answer, None
+    turning, moving = query.missing.joints, query.missing.root
+    stray = torch.full(wanted.shape, _MIN_ROOT_UNCERTAINTY)
+    posed = reach_targets(answer.motion, targets, turning=turning, moving=moving, stray=stray)[0]
+    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
+    there = replace(answer, motion=_blend_key_poses(answer.motion, posed, wanted, query))
     return there, EffectorTargets(reached, targets.wanted)
 
 

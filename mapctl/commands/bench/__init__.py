@@ -33,8 +33,8 @@ class MocapTable(Table):
     """The folder that was trained on, for the clips that were held out."""
     count: options.Count = 48
     """Clips, spread over the kinds."""
-    infiller: options.Name = "infiller"
-    """The bundled infiller, or the file or run folder of a trained one."""
+    inbetweener: options.Name = "transformer"
+    """The bundled transformer, or the file or run folder of a trained transformer or infiller."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +106,8 @@ class Denoise(MocapTable):
 
     denoiser: options.Name = "denoiser"
     """The bundled denoiser, or the file or run folder of a trained one."""
-    infiller: options.Name = "infiller"
-    """For joints that are lost: the bundled infiller, or the file or run folder of a trained one."""
+    inbetweener: options.Name = "transformer"
+    """For joints that are lost: the bundled transformer, or the file or run folder of another in-betweener."""
     prior: options.MaybeName = None
     """As `mapctl denoise` takes it."""
 
@@ -118,6 +118,8 @@ class Infill(MocapTable):
 
     work = "mapctl.commands.bench.infill"
 
+    infiller: options.Name = "infiller"
+    """An infiller to compare as it is: its name if bundled, or the file or run folder of a trained one."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """Other trained infillers, to compare as they are."""
 
@@ -158,9 +160,9 @@ class Transitions(Table):
     """Clips, spread over the kinds."""
     past: Annotated[Literal["1", "10", "all"], arg(metavar="1|10|all")] = "10"
     """Frames that are known before a gap, one being known after it; all shows the whole clip."""
-    transformer: options.Name = "transformer"
-    """The bundled pose transformer, or the file or run folder of a trained one."""
-    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = "infiller"
+    inbetweener: options.Name = "transformer"
+    """The bundled transformer, or the file or run folder of a trained transformer or infiller."""
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """Other in-betweeners to compare, bundled or trained."""
     raw: bool = False
     """Leave out the rows that a MAP stage finishes."""

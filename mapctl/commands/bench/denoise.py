@@ -10,9 +10,9 @@ from mapctl.commands.shared.progress_bar import show_progress
 
 def run(table: Denoise) -> int:
     """Measure and print."""
-    denoiser, infiller = priors.load_denoiser(table.denoiser), priors.load_infiller(table.infiller)
+    denoiser, inbetweener = priors.load_denoiser(table.denoiser), priors.load_inbetweener(table.inbetweener)
     clips = load_clean_clips(table.data, denoiser.card.data.get("held_out", {}), table.count)
     densities = priors.load_choice(table.prior)
     with show_progress("denoising") as progress:
-        rows = benchmark_denoising(clips, denoiser, infiller=infiller, densities=densities, progress=progress)
+        rows = benchmark_denoising(clips, denoiser, inbetweener=inbetweener, densities=densities, progress=progress)
     return print_rows(table, rows)

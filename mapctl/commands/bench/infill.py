@@ -23,5 +23,6 @@ def run(table: Infill) -> int:
     clips = [clip for found in kinds.values() for clip in found]
     with show_progress("filling") as progress:
         rows = benchmark_infilling(clips, networks, ours=ours, progress=progress)
-    by_kind = benchmark_infilling_by_kind(kinds, infiller)
-    return print_rows(table, [*rows, *by_kind, *benchmark_missing_joints(kinds, infiller)])
+    network = priors.load_inbetweener(table.inbetweener)
+    by_kind = benchmark_infilling_by_kind(kinds, network)
+    return print_rows(table, [*rows, *by_kind, *benchmark_missing_joints(kinds, network)])

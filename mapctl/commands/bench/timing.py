@@ -9,7 +9,7 @@ from mapctl.commands.bench.output import print_rows
 
 def run(table: Timing) -> int:
     """Measure and print."""
-    held_out = priors.load_infiller(table.infiller).card.data.get("held_out", {})
+    held_out = priors.load_inbetweener(table.inbetweener).card.data.get("held_out", {})
     kinds = load_canonical(table.data, held_out, table.count)
     clips = [clip for found in kinds.values() for clip in found]
     return print_rows(table, benchmark_keyframe_timing(clips, priors.load_keyframe_timing()))

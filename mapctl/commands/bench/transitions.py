@@ -22,21 +22,19 @@ from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.retrieval import MotionCollection
 from mapctl.pose import decode
-from mapctl.protocols import Inbetweener
-from priors import checkpoints
 from priors.training.corpus import read_corpus, split_corpus
 from priors.training.transition_statistics import compute_position_std
 
 
 def run(table: Transitions) -> int:
     """Measure and print."""
-    transformer = priors.load_transformer(table.transformer)
-    held_out = transformer.card.data.get("held_out", {})
+    network = priors.load_inbetweener(table.inbetweener)
+    held_out = network.card.data.get("held_out", {})
     kinds = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS)
     kinds = {kind: [scale_to_canonical_bones(clip) for clip in clips] for kind, clips in kinds.items()}
     with TemporaryDirectory() as cache:
         corpus = read_corpus(table.data, match="", cache=Path(cache), skip_first=True)
-    train = split_corpus(corpus, int(transformer.card.data["split_seed"])).train
+    train = split_corpus(corpus, int(network.card.data["split_seed"])).train
     origin = GroundPose(torch.zeros(2), torch.zeros(()))
     collection = MotionCollection.of([decode(clip, origin) for clip in train.clips()])
     methods: dict[str, Method] = {
@@ -45,20 +43,14 @@ def run(table: Transitions) -> int:
         "retrieval": of_retrieval(collection),
     }
     for name in filter(None, table.baselines.split(",")):
-        methods[f"{name}, raw"] = of_inbetweener(_load(name), finish=False)
-    methods["transformer, raw"] = of_inbetweener(transformer, finish=False)
+        methods[f"{name}, raw"] = of_inbetweener(priors.load_inbetweener(name), finish=False)
+    methods[f"{table.inbetweener}, raw"] = of_inbetweener(network, finish=False)
     if not table.raw:
-        methods["transformer, finished"] = of_inbetweener(transformer)
-        methods["auto"] = of_inbetweener(AutoInbetweener(transformer, priors.load_choice("auto")))
+        methods[f"{table.inbetweener}, finished"] = of_inbetweener(network)
+        methods["auto"] = of_inbetweener(AutoInbetweener(network, priors.load_choice("auto")))
     past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:
         rows = benchmark_transitions(
             kinds, methods, past=past, std=compute_position_std(train), baseline="slerp", progress=progress
         )
     return print_rows(table, rows)
-
-
-def _load(name: str) -> Inbetweener:
-    """Load an in-betweener of any kind."""
-    kind = checkpoints.read_card(checkpoints.locate(name).with_suffix(".json")).kind
-    return priors.load_infiller(name) if kind == "infiller" else priors.load_transformer(name)

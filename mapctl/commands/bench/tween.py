@@ -11,8 +11,8 @@ from mapctl.features import PRIOR_FPS
 
 def run(table: Tween) -> int:
     """Measure and print."""
-    infiller = priors.load_infiller(table.infiller)
-    kinds = load_canonical(table.data, infiller.card.data.get("held_out", {}), table.count, fps=PRIOR_FPS)
+    inbetweener = priors.load_inbetweener(table.inbetweener)
+    kinds = load_canonical(table.data, inbetweener.card.data.get("held_out", {}), table.count, fps=PRIOR_FPS)
     with show_progress("tween") as progress:
-        rows = benchmark_tweening(kinds, infiller, priors.load_choice(table.prior), progress=progress)
+        rows = benchmark_tweening(kinds, inbetweener, priors.load_choice(table.prior), progress=progress)
     return print_rows(table, rows)

@@ -29,9 +29,9 @@ class Blend(Command):
     margin: options.MaybeNumber = None
     """Seconds before and after in which the limb goes there and back; by its distance if not given."""
     no_finish: bool = False
-    """Leave the infiller's proposal as it is, on rigid bones: no MAP stage plants the feet."""
-    infiller: options.Name = "infiller"
-    """The bundled infiller, or the file or run folder of a trained one."""
+    """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
+    inbetweener: options.Name = "transformer"
+    """A bundled in-betweener, or the file or run folder of a trained one."""
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     video: options.MaybeFile = None

@@ -18,7 +18,7 @@ def run(command: Blend) -> int:
     names = tuple(name.strip() for name in command.joints.split(","))
     transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
     settings = InfillSettings(finish=not command.no_finish)
-    done = blend(motion, other, transfer, priors.load_infiller(command.infiller), settings=settings, rig=rig)
+    done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), settings=settings, rig=rig)
     formats.save(done.motion, command.out)
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:

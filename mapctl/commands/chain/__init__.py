@@ -29,8 +29,8 @@ class Chain(Command):
     """Who proposes, as in `mapctl infill`."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
-    infiller: options.MaybeName = None
-    """The file or run folder of a trained infiller; the bundled one if not given."""
+    inbetweener: options.MaybeName = None
+    """The file or run folder of a trained transformer or infiller; the bundled one if not given."""
     video: options.MaybeFile = None
     """Film of the motion: .mp4, .gif or .png."""
     quiet: bool = False

@@ -17,12 +17,12 @@ from scenes.film import film
 def run(command: Chain) -> int:
     """Check everything, chain, write, report."""
     options.check_seed(command.seed)
-    results.check_method(command.method, finish=not command.no_finish, infiller=command.infiller)
+    results.check_method(command.method, finish=not command.no_finish, inbetweener=command.inbetweener)
     results.check_destinations(command.out, command.video, given=command.clips)
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
     done = chain(
         [inputs.read_motion(path, None) for path in command.clips],
-        build_inbetweener(command.method, results.load_models(command.infiller, None)),
+        build_inbetweener(command.method, results.load_models(command.inbetweener, None)),
         settings=settings,
         filling=InfillSettings(finish=not command.no_finish),
         generator=torch.Generator().manual_seed(command.seed),

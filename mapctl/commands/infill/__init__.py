@@ -24,9 +24,9 @@ class Infill(Command):
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: options.Method = "auto"
-    """Method that proposes. auto: the infiller, a density's rollout through gaps so long that the infiller would slide,
-    or a held pose where the body stands still; a note on each gap names it. rollouts: a density's rollouts, wherever
-    nothing is known. slerp: interpolation."""
+    """Method that proposes. auto: the transformer, a density's rollout through gaps in which it would slide, or a held
+    pose where the body stands still; a note on each gap names it. transformer, infiller: that network alone. rollouts:
+    a density's rollouts, wherever nothing is known. slerp: interpolation."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     curve: options.MaybeCurve = None
@@ -34,8 +34,8 @@ class Infill(Command):
     and ends."""
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
-    infiller: options.MaybeName = None
-    """The file or run folder of a trained infiller; the bundled one if not given."""
+    inbetweener: options.MaybeName = None
+    """The file or run folder of a trained transformer or infiller; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier. It extrapolates a gap at the end (`auto` if none is

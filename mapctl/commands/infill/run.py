@@ -37,8 +37,9 @@ def run(command: Infill) -> int:
 def _check(command: Infill) -> None:
     options.check_seed(command.seed)
     if command.curve is not None and command.method in ("slerp", "rollouts"):
-        raise RequestError(f"--curve needs the infiller's steps; leave --method {command.method} out")
-    results.check_method(command.method, finish=not command.no_finish, prior=command.prior, infiller=command.infiller)
+        raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
+    finish, prior = not command.no_finish, command.prior
+    results.check_method(command.method, finish=finish, prior=prior, inbetweener=command.inbetweener)
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
 
 
@@ -54,7 +55,7 @@ def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
 def _run_infilling(command: Infill, motion: Motion, masks: Sequence[Mask], rig: Rig | None) -> InbetweenSolution:
     return infill(
         motion,
-        build_inbetweener(command.method, results.load_models(command.infiller, command.prior)),
+        build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior)),
         masks,
         settings=InfillSettings(finish=not command.no_finish),
         densities=priors.load_choice(command.prior),

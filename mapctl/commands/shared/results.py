@@ -16,6 +16,7 @@ from mapctl.errors import RequestError
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution, Status
+from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
 from scenes.plots.denoising import film_side_by_side
 
@@ -32,20 +33,28 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
         outputs.check_film(video, _SIZE)
 
 
-def check_method(method: str, *, finish: bool, prior: str | None = None, infiller: str | None) -> None:
+def check_method(method: str, *, finish: bool, prior: str | None = None, inbetweener: str | None) -> None:
     """Raise RequestError for an unknown method, and for a density or a network that the method does not use."""
     proposers.check_method(method)
     if prior is not None and not finish and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
-    if infiller is not None and method == "slerp":
-        raise RequestError("--method slerp knows no network; leave --infiller out")
+    if inbetweener is not None and method == "slerp":
+        raise RequestError("--method slerp knows no network; leave --inbetweener out")
 
 
-def load_models(infiller: str | None, prior: str | None) -> ModelLoaders:
-    """Build the loaders of the named models, or of the bundled ones."""
-    return ModelLoaders(
-        partial(priors.load_infiller, infiller or "infiller"), partial(priors.load_choice, prior or "auto")
-    )
+def load_models(inbetweener: str | None, prior: str | None) -> ModelLoaders:
+    """Build the loaders of the named models, or of the bundled ones; RequestError for a network that is not of the
+    kind that the method asks for.
+    """
+
+    def load_network(method: str) -> Inbetweener:
+        network = priors.load_inbetweener(inbetweener or ("infiller" if method == "infiller" else "transformer"))
+        wanted = {"infiller": "infiller", "transformer": "pose-transformer"}.get(method, network.card.kind)
+        if network.card.kind != wanted:
+            raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
+        return network
+
+    return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"))
 
 
 def conclude(status: Status, *, strict: bool) -> int:

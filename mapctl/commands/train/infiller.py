@@ -15,10 +15,10 @@ _Architectures = Literal["skips", "image", "vanilla", "manifold"]
 
 @dataclass(frozen=True)
 class TrainInfiller(TunableOptions):
-    """Train the infiller that infill, tween, blend and chain begin with."""
+    """Train an infiller, which infill, tween, blend and chain begin with if it is named."""
 
     model = "infiller"
-    used_by = "use it with --infiller"
+    used_by = "use it with --method infiller --inbetweener"
 
     architecture: Annotated[_Architectures | None, arg(metavar="skips|image|vanilla|manifold")] = None
     """skips is the bundled one's, image the paper's, vanilla and manifold its baselines."""

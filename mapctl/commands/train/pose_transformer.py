@@ -15,7 +15,7 @@ class TrainPoseTransformer(TunableOptions):
     """Train the pose transformer that infill, tween, blend and chain begin with; --batch is in frames."""
 
     model = "pose-transformer"
-    used_by = "use it with --transformer"
+    used_by = "use it with --inbetweener"
 
     width: options.MaybeCount = None
     """Numbers of a frame's token; a multiple of twice the heads."""

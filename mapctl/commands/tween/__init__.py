@@ -33,15 +33,15 @@ class Tween(Command):
     timing: options.MaybeName = None
     """The file or run folder of a trained keyframe timing for --suggest-timing; the bundled one if not given."""
     method: options.Method = "auto"
-    """Method that proposes. auto: the infiller, a density's rollout through gaps so long that the infiller would slide,
-    or a held pose where the body stands still; a note on each gap names it. rollouts: a density's rollouts, wherever
-    nothing is known. slerp: interpolation."""
+    """Method that proposes. auto: the transformer, a density's rollout through gaps in which it would slide, or a held
+    pose where the body stands still; a note on each gap names it. transformer, infiller: that network alone. rollouts:
+    a density's rollouts, wherever nothing is known. slerp: interpolation."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     rig: options.MaybeRig = None
     """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
-    infiller: options.MaybeName = None
-    """The file or run folder of a trained infiller; the bundled one if not given."""
+    inbetweener: options.MaybeName = None
+    """The file or run folder of a trained transformer or infiller; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
@@ -49,7 +49,7 @@ class Tween(Command):
     """Number of different motions, as OUT_000.bvh, OUT_001.bvh, ...: the first is what a single one would be, the
     others are rollouts of densities (--prior, or auto) that are steered from key to key."""
     best_of: options.Count = 1
-    """Number of motions of which the one with the lowest energy is kept: from the infiller's proposal, slerp's, and
+    """Number of motions of which the one with the lowest energy is kept: from the network's proposal, slerp's, and
     rollouts of densities (--prior, or auto) that are steered from key to key."""
     seed: options.Count = 0
     """Seed of everything that is sampled; the first variations do not depend on their number."""

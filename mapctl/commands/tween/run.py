@@ -32,7 +32,7 @@ def run(command: Tween) -> int:
     request = _read_key_request(command)
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     clip = _read_keyframe_clip(command, request)
-    models, make = results.load_models(command.infiller, command.prior), _prepare_tweening(command, clip)
+    models, make = results.load_models(command.inbetweener, command.prior), _prepare_tweening(command, clip)
     if command.variations > 1:
         ok = variations.run_variations(command, clip, make, models)
         return exit_status.NOT_SATISFIED if command.strict and not ok else 0
@@ -91,7 +91,7 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
     variations.check_answers(command, given)
     # Variations are rollouts of a density with every method.
     prior = command.prior if command.variations == command.best_of == 1 else None
-    results.check_method(command.method, finish=not command.no_finish, prior=prior, infiller=command.infiller)
+    results.check_method(command.method, finish=not command.no_finish, prior=prior, inbetweener=command.inbetweener)
 
 
 def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:

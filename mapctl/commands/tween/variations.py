@@ -19,7 +19,7 @@ from mapctl.commands.tween import Tween
 from mapctl.errors import RequestError
 
 _MAX_ANSWERS = 1000
-_FIRST_SAMPLED = 3  # the motions before it are the infiller's and slerp's
+_FIRST_SAMPLED = 3  # the motions before it are the network's and slerp's
 
 
 def number_paths(path: Path, count: int) -> list[Path]:
@@ -56,7 +56,7 @@ def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) ->
     """Make several motions and keep the one with the lowest energy."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("answers", quiet=command.quiet) as progress:
-        rollouts = RolloutInbetweener(models.densities(), models.infiller())
+        rollouts = RolloutInbetweener(models.densities(), models.network("auto"))
         return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
 
 
@@ -65,7 +65,7 @@ def run_variations(command: Tween, clip: KeyframeClip, make: Tweening, models: M
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("variations", quiet=command.quiet) as progress:
         first = build_inbetweener(command.method, models)
-        rollouts = RolloutInbetweener(models.densities(), models.infiller())
+        rollouts = RolloutInbetweener(models.densities(), models.network("auto"))
         found = sample_variations(make, first, rollouts, command.variations, generator=generator, progress=progress)
     files = number_paths(command.out, command.variations)
     for one, file in zip(found.each, files, strict=True):

@@ -1,5 +1,6 @@
 """Training of the pose transformer: windows of which parts are hidden, and how far from them it comes back."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,12 +24,13 @@ from priors.pose_transformer.network import (
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.corpus import Corpus, Split
 from priors.training.pose_windows import PoseWindows, Variation, add_targets
-from priors.training.recipe import NetworkRecipe
+from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.trainer import GradientTrainer, make_adam
 
 VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
 """Gaps that are validated, frames."""
 _VALIDATED_WINDOWS = 128
+_CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
 _MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
 
 
@@ -164,6 +166,45 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
         """The trainer, its weights drawn."""
         return PoseTransformerTrainer(self.config, self.settings, parts.train)
 
+    def export(self, trainer: PoseTransformerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """Calibrate how sure it is on the validation clips, and measure that on the test clips."""
+        calibrate_spread(trainer, gathered.parts.validation)
+        done = super().export(trainer, gathered, curve)
+        return replace(done, quality=done.quality | measure_coverage(trainer, gathered.parts.test))
+
+
+@torch.no_grad()
+def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
+    """Shift the spreads' logarithms so that over unseen windows as many errors lie within them as they say."""
+    over = _measure_spread(trainer, corpus, seed=1)
+    shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
+    trainer.network.spread_shift += torch.tensor(shift)
+
+
+@torch.no_grad()
+def measure_coverage(trainer: PoseTransformerTrainer, corpus: Corpus) -> dict[str, float]:
+    """Measure by spread the share of errors in unseen windows that lie within it."""
+    over = _measure_spread(trainer, corpus, seed=2)
+    return {
+        f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in zip(QUANTILES, over, strict=True)
+    }
+
+
+def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) -> list[Tensor]:
+    """Measure by quantile the logarithm of errors over the spread."""
+    settings, generator = trainer.settings, torch.Generator().manual_seed(seed)
+    windows = PoseWindows(corpus, kinds=settings.kinds, evenness=1.0)
+    found: list[Tensor] = []
+    for frames in _CALIBRATED_FRAMES:
+        if frames <= int(windows.lengths.max()):
+            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator))
+            shown = hide(trainer.network, sample_known_parts(truth, settings.parts, generator))
+            proposed = trainer.network(shown)
+            distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
+            unknown = ~shown.known.positions
+            found.append((torch.log(distance + 1e-4)[..., None] - proposed.log_spread)[unknown][::7])
+    return list(torch.cat(found).unbind(dim=-1))
+
 
 def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotion:
     """Interpolate what is not known, and forget contacts of toes that are not."""
@@ -177,10 +218,10 @@ def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: 
     """Measure the mean distance of unknown joints from their true places, cm, and as a share of the interpolation's."""
     shown = hide(network, replace(truth, known=known))
     unknown = ~known.positions
-    places = _poses(truth)[0]
+    places = truth.world_poses()[0]
     errors = [
         float(((made - places).norm(dim=-1) * unknown).sum() / unknown.sum())
-        for made in (network(shown).poses(truth.offsets)[0], _poses(shown)[0])
+        for made in (network(shown).poses(truth.offsets)[0], shown.world_poses()[0])
     ]
     return 100 * errors[0], errors[0] / errors[1]
 
@@ -196,8 +237,8 @@ def compute_losses(
     """
     shown, known = hide(network, hidden), hidden.known
     proposed = network(shown)
-    wanted, wanted_world = _poses(truth)
-    guess = _poses(shown)[0]
+    wanted, wanted_world = truth.world_poses()
+    guess = shown.world_poses()[0]
     made, made_world = proposed.poses(truth.offsets)
     unknown, turned = ~known.positions, ~known.world_rotations
     count = unknown.sum(dim=(1, 2)).clamp_min(1)
@@ -244,21 +285,6 @@ def _length(vectors: Tensor) -> Tensor:
     return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
 
 
-def _poses(motion: PartialMotion) -> tuple[Tensor, Tensor]:
-    """World positions and rotation matrices."""
-    local = rotations.to_matrix(
-        torch.cat(
-            [
-                rotations.multiply(rotations.about_y(motion.heading), motion.quats[..., 0, :])[..., None, :],
-                motion.quats[..., 1:, :],
-            ],
-            dim=-2,
-        )
-    )
-    none = motion.heading.new_zeros(())
-    return ProposedPoses(motion.root_position, local, none, none).poses(motion.offsets)
-
-
 def _weigh_windows(error: Tensor, unknown: Tensor, ease: float) -> Float[Tensor, " batch"]:
     """Weigh windows by the mean error of the interpolation, metres: 1 at 5 cm."""
     mean = (error * unknown).sum(dim=(1, 2)) / unknown.sum(dim=(1, 2)).clamp_min(1)
@@ -283,7 +309,8 @@ def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
     network.mean_quats.copy_(mean)
     network.mean_rotation.copy_(six.mean(dim=0))
     network.std_rotation.copy_(six.std(dim=0).clamp_min(_MIN_STD_ROTATION))
-    places = torch.cat([_poses(replace(each, heading=torch.zeros_like(each.heading)))[0] for each in both])
+    ahead = [replace(each, heading=torch.zeros_like(each.heading)) for each in both]
+    places = torch.cat([each.world_poses()[0] for each in ahead])
     ground = torch.cat([each.root_position for each in both]) * places.new_tensor([1.0, 0.0, 1.0])
     places = (places - ground[..., None, :]).flatten(0, 1)
     network.mean_position.copy_(places.mean(dim=0))

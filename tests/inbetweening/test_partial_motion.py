@@ -1,0 +1,124 @@
+"""Partial motions: what follows from what is known, and the interpolation of the rest."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import on_rig
+
+from mapctl import rotations
+from mapctl.inbetweening.interpolation import interpolate_positions
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.partial_motion import (
+    EFFECTORS,
+    KnownParts,
+    PartialMotion,
+    interpolate_partial_motion,
+    mirror_quats,
+)
+from mapctl.inbetweening.query import GapQuery
+from mapctl.skeleton import CANONICAL
+
+FRAMES = 40
+MEAN = torch.nn.functional.normalize(
+    torch.randn(CANONICAL.num_joints, 4, generator=torch.Generator().manual_seed(5)), dim=-1
+)
+
+
+def partial_motion(known, seed=0):
+    """A made motion, facing anywhere, and numbers that mean nothing where it is not known."""
+    motion = on_rig("canonical", FRAMES)
+    heading, tilt = rotations.split_heading(motion.local_quat_xyzw[:, 0])
+    quats = torch.cat([tilt[:, None], motion.local_quat_xyzw[:, 1:]], dim=1)[None]
+    garbage = torch.nn.functional.normalize(
+        torch.randn(quats.shape, generator=torch.Generator().manual_seed(seed)).double(), dim=-1
+    )
+    quats = torch.where(known.rotations[..., None], quats, garbage)
+    root = torch.where(known.root[..., None], motion.root_position[None], 9.0 + seed)
+    heading = torch.where(known.heading, rotations.unwrap_angle(heading)[None], 50.0 * seed)
+    targets = torch.zeros(1, FRAMES, len(EFFECTORS), 3)
+    offsets = CANONICAL.offsets[None]
+    return PartialMotion(root, heading, quats, torch.full((1, FRAMES, 2), 0.5), targets, offsets, known)
+
+
+def world_positions(motion):
+    return motion.world_poses()[0]
+
+
+def gap(start=10, stop=25):
+    known = torch.ones(1, FRAMES, dtype=torch.bool)
+    known[:, start:stop] = False
+    return KnownParts.whole(known)
+
+
+def test_unknown_values_do_not_matter_and_known_ones_stay():
+    one, other = (interpolate_partial_motion(partial_motion(gap(), seed), MEAN, 0.9) for seed in (1, 2))
+    torch.testing.assert_close(world_positions(one), world_positions(other), atol=1e-9, rtol=0)
+    known = partial_motion(gap()).known.positions
+    truth = on_rig("canonical", FRAMES).joint_positions()[None]
+    torch.testing.assert_close(world_positions(one)[known], truth[known], atol=1e-9, rtol=0)
+
+
+def test_a_gap_of_whole_poses_is_the_interpolation_of_all_the_rest():
+    """The infiller's interpolation, written for positions; hips turn about their heading here, as a whole there."""
+    made = world_positions(interpolate_partial_motion(partial_motion(gap()), MEAN, 0.9))
+    motion, known = on_rig("canonical", FRAMES), gap().positions
+    there = interpolate_positions(motion.joint_positions()[None], motion.local_quat_xyzw[None], known)
+    torch.testing.assert_close(made[..., 0, :], there[..., 0, :], atol=1e-9, rtol=0)
+    assert float((made - there).norm(dim=-1).max()) < 0.02
+
+
+def test_what_is_known_in_no_frame_is_the_mean_pose_s():
+    known = gap()
+    hand, nowhere = CANONICAL.index("leftHand"), torch.zeros(1, FRAMES, dtype=torch.bool)
+    turning = known.rotations.clone()
+    turning[..., hand] = False
+    known = replace(known, rotations=turning, ground=nowhere, height=nowhere, heading=nowhere)
+    made = interpolate_partial_motion(partial_motion(known, seed=3), MEAN, 0.9)
+    torch.testing.assert_close(made.quats[0, :, hand], MEAN[hand].double().expand(FRAMES, 4))
+    assert made.root_position.unique().tolist() == [0.0, 0.9]
+    assert not made.heading.any()
+
+
+def test_a_rough_path_is_followed():
+    known = gap()
+    path = ~known.ground
+    motion = partial_motion(known)
+    way = torch.stack([torch.linspace(0, 3, FRAMES), torch.zeros(FRAMES), torch.linspace(1, 2, FRAMES)], -1).double()
+    motion = replace(motion, root_position=torch.where(path[..., None], way, motion.root_position))
+    made = interpolate_partial_motion(replace(motion, known=replace(known, path=path)), MEAN, 0.9)
+    torch.testing.assert_close(made.root_position[path][:, ::2], way[None][path][:, ::2])
+
+
+def test_known_positions_are_those_of_a_query():
+    masks = torch.rand(FRAMES, CANONICAL.num_joints, generator=torch.Generator().manual_seed(0)) < 0.1
+    root = torch.rand(FRAMES, generator=torch.Generator().manual_seed(1)) < 0.3
+    motion = on_rig("canonical", FRAMES)
+    query = GapQuery(motion, MissingMask(masks, root), torch.arange(FRAMES) / 30.0)
+    told = replace(
+        KnownParts.whole(torch.ones(1, FRAMES, dtype=torch.bool)),
+        rotations=~masks[None],
+        heading=~masks[None, :, 0],
+        ground=~root[None],
+        height=~root[None],
+    )
+    # A query calls hips known only with their rotation.
+    assert torch.equal(told.positions[0, :, 1:], query.known_positions[:, 1:])
+    assert torch.equal(told.everything[0], ~query.missing.frames)
+
+
+@pytest.mark.parametrize("what", ["quats", "targets", "offsets", "contacts"])
+def test_mirrored_twice_is_the_same(what):
+    random = torch.Generator().manual_seed(2)
+    motion = partial_motion(gap())
+    motion = replace(motion, targets=torch.randn(motion.targets.shape, generator=random))
+    twice = motion.mirrored().mirrored()
+    torch.testing.assert_close(getattr(twice, what), getattr(motion, what))
+    assert all(torch.equal(getattr(twice.known, name), known) for name, known in vars(motion.known).items())
+
+
+def test_a_mirrored_motion_has_mirrored_places():
+    motion = partial_motion(KnownParts.whole(torch.ones(1, FRAMES, dtype=torch.bool)))
+    flipped = world_positions(motion)[..., CANONICAL.mirror_partners(), :] * torch.tensor([-1.0, 1.0, 1.0])
+    torch.testing.assert_close(world_positions(motion.mirrored()), flipped, atol=1e-9, rtol=0)
+    torch.testing.assert_close(mirror_quats(mirror_quats(motion.quats)), motion.quats)
