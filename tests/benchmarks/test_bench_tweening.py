@@ -25,7 +25,7 @@ def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough(monkeypa
         ("walks", "keys", "chosen"),
         ("walks", "keys", "rolled"),
         ("walks", "keys", f"best of {tweening._NUM_ALTERNATIVES}"),
-        *(("walks", f"end of {count} frames", by) for count in tweening._END_LENGTHS for by in ("infiller", "density")),
+        *(("walks", f"end of {count} frames", by) for count in tweening._END_LENGTHS for by in ("network", "density")),
     ]
     for row in rows[:2]:
         assert row["key_mm"] == 0

@@ -10,16 +10,24 @@ from typing import Any
 import pytest
 import tiny_denoiser
 import tiny_infiller
+import tiny_transformer
 from helpers import killing, run
 
 import priors
 from mapctl import cli
+from mapctl.commands import train as commands
 from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors.denoiser.network import DenoiserConfig
 from priors.infiller.network import InfillerConfig
+from priors.pose_transformer.network import PoseTransformerConfig
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings, DenoiserTrainer
 from priors.training.recipes.infiller import InfillerRecipe, InfillerSettings, InfillerTrainer
+from priors.training.recipes.pose_transformer import (
+    PoseTransformerRecipe,
+    PoseTransformerSettings,
+    PoseTransformerTrainer,
+)
 from priors.training.run import train
 
 
@@ -70,6 +78,15 @@ MODELS = (
         replace(tiny_infiller.CONFIG, kernel=5),
         InfillerSettings(),
         (("--architecture", "manifold"), InfillerConfig(architecture="manifold")),
+    ),
+    Model(
+        PoseTransformerRecipe,
+        PoseTransformerTrainer,
+        priors.load_transformer,
+        tiny_transformer.CONFIG,
+        replace(tiny_transformer.CONFIG, kernel=5),
+        PoseTransformerSettings(),
+        (("--layers", "2"), PoseTransformerConfig(layers=2)),
     ),
 )
 
@@ -232,7 +249,7 @@ def test_options_of_other_models_are_unknown(model, words):
 
 
 def test_a_shape_that_only_another_model_has_is_unknown(model):
-    (other,) = (each for each in MODELS if each is not model)
+    other = next(each for each in MODELS if each.name == ("denoiser" if model.name == "infiller" else "infiller"))
     with pytest.raises(RequestError, match=f"Unrecognized options: {other.shape[0][0]}"):
         requested(model, *other.shape[0])
 
@@ -270,5 +287,6 @@ def test_the_command_line_trains_what_can_be_loaded(tmp_path, data, model, capsy
     assert run("train", model.name, "--data", data, "-o", out, "--steps", 2, "--batch", 2, "--window", 32, *words) == 0
     told = capsys.readouterr()
     assert told.err == ""
-    assert told.out.endswith(f"wrote {out / 'model.safetensors'}; use it with --{model.name} {out}\n")
+    used_by = next(kind.used_by for kind in commands.MODELS if kind.model == model.name)
+    assert told.out.endswith(f"wrote {out / 'model.safetensors'}; {used_by} {out}\n")
     assert model.load(str(out)).network.config == config

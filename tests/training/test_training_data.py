@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 import tiny_denoiser
 import tiny_infiller
+import tiny_transformer
 import torch
 from helpers import bandai_skeleton, corpus, run, walks
 
@@ -149,13 +150,18 @@ MODELS = {
     "lstm-gmm": (("--width", 8, "--components", 2, "--window", 20, "--device", "cpu"), priors.load),
     "denoiser": ((), priors.load_denoiser),
     "infiller": (("--window", 32), priors.load_infiller),
+    "pose-transformer": (("--window", 32), priors.load_transformer),
 }
 
 
 @pytest.fixture(params=MODELS)
 def model(request, monkeypatch):
     """Its name, words for a small one, and what loads it."""
-    tiny = {"denoiser": tiny_denoiser.CONFIG, "infiller": tiny_infiller.CONFIG}
+    tiny = {
+        "denoiser": tiny_denoiser.CONFIG,
+        "infiller": tiny_infiller.CONFIG,
+        "pose-transformer": tiny_transformer.CONFIG,
+    }
     if request.param in tiny:
         config, train = tiny[request.param], training_run.train
         monkeypatch.setattr(

@@ -29,6 +29,7 @@ from priors.training.trainer import GradientTrainer, make_adam
 
 VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
 """Gaps that are validated, frames."""
+_SHORTEST_WINDOW = 8  # frames
 _VALIDATED_WINDOWS = 128
 _CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
 _MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
@@ -43,9 +44,7 @@ class PoseTransformerSettings:
     batch: int = 2000
     """Frames an update; windows of one update are equally long."""
     window: int = 200
-    """Frames of the longest window."""
-    shortest: int = 8
-    """Frames of the shortest window."""
+    """Frames of the longest window; the shortest have 8, and as many are drawn of each octave."""
     learning_rate: float = 1.5e-3
     """At its highest; it falls to nothing along a cosine."""
     optimiser: str = "muon"
@@ -83,8 +82,8 @@ class PoseTransformerSettings:
         require_at_least(self, 1, "steps", "batch")
         if self.optimiser not in ("muon", "adam"):
             raise RequestError(f"optimiser must be muon or adam, got {self.optimiser!r}")
-        if not 4 <= self.shortest < self.window:
-            raise RequestError(f"windows must reach from 4 frames to more, got {self.shortest} to {self.window}")
+        if self.window < 2 * _SHORTEST_WINDOW:
+            raise RequestError(f"window must be at least {2 * _SHORTEST_WINDOW} frames, got {self.window}")
 
 
 class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
@@ -122,7 +121,7 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         """Compute the losses of a newly drawn batch."""
         settings = self.settings
         share = float(torch.rand((), generator=self.generator))
-        frames = round(settings.shortest * (self.longest / settings.shortest) ** share)
+        frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
         batch = max(1, settings.batch // frames)
         truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=settings.variation))
         hidden = sample_known_parts(truth, settings.parts, self.generator)
@@ -165,6 +164,13 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     def make_untaught(self, parts: Split) -> PoseTransformerTrainer:
         """The trainer, its weights drawn."""
         return PoseTransformerTrainer(self.config, self.settings, parts.train)
+
+    def format_shape(self) -> list[str]:
+        """Width, layers and plainness, where they are not the usual ones."""
+        usual, plain = PoseTransformerConfig(), self.config.kernel == 0 and self.settings.optimiser == "adam"
+        words = [f"--{name} {getattr(self.config, name)}" for name in ("width", "layers")]
+        changed = [getattr(self.config, name) != getattr(usual, name) for name in ("width", "layers")]
+        return [word for word, told in zip(words, changed, strict=True) if told] + ["--plain"] * plain
 
     def export(self, trainer: PoseTransformerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """Calibrate how sure it is on the validation clips, and measure that on the test clips."""

@@ -1,0 +1,152 @@
+"""What `mapctl train pose-transformer` is made of; its runs are tested in test_network_runs."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import on_rig
+from helpers import corpus, run
+from tiny_transformer import CONFIG, network
+
+import mapctl
+from mapctl.inbetweening.partial_motion import KnownParts
+from mapctl.skeleton import CANONICAL
+from priors.pose_transformer.network import PoseTransformerConfig
+from priors.training.pose_windows import PoseWindows, add_targets
+from priors.training.recipes.pose_transformer import (
+    PoseTransformerSettings,
+    PoseTransformerTrainer,
+    calibrate_spread,
+    compute_losses,
+    hide,
+    measure_coverage,
+)
+
+SETTINGS = PoseTransformerSettings(steps=6, batch=100, window=32)
+
+
+def windows_of(data, frames=40, batch=4):
+    windows = PoseWindows(data, kinds=(), evenness=0.0)
+    return add_targets(windows.draw(batch, frames, torch.Generator().manual_seed(0)))
+
+
+def with_gap(truth, start, stop):
+    known = torch.ones(truth.heading.shape, dtype=torch.bool)
+    known[:, start:stop] = False
+    return replace(truth, known=KnownParts.whole(known))
+
+
+def losses_of(truth, hidden, **settings):
+    return compute_losses(network(), truth, hidden, replace(SETTINGS, **settings))
+
+
+def test_a_true_proposal_costs_nothing_but_contacts_and_spread():
+    truth = windows_of(corpus(2, 60))
+    parts = losses_of(truth, truth)
+    assert parts["places_cm"] < 1e-2
+    assert parts["pace_cm"] < 1e-2
+    assert parts["turns"] < 1e-2
+    assert losses_of(truth, with_gap(truth, 10, 20))["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)
+
+
+def test_the_error_is_the_interpolation_s_while_it_is_untrained():
+    truth = windows_of(corpus(2, 60))
+    hidden = with_gap(truth, 10, 25)
+    shown = hide(network(), hidden)
+    apart = (shown.world_poses()[0] - truth.world_poses()[0])[:, 10:25].norm(dim=-1)
+    parts = losses_of(truth, hidden)
+    assert float(parts["places_cm"]) == pytest.approx(100 * float(apart.mean()), rel=1e-3)
+    assert float(parts["share"]) == pytest.approx(1, rel=1e-2)
+
+
+def test_losses_do_not_depend_on_where_a_motion_stands_and_faces():
+    truth = windows_of(corpus(2, 60))
+    turn, shift = torch.tensor(1.3), torch.tensor([4.0, 0.0, -2.0])
+    from mapctl import rotations
+
+    root = rotations.rotate_about_y(truth.root_position, turn) + shift
+    there = add_targets(replace(truth, root_position=root, heading=truth.heading + turn))
+    for name, value in losses_of(truth, with_gap(truth, 8, 30)).items():
+        assert float(losses_of(there, with_gap(there, 8, 30))[name]) == pytest.approx(float(value), rel=1e-3), name
+
+
+def test_lost_joints_count_as_much_as_a_gap():
+    """An error is divided by what is unknown: the same hand lost for half of the time costs the same."""
+    truth = windows_of(corpus(2, 60))
+    lost = truth.known.rotations.clone()
+    lost[..., CANONICAL.index("leftLowerArm")] = False
+    throughout = losses_of(truth, replace(truth, known=replace(truth.known, rotations=lost)))
+    assert float(throughout["places_cm"]) > 0.1
+    assert float(throughout["turns"]) > 0
+
+
+@pytest.mark.parametrize("optimiser", ["muon", "adam"])
+def test_the_loss_falls_on_windows_that_it_sees_again_and_again(optimiser):
+    settings = PoseTransformerSettings(
+        steps=60,
+        batch=120,
+        window=32,
+        learning_rate=5e-3,
+        optimiser=optimiser,
+        variation=replace(SETTINGS.variation, share=0.0),
+    )
+    trainer, rows = (
+        PoseTransformerTrainer(PoseTransformerConfig(width=48, layers=2, heads=2), settings, corpus(1, 60)),
+        [],
+    )
+    for _ in range(60):
+        trainer.generator.manual_seed(1)  # the same windows with the same parts
+        rows.append(trainer.train_step())
+    for name in ("loss", "places_cm", "contacts_nats"):
+        assert rows[-1][name] < 0.9 * rows[0][name], name
+    assert all(math.isfinite(value) for row in rows for value in row.values())
+
+
+def test_muon_steps_the_matrices_of_layers_and_adam_all_else():
+    trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(1, 60))
+    owned = {
+        name: {id(weight) for group in optimiser.param_groups for weight in group["params"]}
+        for name, optimiser in trainer.optimisers().items()
+    }
+    for name, weight in trainer.network.named_parameters():
+        kind = "muon" if name.startswith("layers.") and weight.ndim == 2 else "optimiser"
+        assert [key for key, ids in owned.items() if id(weight) in ids] == [kind], name
+
+
+def test_the_spread_learns_alone_and_is_calibrated():
+    trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(2, 60))
+    truth = windows_of(corpus(2, 60))
+    parts = compute_losses(trainer.network, truth, with_gap(truth, 8, 30), SETTINGS)
+    parts["spread"].backward()
+    touched = {
+        name for name, weight in trainer.network.named_parameters() if weight.grad is not None and weight.grad.any()
+    }
+    assert touched
+    assert all(name.startswith("spread.") for name in touched)
+    calibrate_spread(trainer, corpus(2, 60))
+    covered = measure_coverage(trainer, corpus(2, 60))
+    assert covered["within_50%"] == pytest.approx(0.5, abs=0.12)
+    assert covered["within_90%"] == pytest.approx(0.9, abs=0.08)
+
+
+def test_validation_is_the_same_each_time_and_leaves_out_gaps_that_are_too_long():
+    trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(1, 60))
+    first, again = (trainer.validate(corpus(2, 60)) for _ in range(2))
+    assert first == again
+    assert {"error_10_45_cm", "share_1_5", "error_arm_cm"} < set(first)
+    assert "error_10_60_cm" not in first
+    assert first["share_10_15"] == pytest.approx(1, abs=1e-3)  # untrained
+
+
+def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
+    words = ["--steps", 2, "--batch", 60, "--window", 32, "--width", 16, "--plain", "--quiet"]
+    assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 2
+    words[words.index(16)] = 24
+    assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 0
+    on_rig("daz", 45).save(tmp_path / "in.bvh")
+    words = ["--gap", "20:30", "--method", "transformer", "--inbetweener", tmp_path / "run", "--quiet"]
+    assert run("infill", tmp_path / "in.bvh", "-o", tmp_path / "out.bvh", *words) == 0
+    assert mapctl.load(tmp_path / "out.bvh").num_frames == 45
+    words[words.index("transformer")] = "infiller"
+    assert run("infill", tmp_path / "in.bvh", "-o", tmp_path / "no.bvh", *words) == 2
