@@ -56,9 +56,10 @@ class PoseTransformer(Inbetweener):
 
         Gaps of more than MAX_GAP_FRAMES in which nothing is known stay interpolated.
         """
-        motion = self._show(query)
+        origin = _find_origin(query)
+        motion = self._show(_move(query, -origin))
         poses = _average_mirrored(self._propose_windows(motion), self._propose_windows(motion.mirrored()))
-        root = poses.root_position[0].double() * query.scale
+        root = poses.root_position[0].double() * query.scale + origin
         quats = rotations.from_matrix(poses.local_matrix[0].double())
         shown, missing = query.motion, query.missing
         too_long = _find_too_long(query)
@@ -124,6 +125,23 @@ class PoseTransformer(Inbetweener):
             joined[first:stop] = torch.lerp(joined[first:stop], rows, fade[:, None])
             weights[first:stop] = 1.0
         return _unpack(joined)
+
+
+def _find_origin(query: GapQuery) -> Float[Tensor, " 3"]:
+    """Return the hips' first known place on the ground: far from the world's origin single precision is coarse."""
+    known = (~query.missing.root).nonzero()[:, 0]
+    origin = query.motion.root_position[known[0] if len(known) else 0].clone()
+    origin[1] = 0.0
+    return origin
+
+
+def _move(query: GapQuery, shift: Float[Tensor, " 3"]) -> GapQuery:
+    """Return the query moved in the world."""
+    moved = replace(query.motion, root_position=query.motion.root_position + shift)
+    targets = query.effector_targets
+    if targets is not None:
+        targets = replace(targets, places=targets.places + shift)
+    return replace(query, motion=moved, effector_targets=targets)
 
 
 def _lay_windows(unknown: Bool[Tensor, " frames"]) -> Iterator[tuple[int, int]]:

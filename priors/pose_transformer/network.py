@@ -116,13 +116,13 @@ class PoseTransformerNetwork(nn.Module):
                 tokens = layer(tokens, phases)
             tokens = self.norm(tokens)
             out, spread = self.head(tokens).float(), self.spread(tokens.detach()).float()
-        change = self._decode_rotations(out[..., :_ROTATION_ROWS], shown, motion)
+        local = self._decode_rotations(out[..., :_ROTATION_ROWS], shown, motion)
         moved = out[..., _ROTATION_ROWS : _ROTATION_ROWS + 3] * _HIPS_UNIT
         moved = rotations.rotate_about_y(moved, motion.heading)
         keep = torch.stack([motion.known.ground, motion.known.height, motion.known.ground], dim=-1)
         root = motion.root_position + torch.where(keep, 0.0, moved)
         logits = 4 * out[..., -2:]
-        return ProposedPoses(root, change, logits, spread.unflatten(-1, (_JOINTS, 2)) - 3.0 + self.spread_shift)
+        return ProposedPoses(root, local, logits, spread.unflatten(-1, (_JOINTS, 2)) - 3.0 + self.spread_shift)
 
     def _encode(self, motion: PartialMotion, shown: Float[Tensor, "batch frames joints 3 3"]) -> Tensor:
         """Encode what is shown and what is known, in about unit size."""
