@@ -1,5 +1,6 @@
 """Learned models: what motion is natural."""
 
+from mapctl.errors import CheckpointError
 from priors import checkpoints
 from priors.denoiser import network as denoiser_network
 from priors.denoiser.network import ConvDenoiser
@@ -46,9 +47,13 @@ def load_infiller(name: str = "infiller") -> ConvInfiller:
 
 
 def load_inbetweener(name: str = "transformer") -> ConvInfiller | PoseTransformer:
-    """The bundled in-betweener of that name, or a trained one of either kind by its file or run folder."""
-    kind = checkpoints.read_card(checkpoints.locate(name).with_suffix(".json")).kind
-    return load_infiller(name) if kind == "infiller" else load_transformer(name)
+    """The bundled in-betweener of that name, or a trained one of either kind by its file or run folder; CheckpointError
+    for anything else."""
+    path = checkpoints.locate(name)
+    kind = checkpoints.read_card(path.with_suffix(".json")).kind
+    if kind not in _INBETWEENERS:
+        raise CheckpointError(f"{path}: a {kind} is no in-betweener")
+    return _INBETWEENERS[kind](name)
 
 
 def load_transformer(name: str = "transformer") -> PoseTransformer:
@@ -67,3 +72,6 @@ def refiner_of(prior: str, name: str = "auto") -> LstmRefiner | None:
         return load_refiner(name)
     own = f"{prior}-refiner"
     return load_refiner(own) if own in checkpoints.list_bundled() else None
+
+
+_INBETWEENERS = {"infiller": load_infiller, "pose-transformer": load_transformer}

@@ -97,7 +97,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(command, tiny, s
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_network_of_another_kind_is_refused(command, source, fails):
-    kind = NETWORK[command].removeprefix("--")
+    kind = {"--inbetweener": "in-betweener"}.get(NETWORK[command], NETWORK[command].removeprefix("--"))
     save_tiny_prior(Path("prior.safetensors"))
     for name, said in (("prior.safetensors", f"a lstm-gmm is no {kind}"), ("nobody", "no prior 'nobody'")):
         assert said in fails(command, "in.bvh", "-o", "a.bvh", *WORDS[command], NETWORK[command], name)

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import tiny_denoiser
 import tiny_infiller
+import tiny_transformer
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
@@ -28,7 +29,7 @@ from priors import checkpoints, tensor_files
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus, density_quality, run, run_files
-from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, refiner
+from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, pose_transformer, refiner
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,10 @@ MODELS = {
     "lstm-gmm": Model(lstm_gmm.DensityTrainer, _density),
     "refiner": Model(refiner.AdversarialTrainer, _refiner),
     "denoiser": Model(denoiser.DenoiserTrainer, _windowed(denoiser.DenoiserRecipe, tiny_denoiser.CONFIG)),
+    "pose-transformer": Model(
+        pose_transformer.PoseTransformerTrainer,
+        _windowed(pose_transformer.PoseTransformerRecipe, tiny_transformer.CONFIG),
+    ),
     "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
     "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
 }

@@ -39,7 +39,7 @@ _MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
 class PoseTransformerSettings:
     """How a pose transformer is trained."""
 
-    steps: int = 13_500
+    steps: int = 11_500
     """Updates."""
     batch: int = 2000
     """Frames an update; windows of one update are equally long."""
