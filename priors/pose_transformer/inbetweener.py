@@ -10,7 +10,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_partial_motion
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.numerics.intervals import true_intervals
@@ -113,7 +113,7 @@ class PoseTransformer(Inbetweener):
             (body.skeleton.offsets / query.scale).float()[None],
             known,
         )
-        return interpolate_partial_motion(motion, self.network.mean_quats, float(self.network.mean_position[0, 1]))
+        return self.network.interpolate(motion)
 
     def _propose_windows(self, motion: PartialMotion) -> ProposedPoses:
         """Propose window by window; where two overlap, one fades into the other."""

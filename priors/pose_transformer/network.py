@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.skeleton import CANONICAL
 from priors.config import NetworkConfig
@@ -123,6 +123,10 @@ class PoseTransformerNetwork(nn.Module):
         root = motion.root_position + torch.where(keep, 0.0, moved)
         logits = 4 * out[..., -2:]
         return ProposedPoses(root, local, logits, spread.unflatten(-1, (_JOINTS, 2)) - 3.0 + self.spread_shift)
+
+    def interpolate(self, motion: PartialMotion) -> PartialMotion:
+        """Interpolate a motion where it is not known, as the network takes it."""
+        return interpolate_partial_motion(motion, self.mean_quats, float(self.mean_position[0, 1]))
 
     def _encode(self, motion: PartialMotion, shown: Float[Tensor, "batch frames joints 3 3"]) -> Tensor:
         """Encode what is shown and what is known, in about unit size."""

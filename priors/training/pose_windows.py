@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
@@ -62,7 +63,7 @@ class PoseWindows:
     def draw(
         self, batch: int, frames: int, generator: torch.Generator, *, variation: Variation | None = None
     ) -> PartialMotion:
-        """So many windows of so many frames, of which everything is known; the longest clip alone where none is."""
+        """So many windows of so many frames, of which everything is known; RequestError where no clip is so long."""
         tempo = torch.ones(batch)
         if variation is not None:
             chosen = torch.rand(batch, generator=generator) < variation.share
@@ -70,6 +71,8 @@ class PoseWindows:
             tempo = torch.where(chosen, 1 + change, 1.0)
         span = 1 + ((frames - 1) * tempo).ceil().long()
         room = (self.lengths - int(span.max()) + 1).clamp_min(0).float()
+        if not bool(room.any()):
+            raise RequestError(f"no clip is as long as the window of {int(span.max())} frames")
         clip = torch.multinomial(room * self.weights, batch, replacement=True, generator=generator)
         first = (torch.rand(batch, generator=generator) * (self.lengths[clip] - span + 1)).long()
         window = self.at(clip, first, frames, tempo)

@@ -22,7 +22,7 @@ from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.retrieval import MotionCollection
 from mapctl.pose import decode
-from priors.training.corpus import read_corpus, split_corpus
+from priors.training.corpus import read_corpus
 from priors.training.transition_statistics import compute_position_std
 
 
@@ -34,7 +34,9 @@ def run(table: Transitions) -> int:
     kinds = {kind: [scale_to_canonical_bones(clip) for clip in clips] for kind, clips in kinds.items()}
     with TemporaryDirectory() as cache:
         corpus = read_corpus(table.data, match="", cache=Path(cache), skip_first=True)
-    train = split_corpus(corpus, int(network.card.data["split_seed"])).train
+    # By name: a folder with clips beside those of the training would be split otherwise.
+    kept_out = {name for names in held_out.values() for name in names}
+    train = corpus.subset(number for number, name in enumerate(corpus.names) if name not in kept_out)
     origin = GroundPose(torch.zeros(2), torch.zeros(()))
     collection = MotionCollection.of([decode(clip, origin) for clip in train.clips()])
     methods: dict[str, Method] = {
@@ -42,11 +44,12 @@ def run(table: Transitions) -> int:
         "slerp": of_inbetweener(SlerpInbetweener(), finish=False),
         "retrieval": of_retrieval(collection),
     }
-    for name in filter(None, table.baselines.split(",")):
-        methods[f"{name}, raw"] = of_inbetweener(priors.load_inbetweener(name), finish=False)
-    methods[f"{table.inbetweener}, raw"] = of_inbetweener(network, finish=False)
+    compared = {name: priors.load_inbetweener(name) for name in filter(None, table.baselines.split(","))}
+    for name, each in (compared | {table.inbetweener: network}).items():
+        methods[f"{name}, raw"] = of_inbetweener(each, finish=False)
+        if not table.raw:
+            methods[f"{name}, finished"] = of_inbetweener(each)
     if not table.raw:
-        methods[f"{table.inbetweener}, finished"] = of_inbetweener(network)
         methods["auto"] = of_inbetweener(AutoInbetweener(network, priors.load_choice("auto")))
     past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:

@@ -11,7 +11,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.pose_transformer.network import (
@@ -102,8 +102,8 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         _set_moments(self.network, self.windows)
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Matrices of the layers by Muon (Jordan et al. 2024), which here learnt as much as AdamW in half the steps, at
-        the step size that makes one learning rate serve both (Liu et al. 2025); all else by AdamW."""
+        """Matrices of the layers by Muon (Jordan et al. 2024), at the step size that makes one learning rate serve both
+        (Liu et al. 2025); all else by AdamW."""
         weights = dict(self.network.named_parameters())
         if self.settings.optimiser == "adam":
             return {"optimiser": make_adam(weights.values(), self.learning_rate)}
@@ -216,7 +216,7 @@ def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotio
     """Interpolate what is not known, and forget contacts of toes that are not."""
     toes = motion.known.positions[..., list(TOE_JOINTS)]
     shown = replace(motion, contacts=torch.where(toes, motion.contacts, 0.5))
-    return interpolate_partial_motion(shown, network.mean_quats, float(network.mean_position[0, 1]))
+    return network.interpolate(shown)
 
 
 @torch.no_grad()
