@@ -96,6 +96,18 @@ def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[
     return torch.cat([quat_xyzw[:1], quat_xyzw[1:] * signs.unsqueeze(-1)])
 
 
+def average(
+    quat_xyzw: Float[Tensor, "count *joints 4"], weights: Float[Tensor, " count"] | None = None
+) -> Float[Tensor, "*joints 4"]:
+    """Return the mean rotation over the first axis, whatever the signs, with w >= 0: the first eigenvector of the
+    quaternions' second moment, weighted or not (Markley et al. 2007).
+    """
+    weights = quat_xyzw.new_ones(len(quat_xyzw)) if weights is None else weights
+    moment = torch.einsum("n,n...i,n...j->...ij", weights / weights.sum(), quat_xyzw, quat_xyzw)
+    mean = torch.linalg.eigh(moment)[1][..., -1]
+    return torch.where(mean[..., 3:] < 0, -mean, mean)
+
+
 def slerp(
     start_xyzw: Float[Tensor, "*batch 4"], stop_xyzw: Float[Tensor, "*batch 4"], weight: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 4"]:

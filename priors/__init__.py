@@ -41,14 +41,14 @@ def load_denoiser(name: str = "denoiser") -> ConvDenoiser:
     return denoiser_network.load(name)
 
 
-def load_infiller(name: str = "infiller") -> ConvInfiller:
-    """The bundled infiller, or a trained one by its file or run folder."""
+def load_infiller(name: str) -> ConvInfiller:
+    """A trained infiller by its file or run folder."""
     return infiller_network.load(name)
 
 
 def load_inbetweener(name: str = "transformer") -> ConvInfiller | PoseTransformer:
-    """The bundled in-betweener of that name, or a trained one of either kind by its file or run folder; CheckpointError
-    for anything else."""
+    """The bundled pose transformer, or a trained transformer or infiller by its file or run folder; CheckpointError for
+    anything else."""
     path = checkpoints.locate(name)
     kind = checkpoints.read_card(path.with_suffix(".json")).kind
     if kind not in _INBETWEENERS:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
-from mapctl.mesh.primitives import Array
+from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import CameraSettings
 from scenes.contact_sheet import draw_contact_sheet
 from scenes.content import Painter
@@ -35,6 +35,7 @@ def film(
     size: tuple[int, int] = (1280, 720),
     fps: Fraction | float | None = None,
     renderer: RendererName | None = None,
+    props: Sequence[Surface] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Film the actors walking together; one pass serves all outputs. Returns the paths written.
@@ -42,13 +43,13 @@ def film(
     `actors` are Shots, or tuples (motion, curve, colour, start seconds) of which all but the motion may be
     left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
     the trajectory over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
-    them. `size` is the width and height in pixels (MP4 rounds up to even). `progress` is called with frames
-    done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for endings,
-    sizes and paths that cannot be.
+    them. `size` is the width and height in pixels (MP4 rounds up to even). `props` are what stands around
+    (`scenes.props`). `progress` is called with frames done and all frames. `renderer` is that of
+    `scenes.renderers.select.select_painter`. RequestError for endings, sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
     stage, brush, camera = (
-        Stage([Shot(*actor) for actor in actors], fps),
+        Stage([Shot(*actor) for actor in actors], fps, props),
         select_painter(renderer),
         camera or CameraSettings(),
     )

@@ -4,24 +4,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path, PurePath
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from mapctl import curves
 from mapctl.curves import Curve
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import toml
 from mapctl.formats.toml import STRICT
+from mapctl.intent.path import SpeedProfile
+from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh import colours
 from scenes.cameras import CameraSettings
 
 _FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".png"), (".bvh", ".npz"), (".json",)
 _ENDINGS = (*_FILMS, *_MOTIONS, *_REPORTS)
 _MAX_SECONDS = 3600.0
+_STAY = "line:1"  # of an actor without a curve, who stands at its beginning
 
 Seconds = Annotated[float, Field(gt=0, le=_MAX_SECONDS)]
+Seconds0 = Annotated[float, Field(ge=0, le=_MAX_SECONDS)]
+Length = Annotated[float, Field(gt=0, le=100)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 
 
@@ -31,24 +37,88 @@ class Actor:
 
     __pydantic_config__ = STRICT
 
-    curve: Annotated[str, Field(min_length=1)]
-    """A built-in shape (`circle:4`) or a CSV or SVG file, relative to the scene file."""
+    curve: Annotated[str, Field(min_length=1)] | None = None
+    """A built-in shape (`circle:4`) or a CSV or SVG file, relative to the scene file; without one the actor stays."""
     name: Annotated[str, Field(pattern=r"^[\w-]+$")] = ""
     """Used in file names; `actor1`, `actor2`, ... if not given."""
-    speed: Annotated[float, Field(gt=0, le=20)] | None = None
-    """Speed along the curve, m/s; the controller's own if not given."""
+    speed: Annotated[float, Field(gt=0, le=20)] | Annotated[str, Field(min_length=1)] | None = None
+    """Speed along the curve, m/s, or `ARC:SPEED,ARC:SPEED`; the controller's own if not given."""
     seconds: Seconds | None = None
     """Duration of the walk, seconds; once along the curve if not given."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of everything random about this actor."""
     colour: str | None = None
     """Torso colour: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
-    offset: tuple[Coordinate, Coordinate] = (0.0, 0.0)
-    """Position of the curve's origin, x and z, metres."""
-    turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    speed_by_time: tuple[tuple[Seconds0, Annotated[float, Field(ge=0, le=20)]], ...] | None = None
+    """Speed along the curve by time, pairs of seconds and m/s, zero allowed; instead of `speed`."""
+    gait: str | None = None
+    """Gait of the motion, of those that the prior knows."""
+    style: str | None = None
+    """Style of the motion, of those that the prior knows."""
+    start: Annotated[str, Field(min_length=1)] = "walk"
+    """How it begins: `walk`, `stand`, or `CLIP:FRAME`, going on from that frame of a motion file, on its rig and at its
+    rate, in its place unless `offset` or `turn_deg` are given."""
+    end: Literal["walk", "stand"] = "walk"
+    """How it ends."""
+    keys: tuple[ShotKey, ...] = ()
+    """What it does on the way, one [[actors.keys]] table each."""
+    offset: tuple[Coordinate, Coordinate] | None = None
+    """Position of the curve's origin, x and z, metres; the world's origin if not given."""
+    turn_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     """Rotation of the curve about its origin before that, degrees; positive turns +Z toward +X."""
     start_seconds: Annotated[float, Field(ge=0, le=_MAX_SECONDS)] = 0.0
     """Start time, seconds; until then the actor holds its first pose."""
+
+    @property
+    def clip_frame(self) -> tuple[str, int] | None:
+        """The clip that it goes on from, and the frame; None where it begins by itself."""
+        clip, colon, frame = self.start.rpartition(":")
+        return (clip, int(frame)) if colon and clip and frame.isdecimal() else None
+
+    @property
+    def fault(self) -> str | None:
+        """A fault that the types cannot express, after the key it is of; None without any."""
+        if self.speed is not None and self.speed_by_time is not None:
+            return "speed_by_time: an actor has a speed or speeds by time, not both"
+        try:
+            SpeedProfile.parse(str(1.0 if self.speed is None else self.speed))
+        except RequestError as error:
+            return f"speed: {error}"
+        if self.seconds is None and (self.speed_by_time is not None or self.curve is None):
+            return "seconds: this key is needed with speed_by_time, and without a curve"
+        if self.start not in ("walk", "stand") and not self.clip_frame:
+            return f"start: expected walk, stand or CLIP:FRAME, got {self.start!r}"
+        for number, key in enumerate(self.keys):
+            if key.fault is not None:
+                return f"keys[{number}].{key.fault}"
+        return None
+
+    @property
+    def wishes_more(self) -> bool:
+        """Whether more is wished than to walk along a curve."""
+        ends = self.start != "walk" or self.end != "walk"
+        told = self.curve is None or self.speed_by_time is not None or self.gait or self.style
+        return bool(ends or told or self.keys)
+
+
+@dataclass(frozen=True)
+class SceneObstacle:
+    """A disc or a box on the ground."""
+
+    __pydantic_config__ = STRICT
+
+    place: tuple[Coordinate, Coordinate]
+    """Its centre, x and z, metres."""
+    radius: Annotated[float, Field(gt=0, le=100)] | None = None
+    """Radius of a disc, metres; or `size`."""
+    size: tuple[Length, Length] | None = None
+    """Width along x and depth along z of a box, metres."""
+    turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Turn of a box about its centre, degrees; positive turns +Z toward +X."""
+
+    def build(self) -> Obstacle:
+        """Build the obstacle; RequestError for one that is both a disc and a box, or neither."""
+        return Obstacle(self.place, self.radius, self.size, self.turn_deg)
 
 
 @dataclass(frozen=True)
@@ -65,6 +135,10 @@ class SceneDescription:
     """Description for people."""
     prior: str = "locomotion"
     """Bundled or trained prior that moves the actors."""
+    obstacles: tuple[SceneObstacle, ...] = ()
+    """What all actors walk around, one [[obstacles]] table each."""
+    keep_apart: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Least distance of the actors' hips, metres; any if not given."""
     camera: CameraSettings = field(default_factory=CameraSettings)
     """Camera of the film."""
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (1280, 720)
@@ -110,19 +184,21 @@ def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]
 
 def transform_curve(actor: Actor, folder: Path) -> Curve:
     """Rotate and move the actor's curve into the world; files are relative to `folder`."""
-    is_file = PurePath(actor.curve).suffix.lower() in (".csv", ".svg")
-    curve = curves.read(folder / actor.curve if is_file else actor.curve)
+    text = _STAY if actor.curve is None else actor.curve
+    is_file = PurePath(text).suffix.lower() in (".csv", ".svg")
+    curve = curves.read(folder / text if is_file else text)
     points = curve.points.numpy().copy()
-    angle = np.radians(actor.turn_deg)
+    angle = np.radians(actor.turn_deg or 0.0)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     ground = slice(0, 3, points.shape[1] - 1)
-    points[:, ground] = points[:, ground] @ turn.T + np.array(actor.offset)
+    points[:, ground] = points[:, ground] @ turn.T + np.array(actor.offset or (0.0, 0.0))
     return curves.from_points(points, closed=curve.closed)
 
 
 def _list_allowed_keys(key: Sequence[int | str]) -> str:
-    known = {"actors": Actor, "camera": CameraSettings} if len(key) > 1 else {}
-    return f"allowed: {', '.join(item.name for item in fields(known.get(str(key[0]), SceneDescription)))}"
+    known = {"actors": Actor, "camera": CameraSettings, "obstacles": SceneObstacle} if len(key) > 1 else {}
+    table = ShotKey if "keys" in key[1:-1] else known.get(str(key[0]), SceneDescription)
+    return f"allowed: {', '.join(item.name for item in fields(table))}"
 
 
 def _name_actors(scene: SceneDescription) -> SceneDescription:
@@ -136,11 +212,18 @@ def _check(path: str | PathLike[str], scene: SceneDescription) -> None:
     for number, actor in enumerate(scene.actors):
         if names.index(actor.name) != number:
             raise FileFormatError(path, f"actors[{number}].name: {actor.name!r} is taken by another actor")
+        if actor.fault is not None:
+            raise FileFormatError(path, f"actors[{number}].{actor.fault}")
         if actor.colour is not None:
             try:
                 colours.rgb(actor.colour)
             except MapctlError as error:
                 raise FileFormatError(path, f"actors[{number}].colour: {error}") from error
+    for number, obstacle in enumerate(scene.obstacles):
+        try:
+            obstacle.build()
+        except RequestError as error:
+            raise FileFormatError(path, f"obstacles[{number}].radius: {error}") from error
     for number, name in enumerate(scene.outputs):
         if PurePath(name).name != name or name in scene.outputs[:number]:
             raise FileFormatError(path, f"outputs[{number}]: {name!r} must be a file name of its own, without folders")

@@ -54,9 +54,9 @@ class StagedActor:
 
 
 class Stage:
-    """All actors on their ground. `fps` resamples every motion; by default the first actor's rate holds."""
+    """All actors and props on their ground. `fps` resamples every motion; by default the first actor's rate holds."""
 
-    def __init__(self, shots: Sequence[Shot], fps: Fraction | float | None = None):
+    def __init__(self, shots: Sequence[Shot], fps: Fraction | float | None = None, props: Sequence[Surface] = ()):
         if not shots:
             raise RequestError("a film needs at least one actor")
         self.fps = Fraction(fps or shots[0].motion.fps).limit_denominator(100_000)
@@ -64,7 +64,7 @@ class Stage:
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
         self._grid = overlays.build_grid(self._places()[:, [0, 2]])
         wishes = [player.wish for player in self.players if player.wish is not None]
-        self._still = merge_surfaces([self._grid, *wishes])
+        self._still = merge_surfaces([self._grid, *wishes, *props])
 
     @property
     def seconds(self) -> float:

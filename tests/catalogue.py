@@ -14,6 +14,7 @@ from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetween
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from mapctl import curves
 from mapctl.curves import Curve
+from mapctl.curves.obstacles import Obstacle
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Density, Inbetweener, Refiner
@@ -23,6 +24,8 @@ from mapctl.terms import (
     Clearance,
     FootContact,
     Jerk,
+    KeepApart,
+    KeepClear,
     Keyframe,
     LatentPrior,
     Likelihood,
@@ -32,6 +35,7 @@ from mapctl.terms import (
     StepLength,
     Support,
     Term,
+    WithinReach,
 )
 from mapctl.terms.trial import Trial
 from priors.lstm_gmm.density import LstmGmmDensity
@@ -48,6 +52,8 @@ _RISING = torch.linspace(0, 3, 400, dtype=torch.float64)
 _IN_SPACE = curves.from_points(torch.stack([0.1 * torch.sin(_RISING), 0.1 + 0.2 * _RISING, _RISING], -1))
 
 _VELOCITIES = torch.stack([torch.linspace(0, 0.4, FRAMES), torch.linspace(0, 1.2, FRAMES)], -1).double()
+
+_FAR = torch.tensor([1.0, 1.5, 1.0]).expand(FRAMES, 3).double()
 
 _MASK = torch.arange(FRAMES)[:, None] % (2 + torch.arange(21)) != 1
 
@@ -66,6 +72,9 @@ TERMS: dict[str, Term] = {
     "keyframe": Keyframe(0.3 + 0.1 * torch.rand(FRAMES, 21, 3, generator=generator(9)).double(), _MASK, 0.1),
     "travel": RootVelocity(_VELOCITIES, _VELOCITIES[:9] - 0.2),
     "travel, facing": RootVelocity(_VELOCITIES, _VELOCITIES[:3], facing=4 * torch.arange(FRAMES).double()),
+    "clear of a disc and a box": KeepClear((Obstacle((0.3, 0.8), 0.7), Obstacle((-0.4, 1.0), size=(0.6, 0.5)))),
+    "apart": KeepApart(0.2 * torch.rand(2, FRAMES, 2, generator=generator(3)).double() + 0.5, 1.5),
+    "within reach": WithinReach(6, _FAR, torch.arange(FRAMES) % 2 == 1, 0.5),
 }
 """Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
 

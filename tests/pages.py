@@ -30,10 +30,7 @@ _TINY = {
     "chain": {"--inbetweener": "infiller.safetensors"},
 }
 _NAMED_MODELS = ("--prior", "--init", "--density")
-_TRAINING = {
-    "lstm-gmm": "--steps 2 --batch 2 --window 20 --device cpu",
-    "refiner": "--rounds 1 --batch 2 --window 10 --device cpu",
-}
+_TRAINING = {"lstm-gmm": "--steps 2 --batch 2 --window 20 --device cpu", "refiner": "--steps 1 --batch 2 --window 10"}
 
 
 @dataclass(frozen=True)
@@ -123,6 +120,9 @@ def write_files(folder: Path) -> None:
     (folder / "lost.csv").write_text("joint,start,stop\nLeftHand,5,15\n")
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("*.png", "*.md"))
     (folder / "docs" / "poses").mkdir()
+    (folder / "scenes").mkdir()
+    for scene in (ROOT / "scenes").glob("*.toml"):
+        shutil.copy(scene, folder / "scenes")
     walk(120).save(folder / "docs" / "poses" / "generated_000.bvh")
     shutil.copytree(folder / "docs" / "poses", folder / "poses")
     shutil.copy(ROOT / "docs" / "keys.toml", folder)

@@ -72,13 +72,16 @@ def evaluate_clip(
     inbetweener: Inbetweener | None = None,
 ) -> Row:
     """Measure the mean joint error in and out and of the best filters (cm), contact F1, skate (cm/s) and jitter beside
-    mocap's, milliseconds a frame; where joints are masked and there is an in-betweener, its error too.
+    mocap's, milliseconds a frame; where joints are masked and there is an in-betweener, which then helps, also the
+    errors of the denoiser alone and of infilling alone.
     """
-    filled = float("nan")
+    filled = alone = float("nan")
     if inbetweener is not None and corrupted.masks:
+        without = denoise(corrupted.motion, denoiser, masks=corrupted.masks, densities=densities)
+        alone = _mean_joint_error_cm(truth, without.motion)
         filled = _mean_joint_error_cm(truth, infill(corrupted.motion, inbetweener, corrupted.masks).motion)
     began = time.perf_counter()
-    done = denoise(corrupted.motion, denoiser, masks=corrupted.masks, densities=densities)
+    done = denoise(corrupted.motion, denoiser, inbetweener=inbetweener, masks=corrupted.masks, densities=densities)
     seconds = time.perf_counter() - began
     butterworth, savgol = tune_filters(truth, inspect_recording(corrupted.motion, corrupted.masks))
     ours, mocap = metrics.measure(done.motion), metrics.measure(truth)
@@ -88,7 +91,8 @@ def evaluate_clip(
         "out_cm": out,
         "butterworth_cm": butterworth,
         "savgol_cm": savgol,
-        "infiller_cm": filled,
+        "denoiser_alone_cm": alone,
+        "infill_alone_cm": filled,
         "ratio": out / min(butterworth, savgol),
         "contact_f1": contact_f1(truth, done),
         "skate_cm_s": ours["skate_cm_s"],

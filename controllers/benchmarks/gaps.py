@@ -58,7 +58,7 @@ def _evaluate_gap(
     part = clip.slice(first, first + length + 2 * context)
     free = torch.zeros(part.num_frames, dtype=torch.bool)
     free[context : context + length] = True
-    missing = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
+    missing = MissingMask.of_frames(free, part.num_joints)
     done = fill(part, missing, AutoInbetweener(inbetweener, densities))
     errors = (done.motion.joint_positions() - part.joint_positions())[free].norm(dim=-1)
     toes = CANONICAL.indices(TOES)

@@ -11,6 +11,7 @@ from controllers.benchmarks.infilling import WINDOW_FRAMES, scale_to_canonical_b
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.proposers import AutoInbetweener
+from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import Mask
@@ -31,14 +32,14 @@ def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], inbetweener:
     every = [clip for clips in shown.values() for clip in clips]
     if not every:
         return []
-    mean_pose, rows = mean_rotations(every), []
+    mean_pose, rows = average_pose(every), []
     for kind, clips in shown.items():
         for name, joints in MISSING_LIMBS.items():
             found = []
             for clip in clips:
                 masks = [Mask(joint, 0, clip.num_frames) for joint in joints]
                 made = infill(clip, AutoInbetweener(inbetweener), masks).motion
-                poses = (mean_pose, mean_rotations([clip]))
+                poses = (mean_pose, average_pose([clip]))
                 candidates = [*(replace_joint_rotations(clip, joints, pose) for pose in poses), made]
                 found.append([_mean_joint_distance(motion, clip, joints) for motion in candidates])
             if found:
@@ -49,13 +50,10 @@ def benchmark_missing_joints(kinds: Mapping[str, Sequence[Motion]], inbetweener:
     return rows
 
 
-def mean_rotations(motions: Sequence[Motion]) -> Float[Tensor, "joints 4"]:
-    """Compute the mean rotation of every joint over all frames, every motion counting alike: the eigenvector of the
-    largest eigenvalue of the summed outer products (Markley et al. 2007).
-    """
-    rotations = (motion.local_quat_xyzw for motion in motions)
-    outer = torch.stack([torch.einsum("tji,tjk->jik", quats, quats) / len(quats) for quats in rotations])
-    return torch.linalg.eigh(outer.sum(dim=0))[1][..., -1]
+def average_pose(motions: Sequence[Motion]) -> Float[Tensor, "joints 4"]:
+    """Return the mean rotation of every joint over all frames, every motion counting alike."""
+    weights = torch.cat([torch.ones(motion.num_frames, dtype=torch.float64) / motion.num_frames for motion in motions])
+    return rotations.average(torch.cat([motion.local_quat_xyzw for motion in motions]), weights)
 
 
 def replace_joint_rotations(motion: Motion, joints: Sequence[str], pose: Float[Tensor, "joints 4"]) -> Motion:

@@ -107,7 +107,7 @@ def of_inbetweener(inbetweener: Inbetweener, densities: Sequence[Density] = (), 
     def method(part: Motion, start: int, stop: int) -> Motion:
         free = torch.zeros(part.num_frames, dtype=torch.bool)
         free[start:stop] = True
-        missing = MissingMask(free[:, None].expand(-1, part.num_joints).clone(), free)
+        missing = MissingMask.of_frames(free, part.num_joints)
         return fill(part, missing, inbetweener, settings=InfillSettings(finish=finish), densities=densities).motion
 
     return method

@@ -15,7 +15,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restor
 from mapctl.inbetweening.query import GapQuery
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.motion import Motion
-from mapctl.recording.frequency_bands import upsample
+from mapctl.recording.frequency_bands import resample_by_splines
 from mapctl.retarget import RigMap, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
@@ -110,11 +110,8 @@ def _resample_like(canonical: Motion, made: Motion, seconds: Float[Tensor, " sho
     """Resample an answer to the clip's rate, by splines through its frames."""
     if canonical.fps == PRIOR_FPS:
         return made
-    frames, fps = canonical.num_frames, float(canonical.fps)
-    quats = rotations.make_sign_continuous(made.local_quat_xyzw)
-    quats = torch.nn.functional.normalize(upsample(quats, seconds, fps=fps, frames=frames), dim=-1)
-    root = upsample(made.root_position, seconds, fps=fps, frames=frames)
-    return replace(canonical, root_position=root, local_quat_xyzw=quats)
+    resampled = resample_by_splines(made, seconds, fps=canonical.fps, frames=canonical.num_frames)
+    return replace(canonical, root_position=resampled.root_position, local_quat_xyzw=resampled.local_quat_xyzw)
 
 
 def _resample_to_end(canonical: Motion) -> Motion:

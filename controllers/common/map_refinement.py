@@ -35,6 +35,7 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
 
+_LEVEL_FLOOR = 0.04  # metres from the rest height within which nine of ten toes rest on a level floor
 _DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the motion of planted toes is averaged
 
 
@@ -141,7 +142,7 @@ def refine(
     states = ensemble.infer_state(pose.slice(0, first.stop).features(start, planted[first]))
     before = torch.zeros(0, proposal.num_joints, 3)
     done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before, discarded=first_frame)
-    terms_of = _lay_terms(settings, estimate_rest_height(proposal, planted), capture, targets, terms)
+    terms_of = _lay_terms(_fit_to_floor(settings, proposal, planted, capture), capture, targets, terms)
     done, outcome = solver.solve(done, terms_of, proposal.num_frames, generator=torch.Generator())
     if outcome is Outcome.INTERRUPTED:
         raise KeyboardInterrupt
@@ -150,21 +151,16 @@ def refine(
 
 
 def _lay_terms(
-    settings: RefinementSettings,
-    rest_height: float,
-    capture: Capture,
-    targets: EffectorTargets | None,
-    caller_terms: Sequence[Term],
+    settings: RefinementSettings, capture: Capture, targets: EffectorTargets | None, caller_terms: Sequence[Term]
 ) -> TermsOf:
     """Lay the terms of each window."""
-    footing = replace(settings.footing, rest_height=rest_height)
     clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
 
     def terms_of(first: int, frames: int) -> list[Term]:
         part = slice(first, first + frames)
-        terms: list[Term] = [LatentPrior(1.0), footing, *caller_terms]
+        terms: list[Term] = [LatentPrior(1.0), settings.footing, *caller_terms]
         if settings.clearance is not None:
-            terms.append(replace(settings.clearance, rest_height=rest_height, share=clearing[part]))
+            terms.append(replace(settings.clearance, share=clearing[part]))
         if settings.jerk is not None:
             terms.append(settings.jerk)
         if targets is not None:
@@ -207,6 +203,29 @@ def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> 
     heights = motion.joint_positions()[:, toes, 1]
     planted = heights[contacts]
     return float(planted.median() if len(planted) else heights.quantile(0.05))
+
+
+def _fit_to_floor(
+    settings: RefinementSettings, proposal: Motion, planted: Bool[Tensor, "frames 2"], capture: Capture
+) -> RefinementSettings:
+    """Fit contacts and clearance to the performer's rest height, and to a floor that observed toes show not to be
+    level: heights count for less there, or who climbs would be lifted off the lower step.
+    """
+    rest_height = estimate_rest_height(proposal, planted)
+    toes = proposal.joint_positions()[:, proposal.skeleton.indices(TOES), 1]
+    observed = _find_observed_toes(capture)
+    away = torch.cat([(toes - rest_height).abs()[planted & observed], (rest_height - toes).clamp_min(0)[observed]])
+    uneven = max(0.0, float(away.quantile(0.9)) - _LEVEL_FLOOR) if len(away) else 0.0
+    footing, clearance = settings.footing, settings.clearance
+    footing = replace(
+        footing,
+        rest_height=rest_height,
+        sigma_height=math.hypot(footing.sigma_height, uneven),
+        sigma_below=math.hypot(footing.sigma_below, uneven),
+    )
+    if clearance is not None:
+        clearance = replace(clearance, rest_height=rest_height, sigma=math.hypot(clearance.sigma, uneven))
+    return replace(settings, footing=footing, clearance=clearance)
 
 
 def _compute_proposal_sigma(

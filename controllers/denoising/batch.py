@@ -5,7 +5,7 @@ all.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from joblib import Parallel, delayed
@@ -15,7 +15,7 @@ from controllers.denoising.result import DenoiseSolution
 from controllers.denoising.segment import DenoiseSettings
 from mapctl import formats
 from mapctl.errors import DiskFullError, MapctlError, RequestError
-from mapctl.protocols import Denoiser
+from mapctl.protocols import Denoiser, Inbetweener
 from mapctl.recording.masks import masks_from_missing
 from mapctl.retarget.rigs import Rig
 
@@ -52,6 +52,8 @@ class FileDenoiser:
     """Loader of the network: `functools.partial(priors.load_denoiser, "denoiser")`."""
     settings: DenoiseSettings
     """Settings for all files."""
+    load_inbetweener: Callable[[], Inbetweener] | None = None
+    """Loader of the network that fills what is lost for longer; None leaves that to the denoiser."""
     rig: Rig | None = None
     """Rig of all files, where it is not the one that would be recognised."""
     after: Callable[[FileJob, DenoiseSolution], None] | None = None
@@ -64,7 +66,9 @@ class FileDenoiser:
             unit = None if self.rig is None else self.rig.metres_per_unit
             motion, missing = formats.load_with_missing(job.source, metres_per_unit=unit)
             masks = masks_from_missing(motion, missing)
-            done = denoise(motion, _load_once(self.load), masks=masks, settings=self.settings, rig=self.rig)
+            inbetweener = None if self.load_inbetweener is None else _load_once(self.load_inbetweener)
+            denoiser = _load_once(self.load)
+            done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=self.settings, rig=self.rig)
             job.out.parent.mkdir(parents=True, exist_ok=True)
             if self.after is not None:
                 self.after(job, done)
@@ -79,15 +83,17 @@ class FileDenoiser:
         return FileResult(job, "", done.motion.num_frames, done.seconds)
 
 
-_LOADED_DENOISERS: dict[str, Any] = {}  # the denoiser that this process loaded last
+_Network = TypeVar("_Network", Denoiser, Inbetweener)
+_LOADED: dict[str, Any] = {}  # the denoiser and the in-betweener that this process loaded last
 
 
-def _load_once(load: Callable[[], Denoiser]) -> Denoiser:
+def _load_once(load: Callable[[], _Network]) -> _Network:
     key = repr(load)
-    if key not in _LOADED_DENOISERS:
-        _LOADED_DENOISERS.clear()
-        _LOADED_DENOISERS[key] = load()
-    return _LOADED_DENOISERS[key]
+    if key not in _LOADED:
+        if len(_LOADED) > 1:
+            _LOADED.clear()
+        _LOADED[key] = load()
+    return _LOADED[key]
 
 
 def run_over_processes(jobs: Sequence[FileJob], file_denoiser: FileDenoiser, *, processes: int) -> Iterator[FileResult]:

@@ -13,13 +13,14 @@ import torch
 
 from controllers.denoising.lead_pose import has_lead_pose, restore_lead_pose
 from controllers.denoising.lead_transition import find_lead_transition
+from controllers.denoising.lost_parts import LostPartFiller
 from controllers.denoising.result import DenoiseSolution, join_segments
 from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Status
-from mapctl.protocols import Denoiser, Density
+from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import (
     Mask,
@@ -47,6 +48,7 @@ def denoise(
     motion: Motion,
     denoiser: Denoiser,
     *,
+    inbetweener: Inbetweener | None = None,
     masks: Sequence[Mask] = (),
     settings: DenoiseSettings | None = None,
     densities: Sequence[Density] = (),
@@ -57,12 +59,14 @@ def denoise(
     """Denoise a motion on any rig that `mapctl.retarget.rigs` identifies, or on a given one; RequestError for others
     and for masks that do not fit.
 
-    `denoiser` proposes (see priors.load_denoiser). Of `densities` the likeliest adds its likelihood to each window of
-    the MAP stage; `terms` are the caller's own, which see the time since the capture's first frame. A T-pose in frame
-    0, as many captures begin with, stays. A long capture is cleaned in segments that crossfade, so memory beyond the
-    capture's own does not grow with it. `progress` is called with frames done and all frames.
+    `denoiser` proposes (see priors.load_denoiser), and `inbetweener`, if there is one, what is lost for longer (see
+    LostPartFiller). Of `densities` the likeliest adds its likelihood to each window of the MAP stage; `terms` are the
+    caller's own, which see the time since the capture's first frame. A T-pose in frame 0, as many captures begin with,
+    stays. A long capture is cleaned in segments that crossfade, so memory beyond the capture's own does not grow with
+    it. `progress` is called with frames done and all frames.
     """
     settings = settings or DenoiseSettings()
+    denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
     masks = resolve_joint_names(motion, masks, rig)
     expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
     # Identified once: a segment may lack the frames that show the rig's T-pose.

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.feasibility import check_path, check_tracking
-from controllers.common.initial_state import select_initial_state
+from controllers.common.initial_state import MotionStart, select_initial_state
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import PathRequest, SpeedProfile
+from mapctl.motion import Motion
 from mapctl.pose import decode
-from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver, TermsOf
-from mapctl.problem.solution import Solution, Status
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
+from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -88,17 +89,18 @@ def follow(
     frames = request.frames(PRIOR_FPS)
     # Windows look ahead beyond the last frame, so the requested arcs extend that far.
     arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
-    unit_curve, unit_arcs = character.curve(curve), arcs / character.scale
-    caller_terms = [character.term(term) for term in terms]
-    terms_of = build_follow_terms(unit_curve, unit_arcs, settings.scaled_to(character), caller_terms)
-    start = select_initial_state(
-        prior, unit_curve, unit_arcs, terms_of, skeleton=character.unit_skeleton, fps=PRIOR_FPS, generator=generator
+    motion, done, outcome = walk_arcs(
+        prior,
+        curve,
+        arcs,
+        frames,
+        character=character,
+        settings=settings,
+        generator=generator,
+        terms_of=lambda _first, _frames: terms,
+        progress=progress,
+        deadline=deadline,
     )
-    solver = RecedingHorizonSolver(prior, settings.window, character.unit_skeleton, method=settings.method)
-    done, outcome = solver.solve(
-        start.committed, terms_of, frames, generator=generator, progress=progress, deadline=deadline
-    )
-    motion = character.motion(decode(done.features, start.before_first, skeleton=character.unit_skeleton))
     notes = [lowered] if lowered else []
     notes += check_path(request, arcs[:frames], character.data_limits(prior.limits))
     notes += check_tracking(motion, curve, settings.joint)
@@ -107,9 +109,50 @@ def follow(
     return Solution(motion, status, ledger, done.windows, done.features, seconds)
 
 
-def build_follow_terms(
-    curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings, caller_terms: Sequence[Term] = ()
-) -> TermsOf:
+def walk_arcs(
+    prior: Density,
+    curve: Curve,
+    arcs: Float[Tensor, " ahead"],
+    frames: int,
+    *,
+    character: Character,
+    settings: FollowSettings,
+    generator: torch.Generator,
+    terms_of: TermsOf = lambda _first, _frames: (),
+    start: MotionStart | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    deadline: float | None = None,
+) -> tuple[Motion, CommittedFrames, Outcome]:
+    """Walk a character along a curve so that it is at one arc (metres) in each frame; arcs extend a window beyond.
+
+    It begins in `start`, of the prior's size, or in the initial state that suits the arcs best. `terms_of` gives more
+    terms for each window, which see the character at its own size. The ledger is of the prior's size.
+    """
+    unit_curve, unit_arcs = character.curve(curve), arcs / character.scale
+    follow_terms = build_follow_terms(unit_curve, unit_arcs, settings.scaled_to(character))
+
+    def all_terms(first: int, count: int) -> Sequence[Term]:
+        return *follow_terms(first, count), *(character.term(term) for term in terms_of(first, count))
+
+    if start is None:
+        start = select_initial_state(
+            prior,
+            unit_curve,
+            unit_arcs,
+            all_terms,
+            skeleton=character.unit_skeleton,
+            fps=PRIOR_FPS,
+            generator=generator,
+        )
+    solver = RecedingHorizonSolver(prior, settings.window, character.unit_skeleton, method=settings.method)
+    done, outcome = solver.solve(
+        start.committed, all_terms, frames, generator=generator, progress=progress, deadline=deadline
+    )
+    motion = character.motion(decode(done.features, start.before_first, skeleton=character.unit_skeleton))
+    return motion, done, outcome
+
+
+def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
     """Build the terms of each window, for the requested arcs of all frames and the look-ahead beyond them."""
     path = Path(
         curve,
@@ -122,6 +165,6 @@ def build_follow_terms(
     )
 
     def terms(first: int, frames: int) -> Sequence[Term]:
-        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing, *caller_terms
+        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing
 
     return terms

@@ -9,10 +9,10 @@ from torch import Tensor
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.solution import InbetweenSolution
-from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.kinematics import heading
+from mapctl.kinematics.placing import rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import ALL, Mask
@@ -90,7 +90,7 @@ def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int) -> tuple[Motion
 def _align_to_predecessor(before: Motion, piece: Motion, gap: int) -> Motion:
     """Align a piece to the position and heading that the motion before it reaches after so many frames."""
     facing = heading(before.local_quat_xyzw[-1:, 0])
-    turned = _rotate_about_vertical(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
+    turned = rotate_about_vertical(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
     velocity = _compute_mean_velocity(before.root_position[-_VELOCITY_FRAMES:])
     next_velocity = _compute_mean_velocity(turned.root_position[:_VELOCITY_FRAMES])
     target = before.root_position[-1] + (gap + 1) / 2 * (velocity + next_velocity)
@@ -102,11 +102,3 @@ def _align_to_predecessor(before: Motion, piece: Motion, gap: int) -> Motion:
 def _compute_mean_velocity(positions: Tensor) -> Tensor:
     """Compute the mean velocity, metres a frame."""
     return (positions[-1] - positions[0]) / max(1, len(positions) - 1)
-
-
-def _rotate_about_vertical(motion: Motion, angle: Tensor) -> Motion:
-    """Rotate a motion about the vertical through the origin."""
-    turn = rotations.about_y(angle).expand(motion.num_frames, 4)
-    quats = motion.local_quat_xyzw.clone()
-    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
-    return replace(motion, local_quat_xyzw=quats, root_position=rotations.rotate(turn, motion.root_position))

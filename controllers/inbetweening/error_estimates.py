@@ -10,44 +10,10 @@ import numpy as np
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, leg_length
 
-INFILLER = "infiller"
-"""Name of the source whose errors are used where another's were never measured."""
 TRAVELLING_SPEED = 0.35
 """Speed of the hips, m/s, from one end of a gap to the other, from which a body with canonical legs is travelling."""
 _MIN_CLIPS = 5  # fewest clips for a 90th percentile
-TRAINED_GAP_FRAMES = 75
-"""Frames of the longest gaps that the infiller was trained on: their mean length and a standard deviation."""
 MEASURED_ERRORS: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float, int]]] = {
-    ("infiller", "going", False): (
-        (15, 4.5, 8.3, 22),
-        (30, 5.5, 9.5, 23),
-        (60, 8.2, 13.7, 5),
-        (90, 10.3, 10.3, 1),
-        (120, 9.6, 11.8, 2),
-        (180, 11.0, 11.0, 1),
-    ),
-    ("infiller", "going", True): (
-        (15, 3.2, 5.6, 22),
-        (30, 4.2, 7.9, 21),
-        (60, 5.2, 9.7, 17),
-        (90, 14.1, 14.1, 1),
-        (120, 11.6, 15.1, 2),
-        (180, 18.7, 18.7, 1),
-    ),
-    ("infiller", "in place", False): (
-        (15, 2.3, 5.0, 3),
-        (30, 2.4, 3.4, 2),
-        (90, 18.3, 18.3, 1),
-        (120, 17.7, 17.7, 1),
-        (180, 23.1, 23.1, 1),
-    ),
-    ("infiller", "in place", True): (
-        (15, 1.8, 3.9, 3),
-        (60, 14.5, 14.5, 1),
-        (90, 16.4, 16.4, 1),
-        (120, 17.8, 17.8, 1),
-        (180, 21.0, 21.0, 1),
-    ),
     ("rollout", "going", False): (
         (60, 9.7, 34.6, 15),
         (90, 16.7, 35.4, 15),
@@ -61,7 +27,7 @@ MEASURED_ERRORS: Mapping[tuple[str, str, bool], Sequence[tuple[int, float, float
 the gap, median and 90th percentile of the error (cm), and number of clips; by `mapctl bench gaps --data DATA --count
 25`."""
 
-_MEASURED_SOURCES = {INFILLER: INFILLER, "standing": INFILLER, "rollout": "rollout", "density": "rollout"}
+_MEASURED_SOURCES = {"rollout": "rollout", "density": "rollout"}
 
 
 def is_travelling(motion: Motion, start: int, stop: int) -> bool:
@@ -102,16 +68,14 @@ class ErrorEstimate:
 
 def estimate_error(by: str, frames: int, *, travelling: bool, in_context: bool) -> ErrorEstimate | None:
     """Estimate the error of a proposal for a gap of so many frames at PRIOR_FPS; `in_context` where frames around it
-    are known. None for a source that was never measured.
+    are known. None for a source, or a kind of gap, that was never measured.
 
-    Linear between measured lengths; gaps longer than measured have the longest's error. Kinds of gap in which rollouts
-    were never measured have the infiller's.
+    Linear between measured lengths; gaps longer than measured have the longest's error.
     """
-    name = _MEASURED_SOURCES.get(by.split(" ")[0])
-    if name is None:
-        return None
     what = "going" if travelling else "in place"
-    rows = MEASURED_ERRORS.get((name, what, in_context)) or MEASURED_ERRORS[(INFILLER, what, in_context)]
+    rows = MEASURED_ERRORS.get((_MEASURED_SOURCES.get(by.split(" ")[0], ""), what, in_context))
+    if rows is None:
+        return None
     lengths, median, percentile_90, clips = np.array(rows).T
     nearest = int(clips[np.abs(lengths - frames).argmin()])
     median_cm, percentile_90_cm = (float(np.interp(frames, lengths, errors)) for errors in (median, percentile_90))

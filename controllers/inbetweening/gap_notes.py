@@ -8,13 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.inbetweening.error_estimates import (
-    INFILLER,
-    TRAINED_GAP_FRAMES,
-    ErrorEstimate,
-    estimate_error,
-    is_travelling,
-)
+from controllers.inbetweening.error_estimates import ErrorEstimate, estimate_error, is_travelling
 from controllers.inbetweening.proposers.auto import STANDING_STILL
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
@@ -23,6 +17,8 @@ from mapctl.inbetweening.query import GapSource
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 
+_INFILLER, _INFILLER_FRAMES = "infiller", 75
+"""Name of the source whose longest gaps in training were of so many frames: their mean length and a deviation."""
 _MIN_CONTEXT_FRAMES = 8  # known frames on both sides that show how the body moves
 _MORPH_RATIO, _MIN_MORPH_FRAMES = 1.3, 45
 """Largest ratio of a morph's path to the straight one, and fewest frames: an interpolation instead of a motion."""
@@ -77,8 +73,8 @@ def _estimate_gap_error(query: GapQuery, answer: Proposal, source: GapSource) ->
 def _describe_gap(query: GapQuery, made: Motion, source: GapSource) -> list[str]:
     """List remarks on one gap beyond its proposer and error estimate."""
     remarks, seconds = [source.reason] if source.reason else [], (source.stop - source.start) / PRIOR_FPS
-    if source.stop - source.start > TRAINED_GAP_FRAMES and source.by == INFILLER:
-        remarks.append(f"and {seconds:.1f} s are longer than the {TRAINED_GAP_FRAMES / PRIOR_FPS:.0f} s that it knows")
+    if source.stop - source.start > _INFILLER_FRAMES and source.by == _INFILLER:
+        remarks.append(f"and {seconds:.1f} s are longer than the {_INFILLER_FRAMES / PRIOR_FPS:.0f} s that it knows")
     if _is_morph(query, made, source):
         remarks.append("a still morph: it goes hardly further than straight from one pose to the other; give more keys")
     return remarks

@@ -149,7 +149,7 @@ def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:
     )
     free = torch.ones(frames, dtype=torch.bool)
     free[at] = False
-    return interpolate_missing(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free))
+    return interpolate_missing(motion, MissingMask.of_frames(free, motion.num_joints))
 
 
 @contextmanager

@@ -62,7 +62,7 @@ def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> t
     """
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in wanted if key.shown]] = False
-    shown = interpolate_missing(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free))
+    shown = interpolate_missing(motion, MissingMask.of_frames(free, motion.num_joints))
     return *to_canonical(shown, rig), shown
 
 

@@ -13,6 +13,7 @@ from mapctl.errors import FileFormatError
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Configuration of dataclasses that are read: no key but their fields, and finite numbers."""
+_KINDS = ("float", "str", "constrained-float", "constrained-str")  # which pydantic names where a value may be either
 _MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 T = TypeVar("T")
@@ -27,7 +28,8 @@ def read(path: str | PathLike[str], kind: type[T], *, what: str, unknown: Callab
         return TypeAdapter(kind).validate_json(table, strict=True)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
-        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in fault["loc"]).lstrip(".")
+        place = [part for part in fault["loc"] if part not in _KINDS]
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
         raise FileFormatError(path, f"{where}: {_describe_fault(fault, unknown)}") from error
 
 

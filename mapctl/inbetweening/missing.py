@@ -45,6 +45,11 @@ class MissingMask:
             raise RequestError(f"the gaps leave nothing of the motion's {motion.num_frames} frames to go by")
         return MissingMask(joints, root)
 
+    @staticmethod
+    def of_frames(missing: Bool[Tensor, " frames"], joints: int) -> "MissingMask":
+        """Build the mask of whole frames of a motion with so many joints."""
+        return MissingMask(missing[:, None].expand(-1, joints).clone(), missing)
+
     @property
     def frames(self) -> Bool[Tensor, " frames"]:
         """Frames in which anything is missing."""

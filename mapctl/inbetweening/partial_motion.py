@@ -133,6 +133,13 @@ class PartialMotion:
             self.known.mirrored(),
         )
 
+    def with_mirror_image(self) -> "PartialMotion":
+        """Return a batch of these motions and then their mirror images."""
+        other = self.mirrored()
+        known = {name: torch.cat([part, getattr(other.known, name)]) for name, part in vars(self.known).items()}
+        values = {name: torch.cat([part, getattr(other, name)]) for name, part in vars(self).items() if name != "known"}
+        return PartialMotion(**values, known=KnownParts(**known))
+
 
 def interpolate_partial_motion(
     motion: PartialMotion, mean_quats: Float[Tensor, "joints 4"], mean_height: float

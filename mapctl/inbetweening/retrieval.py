@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl import rotations
@@ -35,31 +36,39 @@ class MotionCollection:
         """Return the window of so many steps whose first and last poses, seen from its first hips, are nearest to these
         two poses (motions of one frame) in the mean square over joints. ValueError if no clip is long enough.
         """
-        at = self._find_starts(steps)
-        if not len(at):
+        starts, ends = _see_ends(self, steps)
+        if not len(starts):
             raise ValueError(f"no clip has {steps + 1} frames")
         wanted = torch.cat([first.joint_positions(), last.joint_positions()]).float()
         facing = heading(first.local_quat_xyzw[:, 0]).float()
-        target = _see_from(wanted[None], wanted[:1, 0], facing)[0]
-        best, nearest = torch.inf, 0
-        for part in at.split(50_000):
-            ends = torch.stack([self.positions[part], self.positions[part + steps]], dim=1)
-            seen = _see_from(ends, self.positions[part, 0], self.heading[part])
-            distance = (seen - target).square().sum(dim=(1, 2, 3))
-            if float(distance.min()) < best:
-                best, nearest = float(distance.min()), int(part[distance.argmin()])
+        target = _see_from(wanted[None], wanted[:1, 0], facing).flatten()
+        # A part at a time, as differences of all windows at once would not fit into the processor's cache.
+        distance = torch.cat([(part - target).square().sum(dim=1) for part in ends.split(5000)])
+        nearest = int(starts[distance.argmin()])
         for motion in self.motions:
             if nearest < motion.num_frames:
                 return motion.slice(nearest, nearest + steps + 1)
             nearest -= motion.num_frames
         raise AssertionError("a start lies in a clip")
 
-    def _find_starts(self, steps: int) -> Tensor:
+    def find_starts(self, steps: int) -> Int[Tensor, " windows"]:
+        """Return the first frames of all windows of so many steps."""
         starts, first = [], 0
         for motion in self.motions:
             starts.append(torch.arange(first, first + max(0, motion.num_frames - steps)))
             first += motion.num_frames
         return torch.cat(starts)
+
+
+# Of one length, as every gap of a length asks for it in turn.
+@lru_cache(maxsize=1)
+def _see_ends(
+    collection: MotionCollection, steps: int
+) -> tuple[Int[Tensor, " windows"], Float[Tensor, "windows columns"]]:
+    """Return the first frames of all windows, and both ends' joint positions seen from the first hips."""
+    starts = collection.find_starts(steps)
+    ends = torch.stack([collection.positions[starts], collection.positions[starts + steps]], dim=1)
+    return starts, _see_from(ends, collection.positions[starts, 0], collection.heading[starts]).flatten(1)
 
 
 def bend_to_ends(motion: Motion, first: Motion, last: Motion) -> Motion:

@@ -5,7 +5,8 @@ is more than the noise, moment by moment and joint by joint, so that a true kick
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import numpy as np
 import torch
@@ -113,6 +114,14 @@ def upsample(
     times = seconds.numpy()
     wanted = np.clip(np.arange(frames) / fps, times[0], times[-1])
     return torch.as_tensor(CubicSpline(times, values.double().numpy(), axis=0)(wanted))
+
+
+def resample_by_splines(motion: Motion, seconds: Float[Tensor, " shown"], *, fps: Fraction, frames: int) -> Motion:
+    """Resample a motion whose frames are at rising times to so many frames at a rate; straight lines would be kinks."""
+    quats = rotations.make_sign_continuous(motion.local_quat_xyzw.double())
+    quats = upsample(quats, seconds, fps=float(fps), frames=frames)
+    root = upsample(motion.root_position.double(), seconds, fps=float(fps), frames=frames)
+    return replace(motion, fps=fps, root_position=root, local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))
 
 
 def split_bands(motion: Motion) -> FrequencyBands:

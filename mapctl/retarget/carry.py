@@ -17,6 +17,7 @@ from mapctl import contacts, kinematics, rotations
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
+from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
 from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
@@ -144,7 +145,7 @@ def _ankle_targets(
     over = scale * (toes[..., 1] - giver.floor - giver.flat_height)
     lifted = torch.where(over < 0, _MAX_TOE_SINK * torch.expm1(over / _MAX_TOE_SINK) - over, 0.0)
     places[..., 1] += (1 - scale) * giver.floor + body.toe_height - scale * giver.flat_height + lifted
-    high = _smootherstep(over / leg_length(moved.skeleton) / _HIGH_SHARE - _LOW_SHARE / _HIGH_SHARE)[..., None]
+    high = smootherstep(over / leg_length(moved.skeleton) / _HIGH_SHARE - _LOW_SHARE / _HIGH_SHARE)[..., None]
     return torch.lerp(places + _foot_length_offset(own, moved, scale), moved.joint_positions()[:, _FEET], high)
 
 
@@ -160,16 +161,10 @@ def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tenso
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(longer)
     rises = (rotations.rotate(turns, axis)[..., 1] for axis in (forward, forward.roll(-1, -1)))
     up = torch.rad2deg(torch.atan2(*rises))
-    on_toes = 1 - _smootherstep(up / _HEEL_DEG) * (1 - _smootherstep((up - _MAX_HEEL_DEG) / _MAX_HEEL_DEG))
+    on_toes = 1 - smootherstep(up / _HEEL_DEG) * (1 - smootherstep((up - _MAX_HEEL_DEG) / _MAX_HEEL_DEG))
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand_as(tilt)
     tilt = rotations.slerp(still, tilt, on_toes)
     return rotations.rotate(rotations.multiply(rotations.about_y(heading), tilt), longer)
-
-
-def _smootherstep(share: Tensor) -> Tensor:
-    """Ease from 0 to 1 over 0 to 1, with two continuous derivatives."""
-    share = share.clamp(0, 1)
-    return share**3 * (10 + share * (6 * share - 15))
 
 
 def _contact_intervals(toes: Float[Tensor, "frames 2 3"], fps) -> list[list[tuple[int, int]]]:
@@ -203,7 +198,7 @@ def _hold_through_contacts(
         held[start:stop] = value
     for (_, stop), (start, _), before, after in zip(spans[:-1], spans[1:], values[:-1], values[1:], strict=True):
         share = torch.arange(1, start - stop + 1, dtype=shift.dtype)[:, None] / (start - stop + 1)
-        held[stop:start] = before + (after - before) * _smootherstep(share)
+        held[stop:start] = before + (after - before) * smootherstep(share)
     return held
 
 

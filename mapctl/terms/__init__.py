@@ -4,6 +4,7 @@ from mapctl.terms.base import Term
 from mapctl.terms.clearance import Clearance
 from mapctl.terms.foot_contact import FootContact
 from mapctl.terms.jerk import Jerk
+from mapctl.terms.keep_clear import KeepApart, KeepClear, WithinReach
 from mapctl.terms.keyframe import Keyframe
 from mapctl.terms.latent_prior import LatentPrior
 from mapctl.terms.likelihood import Likelihood
@@ -25,6 +26,9 @@ ALL = (
     Keyframe,
     Clearance,
     Support,
+    KeepClear,
+    KeepApart,
+    WithinReach,
 )
 
 __all__ = [
@@ -32,6 +36,8 @@ __all__ = [
     "Clearance",
     "FootContact",
     "Jerk",
+    "KeepApart",
+    "KeepClear",
     "Keyframe",
     "LatentPrior",
     "Likelihood",
@@ -41,4 +47,5 @@ __all__ = [
     "StepLength",
     "Support",
     "Term",
+    "WithinReach",
 ]

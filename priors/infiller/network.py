@@ -128,8 +128,8 @@ class ConvInfiller(PositionInfiller):
         )
 
 
-def load(name: str = "infiller") -> ConvInfiller:
-    """Load the bundled infiller, or a trained one by its file or run folder; CheckpointError for anything else."""
+def load(name: str) -> ConvInfiller:
+    """Load a trained infiller by its file or run folder; CheckpointError for anything else."""
     with checkpoints.open_checkpoint(name, "infiller") as (tensors, card):
         network = InfillerNetwork(InfillerConfig.of_card(card.config))
         network.load_state_dict(tensors)

@@ -58,7 +58,7 @@ class PoseTransformer(Inbetweener):
         """
         origin = _find_origin(query)
         motion = self._show(_move(query, -origin))
-        poses = _average_mirrored(self._propose_windows(motion), self._propose_windows(motion.mirrored()))
+        poses = _average_mirrored(self._propose_windows(motion.with_mirror_image()))
         root = poses.root_position[0].double() * query.scale + origin
         quats = rotations.from_matrix(poses.local_matrix[0].double())
         shown, missing = query.motion, query.missing
@@ -122,7 +122,7 @@ class PoseTransformer(Inbetweener):
         for first, stop in _lay_windows(~motion.known.everything[0]):
             rows = _pack(self.network(motion.slice(first, stop)))
             fade = _fade_in(first, weights, stop)
-            joined[first:stop] = torch.lerp(joined[first:stop], rows, fade[:, None])
+            joined[:, first:stop] = torch.lerp(joined[:, first:stop], rows, fade[:, None])
             weights[first:stop] = 1.0
         return _unpack(joined)
 
@@ -180,34 +180,34 @@ def _find_too_long(query: GapQuery) -> Bool[Tensor, " frames"]:
     return found
 
 
-def _rows_of(motion: PartialMotion) -> Float[Tensor, "frames rows"]:
+def _rows_of(motion: PartialMotion) -> Float[Tensor, "batch frames rows"]:
     """Return rows as of a proposal that is the motion itself."""
     logits = contacts.to_logits(motion.contacts > 0.5)
     spread = motion.root_position.new_full((*motion.heading.shape, CANONICAL.num_joints, 2), -9.0)
     return _pack(ProposedPoses(motion.root_position, motion.local_matrices(), logits, spread))
 
 
-def _pack(poses: ProposedPoses) -> Float[Tensor, "frames rows"]:
+def _pack(poses: ProposedPoses) -> Float[Tensor, "batch frames rows"]:
     parts = (poses.root_position, to_six(poses.local_matrix).flatten(-2), poses.contacts, poses.log_spread.flatten(-2))
-    return torch.cat(parts, dim=-1)[0]
+    return torch.cat(parts, dim=-1)
 
 
-def _unpack(rows: Float[Tensor, "frames rows"]) -> ProposedPoses:
+def _unpack(rows: Float[Tensor, "batch frames rows"]) -> ProposedPoses:
     joints = CANONICAL.num_joints
-    root, six, logits, spread = rows[None].split([3, 6 * joints, 2, 2 * joints], dim=-1)
+    root, six, logits, spread = rows.split([3, 6 * joints, 2, 2 * joints], dim=-1)
     return ProposedPoses(root, from_six(six.unflatten(-1, (joints, 6))), logits, spread.unflatten(-1, (joints, 2)))
 
 
-def _average_mirrored(one: ProposedPoses, other: ProposedPoses) -> ProposedPoses:
-    """Return the mean of a proposal and the mirror image of another."""
-    flip = one.root_position.new_tensor([-1.0, 1.0, 1.0])
-    signs = flip[:, None] * flip
-    local = other.local_matrix[..., _PARTNERS, :, :] * signs
+def _average_mirrored(poses: ProposedPoses) -> ProposedPoses:
+    """Return the mean of the first of two proposals and the mirror image of the second."""
+    root, local, logits, spread = poses.root_position, poses.local_matrix, poses.contacts, poses.log_spread
+    flip = root.new_tensor([-1.0, 1.0, 1.0])
+    back = local[1:, ..., _PARTNERS, :, :] * flip[:, None] * flip
     return ProposedPoses(
-        (one.root_position + other.root_position * flip) / 2,
-        from_six((to_six(one.local_matrix) + to_six(local)) / 2),
-        (one.contacts + other.contacts.flip(-1)) / 2,
-        (one.log_spread + other.log_spread[..., _PARTNERS, :]) / 2,
+        (root[:1] + root[1:] * flip) / 2,
+        from_six((to_six(local[:1]) + to_six(back)) / 2),
+        (logits[:1] + logits[1:].flip(-1)) / 2,
+        (spread[:1] + spread[1:, ..., _PARTNERS, :]) / 2,
     )
 
 

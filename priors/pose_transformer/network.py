@@ -40,11 +40,11 @@ QUANTILES = (0.5, 0.9)
 class PoseTransformerConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 192
+    width: int = 256
     """Numbers of a token; a multiple of twice the heads."""
-    layers: int = 4
+    layers: int = 5
     """Layers of attention."""
-    heads: int = 6
+    heads: int = 8
     """Heads of each."""
     kernel: int = 5
     """Frames of each layer's convolution, one number at a time, before its attention; odd, 0 for none."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from mapctl import retarget
 from mapctl.contacts import ContactSettings
 from mapctl.errors import MapctlError, RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, encode
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.formats import load
 from mapctl.retarget import rigs
 from priors.tensor_files import write_tensors
@@ -64,6 +64,17 @@ class Corpus:
     def clips(self) -> list[Float[Tensor, "frames size"]]:
         """The features of each clip."""
         return list(self.features.split(list(self.lengths)))
+
+    def locate_clips(self) -> tuple[Int[Tensor, " clips"], Int[Tensor, " clips"]]:
+        """The number of frames of each clip, and where it starts."""
+        lengths = torch.tensor(self.lengths)
+        return lengths, torch.cumsum(lengths, 0) - lengths
+
+    def integrate_roots(self) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, " frames"]]:
+        """The hips' position on the ground and their heading in every frame, each clip from the origin."""
+        origin = GroundPose(torch.zeros(2), torch.zeros(()))
+        ground, heading = zip(*(integrate_root(clip, origin) for clip in self.clips()), strict=True)
+        return torch.cat(ground), torch.cat(heading)
 
     def subset(self, picked: Iterable[int]) -> "Corpus":
         """The corpus of some clips."""

@@ -14,7 +14,7 @@ from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.training.corpus import Corpus, Split
 from priors.training.gathering import DataSource, describe_skipped
-from priors.training.trainer import Trainer
+from priors.training.trainer import GradientTrainer, Trainer
 
 Row = dict[str, Any]
 """Losses of a step, or measures of held-out clips; in a curve None replaces what is not finite."""
@@ -37,6 +37,7 @@ _TOLD = ("steps", "batch", "window", "pairs", "learning_rate", "seed")  # settin
 C = TypeVar("C", bound=NetworkConfig)
 S = TypeVar("S", bound=Settings)
 T = TypeVar("T", bound=Trainer[Any])
+G = TypeVar("G", bound=GradientTrainer[Any])
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,13 @@ class Recipe(ABC, Generic[C, S, T]):
     def source(self) -> DataSource:
         """Where motion comes from."""
         return DataSource(
-            self.data, self.out, self.match or "", self.skip_first, self.strict_data, seed=self.settings.seed
+            self.data, self.out, self.match or "", self.skip_first, self.strict_data, seed=self.split_seed
         )
+
+    @property
+    def split_seed(self) -> int:
+        """Seed by which clips are kept from training."""
+        return self.settings.seed
 
     def find_shape(self, trainer: T) -> C:
         """Return the configuration of the network that is trained."""
@@ -159,7 +165,7 @@ class Recipe(ABC, Generic[C, S, T]):
             **self.describe_data(corpus),
             **describe_skipped(corpus),
             "match": self.match or "",
-            "split_seed": self.settings.seed,
+            "split_seed": self.split_seed,
             "held_out": gathered.held_out(),
         }
         return Export(trainer.network.state_dict(), data, {"test": trainer.validate(gathered.parts.test)})
@@ -187,40 +193,63 @@ class Recipe(ABC, Generic[C, S, T]):
 
 
 @dataclass(frozen=True)
-class NetworkRecipe(Recipe[C, S, T]):
+class NetworkRecipe(Recipe[C, S, G]):
     """Recipe of one network on the usual card, which may start from another network's weights."""
 
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""
+    processes: int = 1
+    """Processes that compute the gradients of a step, each of a batch of its own."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, 1, "processes")
+
+    @property
+    def split_seed(self) -> int:
+        """That of the initial weights, where there are any."""
+        return find_split_seed(self.init, super().split_seed)
 
     @abstractmethod
-    def make_untaught(self, parts: Split) -> T:
+    def make_untaught(self, parts: Split) -> G:
         """The trainer, its weights drawn."""
 
-    def make_trainer(self, parts: Split) -> T:
+    def make_trainer(self, parts: Split) -> G:
         """As it is before the first step."""
         trainer = self.make_untaught(parts)
+        trainer.processes = self.processes
         if self.init is not None and not self.resume:
-            trainer.network.load_state_dict(self._read_initial_weights(self.init))
+            trainer.network.load_state_dict(self.read_initial_weights(self.init, trainer))
         return trainer
 
-    def _read_initial_weights(self, name: str) -> dict[str, Tensor]:
-        """Another model's weights; CheckpointError if they are not of this network."""
+    def read_initial_weights(self, name: str, trainer: G) -> dict[str, Tensor]:
+        """Another model's weights for this trainer's network; CheckpointError if they are not of its shape."""
         tensors, card = checkpoints.load(checkpoints.locate(name))
         if card.kind != self.kind or card.config != self.config.as_card():
             wanted = f"{self.kind} of {self.config.as_card()}"
             raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
         return tensors
 
-    def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
+    def pin(self, trainer: G, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""
-        return {**super().pin(trainer, corpus), "init": {"name": self.init}}
+        return {**super().pin(trainer, corpus), "init": {"name": self.init}, "processes": {"number": self.processes}}
 
     def format_command(self) -> str:
         """What to type for the same run, for the card; options that are the defaults are left out."""
         parts = ["--init INIT"] if self.init is not None else []
         parts += ["--bfloat16"] * bool(getattr(self.settings, "bfloat16", False))
+        parts += [f"--processes {self.processes}"] * (self.processes > 1)
         return " ".join([super().format_command(), *parts])
+
+
+def find_split_seed(init: str | None, own: int) -> int:
+    """Find the seed by which clips were kept from the model that training begins with; `own` without one.
+
+    With another seed the run would train on what its measures hold out.
+    """
+    if init is None:
+        return own
+    return checkpoints.load(checkpoints.locate(init))[1].data.get("split_seed", own)
 
 
 def average(rows: Sequence[Row], name: str) -> float:

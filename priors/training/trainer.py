@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mapctl.errors import MapctlError
 from priors.training import run_files
 from priors.training.corpus import Corpus
+from priors.training.parallel import GradientHelpers
 
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
@@ -76,7 +77,10 @@ class GradientTrainer(Trainer[Network]):
         super().__init__(steps=steps, seed=seed)
         self.learning_rate = learning_rate
         self.network = draw_weights(make, seed)
+        self.processes = 1
+        """Processes that compute the gradients of a step, each of a batch of its own; to be set before the first."""
         self._optimisers = self.make_optimisers()
+        self._helpers: GradientHelpers | None = None
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
@@ -99,12 +103,11 @@ class GradientTrainer(Trainer[Network]):
         optimisers = self._optimisers.values()
         for group in [group for optimiser in optimisers for group in optimiser.param_groups]:
             group["lr"] = self.compute_learning_rate()
-        parts = self.losses()
-        if not torch.isfinite(parts["loss"]):
-            raise make_divergence_error(self.step + 1, f"the loss is {parts['loss'].item()}")
         for optimiser in optimisers:
             optimiser.zero_grad(set_to_none=True)
-        parts["loss"].backward()
+        parts = self._find_gradients()
+        if not torch.isfinite(parts["loss"]):
+            raise make_divergence_error(self.step + 1, f"the loss is {parts['loss'].item()}")
         self.limit_gradients()
         for optimiser in optimisers:
             optimiser.step()
@@ -114,6 +117,16 @@ class GradientTrainer(Trainer[Network]):
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """All."""
         return self._optimisers
+
+    def _find_gradients(self) -> dict[str, Tensor]:
+        """Leave gradients in the weights; the losses, averaged over the processes."""
+        if self.processes > 1 and self._helpers is None:
+            self._helpers = GradientHelpers(self, self.processes - 1)
+        if self._helpers is not None:
+            self._helpers.begin()
+        parts = self.losses()
+        parts["loss"].backward()
+        return parts if self._helpers is None else self._helpers.finish(parts)
 
 
 def make_adam(weights: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features
+from mapctl.features import LAYOUT, mirror_features
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.pose import BodyPose
@@ -105,12 +105,8 @@ class PositionWindows:
     def __init__(self, corpus: Corpus, *, frames: int, evenness: float):
         """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each."""
         self.frames = frames
-        self.lengths = torch.tensor(corpus.lengths)
-        self.clip_starts = torch.cumsum(self.lengths, 0) - self.lengths
-        origin = GroundPose(torch.zeros(2), torch.zeros(()))
-        roots = [integrate_root(clip, origin) for clip in corpus.clips()]
-        self.ground = torch.cat([ground for ground, _ in roots])
-        self.heading = torch.cat([heading for _, heading in roots])
+        self.lengths, self.clip_starts = corpus.locate_clips()
+        self.ground, self.heading = corpus.integrate_roots()
         self.contacts = LAYOUT.pick(corpus.features, "contacts")
         poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
         self.local = torch.cat([pose.joints_world() for pose in poses])

@@ -9,8 +9,8 @@ from tiny_infiller import tiny_infiller
 
 from controllers.benchmarks.lost_joints import (
     MISSING_LIMBS,
+    average_pose,
     benchmark_missing_joints,
-    mean_rotations,
     replace_joint_rotations,
 )
 from mapctl.skeleton import CANONICAL
@@ -24,7 +24,7 @@ def posed(clip, quats):
 def test_the_mean_of_one_pose_is_that_pose_whatever_its_sign():
     clip = walk(5)
     still = clip.local_quat_xyzw[2:3].expand(5, -1, -1) * torch.tensor([1.0, -1, 1, -1, 1])[:, None, None]
-    found = mean_rotations([posed(clip, still)])
+    found = average_pose([posed(clip, still)])
     assert ((found * still[0]).sum(-1).abs() - 1).abs().max() < 1e-9
 
 
@@ -34,7 +34,7 @@ def test_turns_about_one_axis_have_their_middle_as_mean_and_every_clip_counts_al
     quats = torch.zeros(12, clip.num_joints, 4, dtype=torch.float64)
     angle = torch.tensor([0.3] * 2 + [0.9] * 10, dtype=torch.float64)
     quats[..., 1], quats[..., 3] = torch.sin(angle / 2)[:, None], torch.cos(angle / 2)[:, None]
-    found = mean_rotations([posed(clip, quats).slice(0, 2), posed(clip, quats).slice(2, 12)])
+    found = average_pose([posed(clip, quats).slice(0, 2), posed(clip, quats).slice(2, 12)])
     assert 2 * torch.atan2(found[:, 1].abs(), found[:, 3].abs()) == pytest.approx(0.6, abs=1e-9)
 
 
@@ -42,7 +42,7 @@ def test_turns_about_one_axis_have_their_middle_as_mean_and_every_clip_counts_al
 def test_only_the_lost_joints_and_what_hangs_on_them_go_to_a_mean_pose(joints):
     clip = walk(20, seed=1)
     moved = (
-        replace_joint_rotations(clip, joints, mean_rotations([clip])).joint_positions() - clip.joint_positions()
+        replace_joint_rotations(clip, joints, average_pose([clip])).joint_positions() - clip.joint_positions()
     ).norm(dim=-1)
     lost = [CANONICAL.index(name) for name in joints]
     others = [joint for joint in range(CANONICAL.num_joints) if joint not in lost]

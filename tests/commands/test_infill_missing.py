@@ -184,3 +184,13 @@ def test_denoising_believes_no_nan(clip, tmp_path, many):
     assert run("denoise", given, "-o", out, *words) == 0
     made = [mapctl.load(path) for path in (tmp_path / "asked.bvh", out / "lossy.bvh" if many else out)]
     assert (made[0].joint_positions() - made[1].joint_positions()).abs().max() < 1e-6
+
+
+def test_an_infiller_has_to_be_named(clip, tmp_path, capsys):
+    """None is bundled; what is named has to be of the kind that the method asks for."""
+    words = ["infill", clip("bandai"), "-o", tmp_path / "out.bvh", "--gap", "10:20", "--method", "infiller"]
+    assert run(*words) == 2
+    assert "mapctl train infiller" in capsys.readouterr().err
+    assert run(*words, "--inbetweener", "transformer") == 2
+    assert "takes no pose-transformer" in capsys.readouterr().err
+    assert not (tmp_path / "out.bvh").exists()

@@ -149,11 +149,13 @@ def test_a_long_morph_of_somebody_who_moves_is_called_one():
 
 
 def test_what_was_never_measured_is_not_called_sure():
-    assert estimate_error("slerp", 30, travelling=True, in_context=True) is None
+    for by in ("slerp", "infiller", STANDING_STILL):
+        assert estimate_error(by, 30, travelling=True, in_context=True) is None
+    assert estimate_error("rollout of locomotion", 30, travelling=False, in_context=True) is None
 
 
-@pytest.mark.parametrize("by", ["infiller", "rollout of locomotion", "density general", STANDING_STILL])
-@pytest.mark.parametrize(("going", "beside"), [(True, True), (True, False), (False, True), (False, False)])
+@pytest.mark.parametrize("by", ["rollout of locomotion", "density general"])
+@pytest.mark.parametrize(("going", "beside"), [(True, True), (True, False), (False, False)])
 def test_longer_gaps_are_no_surer_and_what_few_clips_told_is_said(by, going, beside):
     sures = [estimate_error(by, frames, travelling=going, in_context=beside) for frames in (5, 15, 60, 200, 1000)]
     assert sures[0].percentile_90_cm <= sures[-1].percentile_90_cm

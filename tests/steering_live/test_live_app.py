@@ -74,9 +74,12 @@ def test_pause_and_reset_are_for_everybody(show, actors):
 
 
 def test_frames_stand_the_puppet_where_they_say(show, actors):
-    run(show, 30)
+    for _ in range(40):  # it walks; how far in so many frames depends on how busy the machine is
+        run(show, 30)
+        if np.hypot(*show._members[0].place) > 0.1:
+            break
     frame = show._members[0].place
-    assert np.hypot(*frame) > 0.1  # it walks; how far depends on how busy the machine is
+    assert np.hypot(*frame) > 0.1
     np.testing.assert_allclose(show._world.position, [-frame[0], 0, -frame[1]], atol=1e-9)
     show._panel.follow.value = False
     run(show, 1)

@@ -305,8 +305,8 @@ def test_pause_holds_the_frames(page):
     time.sleep(1)
     assert shown(page) == before
     page.get_by_role("button", name="Go on").click()
-    time.sleep(1.5)
-    assert shown(page) > before
+    # Another count, not a larger one: a reset that came in while nothing moved is counted from now on only.
+    assert any(time.sleep(0.1) or shown(page) != before for _ in range(200))
 
 
 @pytest.mark.slow

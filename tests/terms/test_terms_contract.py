@@ -121,6 +121,13 @@ def test_the_gradient_is_finite_where_nothing_is_wrong(name):
     assert bool(torch.isfinite(gradient).all())
 
 
+def moved_obstacle(obstacle, turn, shift):
+    """The obstacle where the scene is turned and moved."""
+    place = rotate_ground(torch.tensor(obstacle.place).double(), torch.tensor(turn).double())
+    x, z = (place + torch.tensor(shift).double()).tolist()
+    return replace(obstacle, place=(x, z), turn_deg=obstacle.turn_deg + math.degrees(turn))
+
+
 @each_term
 @pytest.mark.parametrize("turn", [0.9, -2.5])
 def test_moving_the_whole_scene_changes_nothing(name, turn):
@@ -146,6 +153,14 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
         turned = rotate_ground(places[..., ::2], angle.expand(places.shape[:-1]))
         places[..., ::2] = turned + torch.tensor(shift).double()
         term = replace(term, places=places)
+    if "place" in names:
+        place = rotate_ground(term.place[..., ::2], angle.expand(FRAMES)) + torch.tensor(shift).double()
+        term = replace(term, place=torch.stack([place[..., 0], term.place[..., 1], place[..., 1]], dim=-1))
+    if "others" in names:
+        others = rotate_ground(term.others, angle.expand(term.others.shape[:-1]))
+        term = replace(term, others=others + torch.tensor(shift).double())
+    if "obstacles" in names:
+        term = replace(term, obstacles=tuple(moved_obstacle(one, turn, shift) for one in term.obstacles))
     torch.testing.assert_close(term(there), TERMS[name](here), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(term.residual(there), TERMS[name].residual(here), rtol=1e-6, atol=1e-6)
 

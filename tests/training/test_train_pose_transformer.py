@@ -12,9 +12,13 @@ from tiny_transformer import CONFIG, network
 import mapctl
 from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.skeleton import CANONICAL
+from priors import checkpoints
+from priors.pose_transformer.growing import can_grow, grow
 from priors.pose_transformer.network import PoseTransformerConfig
-from priors.training.pose_windows import PoseWindows, add_targets
+from priors.training.augmentation.pose_windows import PoseWindows, add_targets
+from priors.training.recipes.lstm_gmm import DensityRecipe
 from priors.training.recipes.pose_transformer import (
+    PoseTransformerRecipe,
     PoseTransformerSettings,
     PoseTransformerTrainer,
     calibrate_spread,
@@ -130,6 +134,45 @@ def test_the_spread_learns_alone_and_is_calibrated():
     assert covered["within_90%"] == pytest.approx(0.9, abs=0.08)
 
 
+@pytest.mark.parametrize(
+    "larger", [{"width": 24, "heads": 3}, {"layers": 3}, {"width": 32, "heads": 4, "layers": 2}], ids=str
+)
+def test_a_grown_network_answers_as_the_small_one_and_all_of_it_learns(larger):
+    small = network(drawn=0.02)
+    with torch.no_grad():  # a token whose mean is zero, so that the wider norm is exact
+        for write in (small.embed[2], small.bones, small.layers[0].join, small.layers[0].perceptron[2]):
+            write.weight -= write.weight.mean(dim=0, keepdim=True)
+            if write.bias is not None:
+                write.bias -= write.bias.mean()
+        small.layers[0].near.weight.zero_()
+        small.layers[0].near.bias.zero_()
+    large = network(config=replace(CONFIG, **larger), seed=1)
+    large.load_state_dict(grow(small.state_dict(), CONFIG, large))
+    truth = windows_of(corpus(2, 60))
+    shown = hide(small, with_gap(truth, 10, 25))
+    answer, grown = small(shown), large(shown)
+    assert torch.allclose(answer.root_position, grown.root_position, atol=1e-4)
+    assert torch.allclose(answer.local_matrix, grown.local_matrix, atol=1e-4)
+    assert torch.allclose(answer.log_spread, grown.log_spread, atol=1e-3)
+    assert not torch.allclose(answer.local_matrix, shown.local_matrices(), atol=1e-3)
+    trainer = PoseTransformerTrainer(large.config, SETTINGS, corpus(2, 60))
+    trainer.network.load_state_dict(large.state_dict())
+    for _ in range(3):
+        trainer.train_step()
+    after = dict(trainer.network.named_parameters())
+    for name, weight in large.named_parameters():
+        if name.startswith("layers.") and weight.ndim > 1:
+            assert ((after[name] - weight).abs().flatten(1).amax(dim=1) > 0).all(), name
+
+
+def test_only_a_smaller_network_with_equal_heads_is_grown():
+    shape = PoseTransformerConfig(width=32, layers=2, heads=2, kernel=3)
+    for larger in ({}, {"layers": 3}, {"width": 64, "heads": 4}):
+        assert can_grow(shape, replace(shape, **larger)), larger
+    for other in ({"width": 16, "heads": 1}, {"layers": 1}, {"kernel": 5}, {"width": 64}):
+        assert not can_grow(shape, replace(shape, **other)), other
+
+
 def test_validation_is_the_same_each_time_and_leaves_out_gaps_that_are_too_long():
     trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(1, 60))
     first, again = (trainer.validate(corpus(2, 60)) for _ in range(2))
@@ -140,9 +183,9 @@ def test_validation_is_the_same_each_time_and_leaves_out_gaps_that_are_too_long(
 
 
 def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
-    words = ["--steps", 2, "--batch", 60, "--window", 32, "--width", 16, "--plain", "--quiet"]
+    words = ["--steps", 2, "--batch", 60, "--window", 32, "--width", 25, "--plain", "--quiet"]
     assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 2
-    words[words.index(16)] = 24
+    words[words.index(25)] = 16
     assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 0
     on_rig("daz", 45).save(tmp_path / "in.bvh")
     words = ["--gap", "20:30", "--method", "transformer", "--inbetweener", tmp_path / "run", "--quiet"]
@@ -150,3 +193,13 @@ def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
     assert mapctl.load(tmp_path / "out.bvh").num_frames == 45
     words[words.index("transformer")] = "infiller"
     assert run("infill", tmp_path / "in.bvh", "-o", tmp_path / "no.bvh", *words) == 2
+
+
+@pytest.mark.parametrize("recipe", [PoseTransformerRecipe, DensityRecipe])
+def test_a_run_that_goes_on_from_a_model_keeps_out_what_was_kept_from_that(recipe, tmp_path):
+    """With another seed it would train on the clips that its tables are measured on."""
+    held = checkpoints.Card("any", {}, licence="none", data={"split_seed": 7}, **checkpoints.Card.layout_fields())
+    checkpoints.save({"one": torch.zeros(1)}, held, tmp_path / "init.safetensors")
+    made = recipe(data=tmp_path, out=tmp_path / "run", init=str(tmp_path / "init.safetensors"))
+    assert made.source().seed == made.split_seed == 7
+    assert replace(made, init=None).source().seed == made.settings.seed

@@ -40,7 +40,7 @@ _SKATE_HEIGHT = 0.025  # metres
 class ChoiceSettings:
     """Thresholds at which other proposers are tried, and weights of the cost of a proposal."""
 
-    max_bare_frames: int = 30
+    max_bare_frames: int = 45
     """Frames of the longest gap with little context in which only the network is tried."""
     context: int = 8
     """Known frames on both sides of a gap that are enough context for the network."""

@@ -118,10 +118,11 @@ class Infill(MocapTable):
 
     work = "mapctl.commands.bench.infill"
 
-    infiller: options.Name = "infiller"
-    """An infiller to compare as it is: its name if bundled, or the file or run folder of a trained one."""
+    infiller: options.MaybeName = None
+    """A trained infiller, its file or run folder, for the tables of Kaufmann et al. 2020; without one they are left
+    out."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
-    """Other trained infillers, to compare as they are."""
+    """Other trained infillers for them, to compare as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +167,22 @@ class Transitions(Table):
     """Other in-betweeners to compare, bundled or trained."""
     raw: bool = False
     """Leave out the rows that a MAP stage finishes."""
+    auto: bool = False
+    """Also as --method auto chooses; its rollouts take seconds a gap."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shots(PriorTable):
+    """Random shots of one to four wishes: how many hold, which are told not to, and how it looks beside plain walks."""
+
+    work = "mapctl.commands.bench.shots"
+
+    count: options.Count = 40
+    """Shots."""
+    seed: options.Count = 0
+    """Seed of the wishes."""
+    inbetweener: options.Name = "transformer"
+    """The bundled transformer, or the file or run folder of a trained transformer."""
 
 
 @dataclass(frozen=True)
@@ -186,5 +203,6 @@ TABLES: dict[str, type[Table]] = {
     "gaps": Gaps,
     "transitions": Transitions,
     "timing": Timing,
+    "shots": Shots,
 }
 """By the name the user types; the first is what `mapctl bench` alone measures."""

@@ -49,7 +49,7 @@ def run(table: Transitions) -> int:
         methods[f"{name}, raw"] = of_inbetweener(each, finish=False)
         if not table.raw:
             methods[f"{name}, finished"] = of_inbetweener(each)
-    if not table.raw:
+    if table.auto:
         methods["auto"] = of_inbetweener(AutoInbetweener(network, priors.load_choice("auto")))
     past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:

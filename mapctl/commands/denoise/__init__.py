@@ -35,6 +35,9 @@ class Denoise(Command):
     """Seconds within which --causal decides a frame, at any frame rate, but for the compute; 0.2 if not given."""
     denoiser: options.Name = "denoiser"
     """The bundled denoiser, or the file or run folder of a trained one."""
+    inbetweener: options.MaybeName = None
+    """The file or run folder of a trained transformer or infiller, for what is lost for 0.3 s or longer; the bundled
+    transformer if not given. --causal leaves that to the denoiser."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the last stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier. None if not given, which measures as well."""

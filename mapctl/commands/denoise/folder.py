@@ -21,8 +21,10 @@ def run(command: Denoise, settings: DenoiseSettings) -> int:
     jobs, skipped = collect_jobs(command)
     priors.load_denoiser(command.denoiser)  # a typing error is reported once, now
     load = partial(priors.load_denoiser, command.denoiser)
+    load_inbetweener = partial(priors.load_inbetweener, command.inbetweener or "transformer")
+    load_inbetweener()
     after = None if command.report is None else ReportWriter(command, command.report)
-    file_denoiser = FileDenoiser(load, settings, inputs.read_rig(command.rig), after)
+    file_denoiser = FileDenoiser(load, settings, load_inbetweener, inputs.read_rig(command.rig), after)
     if command.cluster is not None:
         ended_files = run_over_cluster(jobs, file_denoiser, address=command.cluster, workers=command.jobs)
     else:

@@ -54,7 +54,14 @@ def _run_denoising(command: Denoise) -> DenoiseSolution:
                 motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
             )
         return denoise(
-            motion, denoiser, masks=masks, settings=settings, densities=densities, rig=rig, progress=progress
+            motion,
+            denoiser,
+            inbetweener=priors.load_inbetweener(command.inbetweener or "transformer"),
+            masks=masks,
+            settings=settings,
+            densities=densities,
+            rig=rig,
+            progress=progress,
         )
 
 
@@ -62,6 +69,8 @@ def read_settings(command: Denoise) -> DenoiseSettings:
     """Read the settings from the options; RequestError for numbers that make no sense."""
     if command.causal and command.prior is not None:
         raise RequestError("--causal has no time for a density; leave --prior out")
+    if command.causal and command.inbetweener is not None:
+        raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:
         raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
     return DenoiseSettings(sigma_deg=command.sigma_deg, sigma_cm=command.sigma_cm, anchor=command.anchor)

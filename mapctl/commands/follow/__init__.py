@@ -1,9 +1,9 @@
 """`mapctl follow`: a character walks a drawn curve."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.command import Command
@@ -28,6 +28,21 @@ class FollowCurve(Command):
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
+    start: Annotated[str, arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
+    """How it begins: in its stride, standing, or going on from a frame of a motion file, on that file's rig and at its
+    rate."""
+    end: Literal["walk", "stand"] = "walk"
+    """How it ends: in its stride, or standing."""
+    keys: options.MaybeFile = None
+    """TOML file of [[key]] tables: what hands and feet reach for and the head looks at, and when."""
+    avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
+    """A disc on the ground to walk around, metres; may be given several times."""
+    gait: options.MaybeName = None
+    """Gait of the motion, of those that the prior knows."""
+    style: options.MaybeName = None
+    """Style of the motion, of those that the prior knows."""
+    fps: options.MaybeNumber = None
+    """Frame rate of the motion; 30, or that of the clip it goes on from, if not given."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
     camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None

@@ -13,27 +13,33 @@ from mapctl.commands.run import RunScene
 from mapctl.commands.shared import exit_status, options, outputs, results
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
+from mapctl.commands.shared.played_shot import PlayedShot, ShotPlan, list_props, plan_shot, play_shot
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.curves import Curve
+from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.path import PathRequest
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.film import film
-from scenes.scene_file import SceneDescription, load
+from scenes.scene_file import Actor, SceneDescription, load
 from scenes.stage import Shot
 
 
 def run(command: RunScene) -> int:
-    """Check everything, let every actor walk, write the outputs.
+    """Check everything, let every actor move, write the outputs.
 
-    Ctrl-C ends the walks; those that have begun are written, without a film.
+    Ctrl-C ends the solves; those that have begun are written, without a film.
     """
-    scene, curves = load(scenes.find_scene(command.scene))
-    requests = [
-        parse_follow(curve, actor.speed, actor.seconds) for actor, curve in zip(scene.actors, curves, strict=True)
+    path = scenes.find_scene(command.scene)
+    scene, curves = load(path)
+    character, prior = read_character(command.rig), priors.load(scene.prior)
+    plans = [
+        _plan(scene, actor, curve, prior, character, Path(path))
+        for actor, curve in zip(scene.actors, curves, strict=True)
     ]
     outputs.check_folder(command.out)
-    for path in scene.films(command.out):
-        outputs.require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
-    walks, interrupted = _walk(command, scene, requests, priors.load(scene.prior), read_character(command.rig))
+    for film_path in scene.films(command.out):
+        outputs.require_render("av" if film_path.suffix.lower() == ".mp4" else "PIL")
+    walks, interrupted = _solve(command, scene, plans, prior, character)
     with outputs.make_folder(command.out):
         _write(command, scene, walks, films=() if interrupted else scene.films(command.out))
     if interrupted:
@@ -41,31 +47,53 @@ def run(command: RunScene) -> int:
     return max(results.conclude(done.solution.status, strict=command.strict) for done in walks)
 
 
-def _walk(
+def _plan(
+    scene: SceneDescription, actor: Actor, curve: Curve, prior: LstmGmmDensity, character: Character, path: Path
+) -> PathRequest | ShotPlan:
+    """Plan what an actor does: a walk along its curve, or a shot where it is to do more."""
+    if not (actor.wishes_more or scene.obstacles or scene.keep_apart is not None):
+        return parse_follow(curve, actor.speed, actor.seconds)
+    obstacles = [obstacle.build() for obstacle in scene.obstacles]
+    try:
+        return plan_shot(actor, curve, prior, character=character, folder=path.parent, obstacles=obstacles)
+    except RequestError as error:
+        raise FileFormatError(path, f"{actor.name}: {error}") from error
+
+
+def _solve(
     command: RunScene,
     scene: SceneDescription,
-    requests: Sequence[PathRequest],
+    plans: Sequence[PathRequest | ShotPlan],
     prior: LstmGmmDensity,
     character: Character,
-) -> tuple[list[Walk], bool]:
-    """Solve the walks of the first actors, of all unless Ctrl-C came, and return whether it did."""
-    walks: list[Walk] = []
-    for actor, request in zip(scene.actors, requests, strict=True):
+) -> tuple[list[Walk | PlayedShot], bool]:
+    """Solve for the first actors, for all unless Ctrl-C came, and return whether it did."""
+    done: list[Walk | PlayedShot] = []
+    shots = any(isinstance(plan, ShotPlan) for plan in plans)
+    inbetweener = priors.load_inbetweener() if shots else None
+    for actor, plan in zip(scene.actors, plans, strict=True):
         try:
             with show_progress(actor.name, quiet=command.quiet) as progress:
-                walks.append(walk(prior, request, seed=actor.seed, progress=progress, character=character))
+                if isinstance(plan, PathRequest) or inbetweener is None:
+                    assert isinstance(plan, PathRequest)
+                    done.append(walk(prior, plan, seed=actor.seed, progress=progress, character=character))
+                else:
+                    earlier = [one for one in done if isinstance(one, PlayedShot)]
+                    done.append(play_shot(plan, earlier, inbetweener, keep_apart=scene.keep_apart, progress=progress))
         except KeyboardInterrupt:
-            if not walks:
+            if not done:
                 raise
-            return walks, True
+            return done, True
         if not command.quiet:
-            print("\n".join([f"{actor.name}:", *(f"  {line}" for line in walks[-1].summary())]))
-        if walks[-1].interrupted:
-            return walks, True
-    return walks, False
+            print("\n".join([f"{actor.name}:", *(f"  {line}" for line in done[-1].summary())]))
+        if done[-1].interrupted:
+            return done, True
+    return done, False
 
 
-def _write(command: RunScene, scene: SceneDescription, walks: Sequence[Walk], films: Sequence[Path]) -> None:
+def _write(
+    command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path]
+) -> None:
     motions, reports = scene.motions(command.out), scene.reports(command.out)
     begun = scene.actors[: len(walks)]
     written = [*chain.from_iterable(motions[actor.name] for actor in begun), *films, *reports]
@@ -83,16 +111,19 @@ def _write(command: RunScene, scene: SceneDescription, walks: Sequence[Walk], fi
         print(f"wrote {', '.join(map(str, written))}")
 
 
-def _film(command: RunScene, scene: SceneDescription, walks: Sequence[Walk], films: Sequence[Path]) -> None:
+def _film(
+    command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path]
+) -> None:
     shots = [
         Shot(done.solution.motion, done.request.curve, actor.colour, actor.start_seconds)
         for actor, done in zip(scene.actors, walks, strict=True)
     ]
     with show_progress("filming", quiet=command.quiet) as progress:
-        film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, progress=progress)
+        props = list_props([done.request for done in walks if isinstance(done, PlayedShot)])
+        film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, props=props, progress=progress)
 
 
-def _report(command: RunScene, scene: SceneDescription, walks: Sequence[Walk]) -> dict[str, Any]:
+def _report(command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot]) -> dict[str, Any]:
     """Build the report, by actor of each walk that has begun."""
     request = options.describe_request("run", command) | {"title": scene.title}
     actors = {

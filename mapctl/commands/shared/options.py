@@ -1,7 +1,7 @@
 """Options that several commands share: their types for tyro, and checks that need nothing heavy."""
 
 import re
-from dataclasses import fields
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -50,7 +50,16 @@ def parse_size(text: str) -> tuple[int, int]:
 def describe_request(name: str, command: Any) -> dict[str, Any]:
     """Describe a command and its options as a report shows them."""
     values = {field.name: getattr(command, field.name) for field in fields(command)}
-    return {"command": name} | {key: str(v) if isinstance(v, Path) else v for key, v in values.items()}
+    return {"command": name} | {key: _describe_value(value) for key, value in values.items()}
+
+
+def _describe_value(value: Any) -> Any:
+    """Describe a value in plain numbers, texts, lists and tables: paths and what tables of a file were read as."""
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple | list):
+        return [_describe_value(each) for each in value]
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 def collect_paths(*paths: Path | None) -> list[Path]:

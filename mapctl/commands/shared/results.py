@@ -48,7 +48,11 @@ def load_models(inbetweener: str | None, prior: str | None) -> ModelLoaders:
     """
 
     def load_network(method: str) -> Inbetweener:
-        network = priors.load_inbetweener(inbetweener or ("infiller" if method == "infiller" else "transformer"))
+        if method == "infiller" and inbetweener is None:
+            raise RequestError(
+                "no infiller is bundled; name one that `mapctl train infiller` made by --inbetweener RUN"
+            )
+        network = priors.load_inbetweener(inbetweener or "transformer")
         wanted = {"infiller": "infiller", "transformer": "pose-transformer"}.get(method, network.card.kind)
         if network.card.kind != wanted:
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")

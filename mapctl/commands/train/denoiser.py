@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
-from mapctl.commands.train.options import TunableOptions
+from mapctl.commands.train.options import ParallelOptions
 
 if TYPE_CHECKING:
     from priors.training.recipes.denoiser import DenoiserRecipe
 
 
 @dataclass(frozen=True)
-class TrainDenoiser(TunableOptions):
+class TrainDenoiser(ParallelOptions):
     """Train the denoiser that denoise begins with."""
 
     model = "denoiser"
@@ -32,4 +32,5 @@ class TrainDenoiser(TunableOptions):
             settings=replace(DenoiserSettings(), bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,
+            processes=self.processes,
         )

@@ -155,6 +155,14 @@ class TunableOptions(NetworkOptions):
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
 
 
+@dataclass(frozen=True)
+class ParallelOptions(TunableOptions):
+    """Options of any network whose batches several processes can share."""
+
+    processes: options.Count = 1
+    """Processes that compute the gradients of a step, each of --batch of its own; one for each core pays."""
+
+
 def _print_line(line: str) -> None:
     # Flushed, so that a log file shows how far a run of hours has come.
     print(line, flush=True)

@@ -4,21 +4,21 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
-from mapctl.commands.train.options import TunableOptions
+from mapctl.commands.train.options import ParallelOptions
 
 if TYPE_CHECKING:
     from priors.training.recipes.pose_transformer import PoseTransformerRecipe
 
 
 @dataclass(frozen=True)
-class TrainPoseTransformer(TunableOptions):
+class TrainPoseTransformer(ParallelOptions):
     """Train the pose transformer that infill, tween, blend and chain begin with; --batch is in frames."""
 
     model = "pose-transformer"
     used_by = "use it with --inbetweener"
 
     width: options.MaybeCount = None
-    """Numbers of a frame's token; a multiple of twice the heads."""
+    """Numbers of a frame's token, even; every 32 of them have a head of attention."""
     layers: options.MaybeCount = None
     """Layers of attention."""
     plain: bool = False
@@ -34,11 +34,15 @@ class TrainPoseTransformer(TunableOptions):
 
         common = self.common()
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
+        shape = self.select_given("width", "layers")
+        if self.width is not None:
+            shape["heads"] = max(1, self.width // 32)
         plain = ({"kernel": 0}, {"optimiser": "adam", "learning_rate": 8e-4}) if self.plain else ({}, {})
         return PoseTransformerRecipe(
             **common,
-            config=replace(PoseTransformerConfig(), **plain[0], **self.select_given("width", "layers")),
+            config=replace(PoseTransformerConfig(), **plain[0], **shape),
             settings=replace(PoseTransformerSettings(), bfloat16=self.bfloat16, **{**plain[1], **given}),
             skip_first=self.skip_first,
             init=self.init,
+            processes=self.processes,
         )

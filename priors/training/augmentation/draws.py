@@ -59,6 +59,12 @@ class Draws:
             limbs[row, list(joints)] = True
         return limbs[self.below(torch.full((self.batch,), len(LIMBS)))]
 
+    def joints(self, limbs: float) -> Bool[Tensor, "batch joints"]:
+        """1 to 3 joints at random, or in this share of cases those of a limb."""
+        limb, order = self.limb(), self.uniform(CANONICAL.num_joints).argsort(dim=1).argsort(dim=1)
+        some = order < (1 + self.uniform(1) * 3).floor()
+        return torch.where(self.uniform(1) < 1 - limbs, some, limb)
+
     def mark(self, start: Tensor, length: Tensor) -> Bool[Tensor, "batch frames"]:
         """True from each start on for so many frames."""
         frame = torch.arange(self.frames)

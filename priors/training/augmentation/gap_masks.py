@@ -88,7 +88,7 @@ def _sample_keyframes(draw: Draws, length: float) -> Bool[Tensor, "batch frames"
 
 def _sample_partial(draw: Draws, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """Some joints, or all but some, known for a stretch."""
-    some = _sample_joints(draw)
+    some = draw.joints(limbs=0.5)
     other = draw.uniform(1) < 0.25
     stretch = _sample_interval(draw, 1 + draw.uniform() ** 2 * draw.frames)
     return stretch[..., None] & torch.where(other, ~some, some)[:, None]
@@ -96,16 +96,8 @@ def _sample_partial(draw: Draws, settings: GapSettings) -> Bool[Tensor, "batch f
 
 def _sample_missing_joints(draw: Draws, settings: GapSettings) -> Bool[Tensor, "batch frames joints"]:
     """All known but 1 to 3 joints, or a limb, throughout or for a stretch; or any joint now and then."""
-    lost = _sample_joints(draw)[:, None].expand(-1, draw.frames, -1)
+    lost = draw.joints(limbs=0.5)[:, None].expand(-1, draw.frames, -1)
     during = _sample_interval(draw, 10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     lost = torch.where((draw.uniform() < settings.dropout)[:, None, None], dropped, lost & during[..., None])
     return ~lost
-
-
-def _sample_joints(draw: Draws) -> Bool[Tensor, "batch joints"]:
-    """1 to 3 joints at random, or a limb."""
-    limb = draw.limb()
-    order = draw.uniform(_JOINTS).argsort(dim=1).argsort(dim=1)
-    some = order < (1 + draw.uniform(1) * 3).floor()
-    return torch.where(draw.uniform(1) < 0.5, some, limb)

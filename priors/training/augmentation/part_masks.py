@@ -13,17 +13,18 @@ from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.draws import Draws
 
 _JOINTS = CANONICAL.num_joints
+_TRUNK = CANONICAL.indices(("spine", "chest", "neck", "head"))
 
 
 @dataclass(frozen=True)
 class PartSettings:
     """What stays known. A window has gaps, lost joints, or keys; shares of the three are these, gaps get the rest."""
 
-    joints: float = 0.27
+    joints: float = 0.22
     """Share of windows that lose joints."""
     keys: float = 0.08
     """Share of windows of which only single frames are known, now and then."""
-    several: float = 0.3
+    several: float = 0.25
     """Share of windows with gaps that have several."""
     bare: float = 0.4
     """Share of runs of known frames that are one frame long."""
@@ -31,8 +32,11 @@ class PartSettings:
     """Frames of the longest run beside a gap."""
     open: float = 0.08
     """Share of windows with gaps that end, or half as often begin, in one."""
-    parts: float = 0.4
+    parts: float = 0.33
     """Share of windows with gaps of which something is told in the gap."""
+    reaching: float = 0.5
+    """Share of windows that lose joints of which hands or feet that are lost are told where to be, now and then or for
+    a while; half of them lose the trunk too."""
 
 
 def sample_known_parts(motion: PartialMotion, settings: PartSettings, generator: torch.Generator) -> PartialMotion:
@@ -45,10 +49,13 @@ def sample_known_parts(motion: PartialMotion, settings: PartSettings, generator:
     poses = torch.where((lossy & (draw.uniform() < 0.8))[:, None], True, poses)
     known = KnownParts.whole(poses)
     lost = torch.where(lossy[:, None, None], _sample_lost_joints(draw), False)
+    reaching = lossy & (draw.uniform() < settings.reaching)
+    lost = lost | _lose_trunk(draw, lost, reaching & (draw.uniform() < 0.5))
     told = ~lossy & (draw.uniform() < settings.parts)
     motion, known = _tell_parts(draw, motion, known, told)
     known = replace(known, rotations=known.rotations & ~lost)
-    return replace(motion, known=known)
+    effectors = reaching[:, None, None] & _sample_reached(draw, 0.5) & ~known.positions[..., list(EFFECTORS)]
+    return replace(motion, known=replace(known, effectors=known.effectors | effectors))
 
 
 def _sample_gaps(draw: Draws, settings: PartSettings) -> Bool[Tensor, "batch frames"]:
@@ -89,13 +96,6 @@ def _sample_keys(draw: Draws) -> Bool[Tensor, "batch frames"]:
     return known
 
 
-def _sample_joints(draw: Draws) -> Bool[Tensor, "batch joints"]:
-    """1 to 3 joints at random, or a limb."""
-    order = draw.uniform(_JOINTS).argsort(dim=1).argsort(dim=1)
-    some = order < (1 + draw.uniform(1) * 3).floor()
-    return torch.where(draw.uniform(1) < 0.35, some, draw.limb())
-
-
 def _sample_stretch(draw: Draws, shortest: float) -> Bool[Tensor, "batch frames"]:
     length = shortest + draw.uniform() * (draw.frames - shortest)
     return draw.mark(draw.uniform() * (draw.frames + 8 - length).clamp_min(1) - 4, length)
@@ -103,11 +103,27 @@ def _sample_stretch(draw: Draws, shortest: float) -> Bool[Tensor, "batch frames"
 
 def _sample_lost_joints(draw: Draws) -> Bool[Tensor, "batch frames joints"]:
     """1 to 3 joints, or one or two limbs, throughout or for a stretch; or any joint now and then."""
-    joints = _sample_joints(draw)
+    joints = draw.joints(limbs=0.65)
     joints = joints | (draw.limb() & (draw.uniform(1) < 0.3))
     during = _sample_stretch(draw, 6) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     return torch.where((draw.uniform() < 0.15)[:, None, None], dropped, joints[:, None] & during[..., None])
+
+
+def _lose_trunk(
+    draw: Draws, lost: Bool[Tensor, "batch frames joints"], chosen: Bool[Tensor, " batch"]
+) -> Bool[Tensor, "batch frames joints"]:
+    """Spine to head of chosen windows in the frames that lack any joint: who reaches far leans and turns."""
+    trunk = torch.zeros(_JOINTS, dtype=torch.bool)
+    trunk[list(_TRUNK)] = True
+    return chosen[:, None, None] & lost.any(dim=-1, keepdim=True) & trunk
+
+
+def _sample_reached(draw: Draws, held: float) -> Bool[Tensor, "batch frames 1"]:
+    """Frames in which places of hands and feet are told: one here and there, or, in a share of windows, a while."""
+    reached = draw.uniform(draw.frames, 1) < draw.uniform(1, 1) ** 2 * 0.12
+    stretch = draw.mark(draw.uniform() * draw.frames, 1 + draw.uniform() * 12)[..., None]
+    return torch.where((draw.uniform() < held)[:, None, None], stretch, reached)
 
 
 def _tell_parts(
@@ -119,7 +135,7 @@ def _tell_parts(
     def chosen(low: float, high: float) -> Bool[Tensor, "batch 1"]:
         return ((which >= low) & (which < high))[:, None]
 
-    joints = _sample_joints(draw)
+    joints = draw.joints(limbs=0.65)
     joints = torch.where(draw.uniform(1) < 0.4, ~joints, joints)
     stretch = _sample_stretch(draw, 1)
     rotations = known.rotations | (chosen(0.0, 0.2)[..., None] & joints[:, None] & stretch[..., None])
@@ -131,11 +147,13 @@ def _tell_parts(
     rotations[..., 0] |= hips & heading & (draw.uniform(1) < 0.6)
     ground, height = (each | (hips & (draw.uniform(1) < 0.85)) for each in (known.ground, known.height))
     path = chosen(0.35, 0.5) & ~ground
-    reached = draw.uniform(draw.frames, 1) < draw.uniform(1, 1) ** 2 * 0.12
-    held = draw.mark(draw.uniform() * draw.frames, 1 + draw.uniform() * 12)[..., None]
-    reached = torch.where((draw.uniform() < 0.2)[:, None, None], held, reached)
     which_effectors = draw.uniform(1, len(EFFECTORS)) < 0.2 + 0.4 * draw.uniform(1, 1)
-    effectors = chosen(0.64, 1.01)[..., None] & reached & which_effectors & ~known.positions[..., list(EFFECTORS)]
+    effectors = (
+        chosen(0.64, 1.01)[..., None]
+        & _sample_reached(draw, 0.2)
+        & which_effectors
+        & ~known.positions[..., list(EFFECTORS)]
+    )
     parts = KnownParts(rotations, heading, ground, height, path, effectors)
     return replace(motion, root_position=_roughen(draw, motion.root_position, path)), parts
 

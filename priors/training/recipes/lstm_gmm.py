@@ -23,7 +23,7 @@ from priors.training.corpus import Corpus, Split
 from priors.training.gathering import describe_skipped
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
-from priors.training.recipe import Export, Gathered, Recipe, Row, average
+from priors.training.recipe import Export, Gathered, Recipe, Row, average, find_split_seed
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import FeatureWindows
 
@@ -291,6 +291,11 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         """One line on the losses of some steps."""
         return f"{average(rows, 'loss'):.2f} nats"
 
+    @property
+    def split_seed(self) -> int:
+        """That of the initial weights, where there are any."""
+        return find_split_seed(self.init, super().split_seed)
+
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
         model, corpus, parts = trainer.network.cpu().eval(), gathered.corpus, gathered.parts
@@ -302,7 +307,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             **describe_skipped(corpus),
             "match": self.match or "",
             "labels": self.labels,
-            "split_seed": self.settings.seed,
+            "split_seed": self.split_seed,
             "starts": list(found.names),
             "held_out": gathered.held_out(),
         }

@@ -10,10 +10,12 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl import rotations
-from mapctl.errors import RequestError
+from mapctl.errors import CheckpointError, RequestError
 from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from priors import checkpoints
 from priors.config import require_at_least
+from priors.pose_transformer.growing import can_grow, grow
 from priors.pose_transformer.network import (
     QUANTILES,
     PoseTransformerConfig,
@@ -22,8 +24,8 @@ from priors.pose_transformer.network import (
     to_six,
 )
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
+from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
 from priors.training.corpus import Corpus, Split
-from priors.training.pose_windows import PoseWindows, Variation, add_targets
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.trainer import GradientTrainer, make_adam
 
@@ -53,7 +55,7 @@ class PoseTransformerSettings:
     """Weight of the mean distance of joints from their true places, metres."""
     pace: float = 20.0
     """Weight of the error of joints' steps, metres a frame."""
-    turns: float = 0.5
+    turns: float = 1.0
     """Weight of the error of world rotations: norm of the difference of matrices."""
     hips: float = 5.0
     """Weight of the distance of the hips, metres."""
@@ -63,9 +65,9 @@ class PoseTransformerSettings:
     """Weight of the contacts' cross entropy, nats."""
     spread: float = 1.0
     """Weight of the quantile loss of the spread, which only its own layers learn from."""
-    ease: float = 0.5
+    ease: float = 0.4
     """How much windows count for more whose interpolation errs little: 0 all alike, 1 by the share of its error."""
-    evenness: float = 0.6
+    evenness: float = 0.85
     """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
     kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
     """Kinds, as patterns of names; clips of none of these are another kind."""
@@ -164,6 +166,16 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     def make_untaught(self, parts: Split) -> PoseTransformerTrainer:
         """The trainer, its weights drawn."""
         return PoseTransformerTrainer(self.config, self.settings, parts.train)
+
+    def read_initial_weights(self, name: str, trainer: PoseTransformerTrainer) -> dict[str, Tensor]:
+        """Another pose transformer's weights, grown where it is smaller."""
+        tensors, card = checkpoints.load(checkpoints.locate(name))
+        if card.kind == self.kind:
+            small = PoseTransformerConfig(**card.config)
+            if can_grow(small, self.config):
+                return grow(tensors, small, trainer.network)
+        wanted = f"{self.kind} of {self.config.as_card()}, or a smaller one with heads as wide"
+        raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
 
     def format_shape(self) -> list[str]:
         """Width, layers and plainness, where they are not the usual ones."""

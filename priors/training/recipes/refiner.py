@@ -291,8 +291,12 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
 
     def source(self) -> DataSource:
         """Gather the data, split as the density's, so that its held-out clips stay held out."""
-        seed = self.prior.card.data.get("split_seed", self.settings.seed)
-        return replace(super().source(), match=self._find_match(), seed=seed)
+        return replace(super().source(), match=self._find_match())
+
+    @property
+    def split_seed(self) -> int:
+        """That of the density, so that its held-out clips stay held out."""
+        return self.prior.card.data.get("split_seed", self.settings.seed)
 
     def make_trainer(self, parts: Split) -> AdversarialTrainer:
         """With samples of the density, to train on and to be measured."""

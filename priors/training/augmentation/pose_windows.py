@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose, integrate_root
+from mapctl.features import LAYOUT
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL
@@ -46,12 +46,8 @@ class PoseWindows:
         """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
         frames, 1 the same number of each kind.
         """
-        self.lengths = torch.tensor(corpus.lengths)
-        self.starts = torch.cumsum(self.lengths, 0) - self.lengths
-        origin = GroundPose(torch.zeros(2), torch.zeros(()))
-        roots = [integrate_root(clip, origin) for clip in corpus.clips()]
-        self.ground = torch.cat([ground for ground, _ in roots])
-        self.heading = torch.cat([heading for _, heading in roots])
+        self.lengths, self.starts = corpus.locate_clips()
+        self.ground, self.heading = corpus.integrate_roots()
         self.height = LAYOUT.pick(corpus.features, "root_height")
         self.contacts = LAYOUT.pick(corpus.features, "contacts")
         poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
@@ -108,14 +104,7 @@ class PoseWindows:
     def mean_quats(self) -> Float[Tensor, "joints 4"]:
         """Mean rotation of each joint, of a motion and its mirror image."""
         sample = self.quats[:: max(1, len(self.quats) // 20_000)]
-        both = torch.cat([sample, mirror_quats(sample)])
-        return torch.stack([_average(both[:, joint]) for joint in range(CANONICAL.num_joints)])
-
-
-def _average(quats: Float[Tensor, "count 4"]) -> Float[Tensor, " 4"]:
-    """Return the mean rotation: the first eigenvector of the quaternions' second moment (Markley et al. 2007)."""
-    mean = torch.linalg.eigh(quats.double().T @ quats.double())[1][:, -1].float()
-    return mean if mean[3] >= 0 else -mean
+        return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
 
 
 def _find_kind(name: str, kinds: Sequence[str]) -> int:

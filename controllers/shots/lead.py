@@ -1,0 +1,96 @@
+"""A clip that a shot goes on from: where it ends, the shot begins, in the same pose and the same stride."""
+
+import math
+from dataclasses import dataclass, replace
+
+from controllers.common.character import Character
+from controllers.common.initial_state import MotionStart, start_from_state
+from mapctl import kinematics
+from mapctl.curves import Curve
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.kinematics.placing import move_to, rotate_about_vertical
+from mapctl.motion import Motion
+from mapctl.problem.receding_horizon import replay
+from mapctl.protocols import Density
+
+_MEMORY_FRAMES = 120  # at PRIOR_FPS, that warm up the density's state
+_TRAVEL_FRAMES = 15  # over which the direction of travel is measured
+_STANDING_SPEED = 0.3  # m/s below which the hips' heading is the direction
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """The frames of a clip up to the one that a shot begins in."""
+
+    motion: Motion
+    """On canonical joints with the character's bones, at PRIOR_FPS; the last frame is the shot's first."""
+
+    @staticmethod
+    def of(canonical: Motion, frame: int) -> "Lead":
+        """Take the frames up to one of a clip, at its own rate; RequestError for a frame that it does not have, and
+        for its first two, before which nothing shows how it moves."""
+        if not 2 <= frame < canonical.num_frames:
+            raise RequestError(f"the clip's frames to go on from are 2:{canonical.num_frames}, got {frame}")
+        # Resampling keeps the first frame, so backwards it keeps the last.
+        backwards = _reverse(canonical.slice(0, frame + 1)).resample(PRIOR_FPS)
+        return Lead(_reverse(backwards.slice(0, min(backwards.num_frames, _MEMORY_FRAMES))))
+
+    @property
+    def last_pose(self) -> Motion:
+        """Its last frame."""
+        return self.motion.slice(self.motion.num_frames - 1, self.motion.num_frames)
+
+    @property
+    def speed(self) -> float:
+        """Speed of the hips over the ground at its end, m/s."""
+        ground = self.motion.root_position[-_TRAVEL_FRAMES:, ::2]
+        return float((ground[-1] - ground[0]).norm()) * PRIOR_FPS / max(1, len(ground) - 1)
+
+    @property
+    def stands(self) -> bool:
+        """Whether it ends standing."""
+        return self.speed < _STANDING_SPEED
+
+    @property
+    def direction(self) -> float:
+        """Direction of travel at its end, radians; the hips' heading of somebody who stands."""
+        ground = self.motion.root_position[-_TRAVEL_FRAMES:, ::2]
+        if self.stands:
+            return float(kinematics.heading(self.motion.local_quat_xyzw[-1:, 0]))
+        x, z = (ground[-1] - ground[0]).tolist()
+        return math.atan2(x, z)
+
+    def bring_curve(self, curve: Curve) -> Curve:
+        """Return a curve moved so that it begins at the lead's end and leads on."""
+        ground = slice(0, None, curve.dims - 1)
+        angle = self.direction - curve.start_heading
+        turn = curve.points.new_tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        points = curve.points.clone()
+        points[:, ground] = (points[:, ground] - points[0, ground]) @ turn + self.motion.root_position[-1, ::2]
+        return replace(curve, points=points)
+
+    def bring_to(self, curve: Curve) -> "Lead":
+        """Return the lead moved so that it ends where a curve begins, on its way along it."""
+        turned = rotate_about_vertical(self.motion, curve.start_heading - self.direction)
+        return Lead(move_to(turned, curve.start[:: curve.dims - 1], frame=-1))
+
+    def start(self, prior: Density, character: Character) -> MotionStart:
+        """Return the density's state at its end, of the prior's size."""
+        size = character.scale
+        unit = replace(self.motion, skeleton=character.unit_skeleton, root_position=self.motion.root_position / size)
+        features, place = encode(unit)
+        ground, heading = integrate_root(features, place)
+        observed = features.float()
+        state = replay(prior, observed[1:], prior.start_after(observed[:1]))
+        end = GroundPose(ground[-1].float(), heading[-1].float())
+        return start_from_state(state, end, character.unit_skeleton)
+
+
+def _reverse(motion: Motion) -> Motion:
+    return replace(
+        motion,
+        root_position=motion.root_position.flip(0),
+        local_quat_xyzw=motion.local_quat_xyzw.flip(0),
+        moving_offsets={joint: values.flip(0) for joint, values in motion.moving_offsets.items()},
+    )

@@ -1,0 +1,168 @@
+"""Hands and feet that reach: the walk comes near enough, then trunk and limb are made anew around the moment."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.shots.request import Reach
+from controllers.shots.way import Way
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.motion import Motion
+from mapctl.numerics.easing import smootherstep
+from mapctl.numerics.intervals import true_intervals
+from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
+from mapctl.terms.keep_clear import WithinReach
+
+_AROUND_FRAMES = 27  # at PRIOR_FPS, before and after a reach, in which trunk and limb are free
+_EASY_SHARE = 0.9  # of a stretched limb's length that it reaches without strain
+_STRETCHED_SHARE = 0.97  # of its length, that a limb is stretched toward what it cannot reach
+_BENT_SHARE = 0.85  # of its length, from which on the way to a place is shortened
+_LEAN = 0.05  # metres that leaning adds to what a limb reaches
+_TIPTOE, _CROUCH = 0.15, 1.0  # metres by which a body rises or goes down for a reach
+_STEP_ASIDE = 1.2  # metres between the way and a body that leans and leaves it for a reach
+_TRUNK = list(CANONICAL.indices(("spine", "chest", "neck", "head")))
+
+
+@dataclass(frozen=True, eq=False)
+class ReachTargets:
+    """Targets of a shot by frame."""
+
+    targets: EffectorTargets
+    """World positions of hands and feet."""
+
+    @staticmethod
+    def of(reaches: Sequence[Reach], frames: int) -> "ReachTargets":
+        """Collect the targets of all reaches."""
+        places = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
+        wanted = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
+        for reach in reaches:
+            first = round(reach.seconds * PRIOR_FPS)
+            held = slice(first, first + round(reach.hold_seconds * PRIOR_FPS) + 1)
+            for name, place in reach.places.items():
+                places[held, CANONICAL.index(name)] = places.new_tensor(place)
+                wanted[held, CANONICAL.index(name)] = True
+        return ReachTargets(EffectorTargets(places, wanted))
+
+    def terms(self, skeleton: Skeleton, first: int, frames: int) -> list[WithinReach]:
+        """Build the terms that lead a walk near enough, for frames of the shot; lengths are of the skeleton's size."""
+        found = []
+        for name, limb in LIMBS.items():
+            window = slice(first, first + frames)
+            wanted = self.targets.wanted[window, limb.end]
+            if not bool(wanted.any()):
+                continue
+            missing = frames - len(wanted)  # look-ahead beyond the shot's end
+            bones = skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+            place = torch.cat([self.targets.places[window, limb.end], torch.zeros(missing, 3, dtype=torch.float64)])
+            wished = torch.cat([wanted, wanted.new_zeros(missing)])
+            term = WithinReach(limb.upper, place, wished, _EASY_SHARE * float(bones))
+            found.append(replace(term, name=f"{name} within reach"))
+        return found
+
+    def within_reach(self, motion: Motion) -> "ReachTargets":
+        """Return the targets that limbs reach from where a motion comes; of a limb that reaches none of its targets,
+        the nearest one, brought as near as the limb reaches."""
+        places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
+        for limb in LIMBS.values():
+            away = places[:, limb.end] - positions[:, limb.upper]
+            bones = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+            most = _STRETCHED_SHARE * bones + _LEAN
+            far = away.norm(dim=-1)
+            for _, first, last in true_intervals(wanted[:, limb.end : limb.end + 1].clone()):
+                reached = far[first:last] <= most
+                if not bool(reached.any()):
+                    reached[far[first:last].argmin()] = True
+                wanted[first:last, limb.end] = reached
+            near = positions[:, limb.upper] + away * (most / far.clamp_min(1e-6)).clamp(max=1.0)[:, None]
+            places[:, limb.end] = near
+        return ReachTargets(EffectorTargets(places, wanted))
+
+    def led_there(self, motion: Motion) -> "ReachTargets":
+        """Return targets in all frames around a reach: from where limbs are, smoothly to the place and back.
+
+        Told of the place alone, an in-betweener that never saw such a reach goes there at the last moment. The way is
+        about the shoulder, its direction and its distance by themselves: a straight one may lead through the body.
+        """
+        places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
+        frame = torch.arange(len(wanted))
+        for limb in LIMBS.values():
+            reached = self.targets.wanted[:, limb.end]
+            shoulder = positions[:, limb.upper]
+            bones = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+            way = positions[:, limb.end] - shoulder
+            for _, first, last in true_intervals(reached[:, None].clone()):
+                away = (first - frame).clamp_min(0) + (frame - last + 1).clamp_min(0)
+                share = smootherstep((1 - away / (_AROUND_FRAMES + 1)).to(way))
+                aim = places[frame.clamp(first, last - 1), limb.end] - shoulder
+                way = torch.where(share[:, None] > 0, _lead_about(way, _bend_within(aim, bones), share), way)
+            near = _widen(reached, _AROUND_FRAMES)
+            places[:, limb.end] = torch.where(reached[:, None], places[:, limb.end], shoulder + way)
+            wanted[:, limb.end] = near
+        return ReachTargets(EffectorTargets(places, wanted))
+
+    def free_limbs(self, joints: int) -> MissingMask:
+        """Return what the in-betweener makes anew: trunk and limb around every reach."""
+        frames = len(self.targets.wanted)
+        free = torch.zeros(frames, joints, dtype=torch.bool)
+        for name, limb in LIMBS.items():
+            near = _widen(self.targets.wanted[:, limb.end], _AROUND_FRAMES)
+            own = [CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end]
+            freed = own + _TRUNK if name.endswith("Hand") else own[1:]
+            free[:, freed] |= near[:, None]
+        return MissingMask(free, torch.zeros(frames, dtype=torch.bool))
+
+
+def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:
+    """Raise RequestError, with the distance, for targets beyond any arm or leg: too high over the ground, or too far
+    from where the way is at that time for any lean or step aside."""
+    positions = rest.joint_positions()[0]
+    for reach in reaches:
+        frame = min(round(reach.seconds * PRIOR_FPS), len(way.arcs) - 1)
+        on_way = way.curve.point(way.arcs[frame])[:: way.curve.dims - 1]
+        for name, place in reach.places.items():
+            limb = LIMBS[name]
+            bones = float(rest.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+            target = positions.new_tensor(place)
+            up = float((target[1] - positions[limb.upper, 1]).abs())
+            aside = float((target[::2] - on_way).norm())
+            most = bones + (_TIPTOE if target[1] > positions[limb.upper, 1] else _CROUCH)
+            if up > most or aside > bones + _STEP_ASIDE:
+                raise RequestError(
+                    f"{name} at {reach.seconds:g} s is to be {aside:.1f} m from where the way is then, and {up:.1f} m "
+                    f"above or below the joint it reaches from; it is {bones:.2f} m long"
+                )
+
+
+def _lead_about(
+    one: Float[Tensor, "frames 3"], other: Float[Tensor, "frames 3"], share: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames 3"]:
+    """Turn one vector toward another by a share of the angle between them, its length by the same share."""
+    lengths = [vector.norm(dim=-1, keepdim=True).clamp_min(1e-6) for vector in (one, other)]
+    whole = rotations.to_rotation_vector(rotations.between_vectors(one / lengths[0], other / lengths[1]))
+    turned = rotations.rotate(rotations.from_rotation_vector(share[:, None] * whole), one / lengths[0])
+    return turned * torch.lerp(lengths[0], lengths[1], share[:, None])
+
+
+def _bend_within(away: Float[Tensor, "frames 3"], bones: Float[Tensor, ""]) -> Float[Tensor, "frames 3"]:
+    """Bring vectors smoothly to where a limb reaches them without being stretched: a stretched elbow swings fast."""
+    far = away.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    easy, most = _BENT_SHARE * bones, _STRETCHED_SHARE * bones
+    near = torch.where(far > easy, most - (most - easy) * torch.exp(-(far - easy).clamp_min(0) / (most - easy)), far)
+    return away / far * near
+
+
+def _widen(wanted: Tensor, frames: int) -> Tensor:
+    kernel = torch.ones(1, 1, 2 * frames + 1)
+    return torch.nn.functional.conv1d(wanted.float()[None, None], kernel, padding=frames)[0, 0] > 0
+
+
+def measure_misses(positions: Float[Tensor, "frames joints 3"], targets: EffectorTargets) -> Float[Tensor, " frames"]:
+    """Measure how far the farthest limb is from its target in each frame, metres."""
+    return ((positions - targets.places).norm(dim=-1) * targets.wanted).amax(dim=-1)

@@ -1,0 +1,100 @@
+"""The way of a shot: its curve led around obstacles and others, and the arc along it at each frame."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.shots.request import Others, ShotRequest
+from controllers.shots.timeline import StandingEnds, limit_timed_speeds, plan_speeds
+from mapctl.curves import Curve
+from mapctl.curves.detour import apply_detour, find_detour
+from mapctl.curves.obstacles import measure_clearance
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.path import PathRequest
+from mapctl.intent.timed_speed import TimedSpeed, integrate_speeds
+from mapctl.numerics import vectors
+
+_BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far
+_APART_MARGIN = 0.15  # metres beyond the distance to others: hips sway, and are early or late
+_MOST_FRAMES = 108_000
+_MEETING_FRAMES = 6  # frames by which either may be early or late
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """Where a character is to be at each frame."""
+
+    curve: Curve
+    """Curve that is clear of obstacles and others."""
+    speeds: Float[Tensor, " frames"]
+    """Speed along it, m/s."""
+    arcs: Float[Tensor, " frames"]
+    """Arc along it, metres."""
+    note: str | None = None
+    """What was changed about the request, or why it cannot hold."""
+
+
+def plan_way(request: ShotRequest) -> Way:
+    """Plan the way of a shot: first around obstacles, then past others, who are met where the plan is when they are
+    there. Where no way leads through the curve stays as it is, and a note says so."""
+    speeds = _plan_speeds(request, request.curve)
+    arcs = integrate_speeds(speeds, PRIOR_FPS)
+    if not request.obstacles and request.others is None:
+        return Way(request.curve, speeds, arcs)
+
+    at_start = float(measure_clearance(request.obstacles, request.curve.start[None, :: request.curve.dims - 1]))
+
+    def clearance(points: Tensor, at: Tensor) -> Tensor:
+        # Who begins beside an obstacle has to get away from it first.
+        margin = (at_start + 0.5 * at).clamp(max=_BODY_MARGIN)[:, None]
+        clear = measure_clearance(request.obstacles, points) - margin
+        return (
+            clear
+            if request.others is None
+            else torch.minimum(clear, _clear_of_others(points, at, arcs, request.others))
+        )
+
+    offsets = find_detour(request.curve, clearance)
+    if offsets is None:
+        return Way(request.curve, speeds, arcs, "no way leads around the obstacles and past the others")
+    curve = apply_detour(request.curve, offsets)
+    speeds = _plan_speeds(request, curve)
+    return Way(curve, speeds, integrate_speeds(speeds, PRIOR_FPS))
+
+
+def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]:
+    """Plan the speed at each frame; a shot without a duration lasts until the curve ends."""
+    ends = StandingEnds(request.begins_standing, request.stand_at_end)
+    if isinstance(request.speed, TimedSpeed):
+        frames = max(2, round((request.seconds or 0.0) * PRIOR_FPS))
+        return limit_timed_speeds(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS, ends)
+    path, _ = PathRequest(curve, request.speed, request.seconds).fitted(PRIOR_FPS)
+    frames = path.frames(PRIOR_FPS)
+    if ends.start or ends.end:
+        length = math.inf if curve.closed and request.seconds is not None else curve.length
+        return plan_speeds(path.profile, length, PRIOR_FPS, ends, seconds=request.seconds, most=_MOST_FRAMES)
+    arcs = path.arcs(frames, PRIOR_FPS)
+    return torch.tensor([path.profile.at(float(arc)) for arc in arcs], dtype=torch.float64)
+
+
+def _clear_of_others(
+    points: Float[Tensor, "arcs offsets 2"], at: Float[Tensor, " arcs"], arcs: Float[Tensor, " frames"], others: Others
+) -> Float[Tensor, "arcs offsets"]:
+    """Compute by how much points are clear of others when they are reached."""
+    frame = torch.searchsorted(arcs.contiguous(), at.contiguous()).clamp(max=len(arcs) - 1)
+    clear = torch.full(points.shape[:2], torch.inf, dtype=points.dtype)
+    last = others.hips.shape[1] - 1
+    for late in range(-_MEETING_FRAMES, _MEETING_FRAMES + 1, 3):
+        there = others.hips[:, (frame + late).clamp(0, last)].to(points)
+        away = vectors.length(points[None] - there[:, :, None])
+        clear = torch.minimum(clear, away.amin(dim=0))
+    return clear - others.distance - _APART_MARGIN
+
+
+def cut_curve(curve: Curve, start: float, stop: float) -> Curve:
+    """Return the open piece of a curve between two arcs, metres."""
+    arcs = torch.linspace(start, stop, max(2, round((stop - start) / 0.01)) + 1, dtype=torch.float64)
+    return replace(curve, points=curve.point(arcs), closed=False)

@@ -1,0 +1,135 @@
+"""What became of the wishes of a shot: asked, got, and the residual of each."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from controllers.shots.looking import measure_look_errors
+from controllers.shots.reaching import ReachTargets, measure_misses
+from controllers.shots.request import Reach, ShotRequest
+from controllers.shots.way import Way
+from mapctl.curves.obstacles import measure_clearance
+from mapctl.features import PRIOR_FPS
+from mapctl.motion import Motion
+from mapctl.numerics import vectors
+from mapctl.skeleton import LIMBS
+
+_PATH_TOLERANCE = 0.15  # metres
+_REACH_TOLERANCE = 0.01  # metres
+_LOOK_TOLERANCE_DEG = 15.0
+_STILL_TOLERANCE = 0.06  # m/s
+_NEAR_REACH_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Wish:
+    """One wish of a shot."""
+
+    name: str
+    """What was wished."""
+    asked: str
+    """In numbers."""
+    got: float
+    """What it came to, in `unit`."""
+    limit: float
+    """Beyond which it does not hold."""
+    unit: str
+    """Unit of both."""
+    at_least: bool = False
+    """Whether `limit` is a least value; else a largest one."""
+    remedy: str = ""
+    """What would let it hold; empty where it does, or where nothing is known to."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it holds."""
+        return self.got >= self.limit if self.at_least else self.got <= self.limit
+
+    @property
+    def residual(self) -> float:
+        """By how much it does not hold, in `unit`; 0 where it does."""
+        return max(0.0, self.limit - self.got if self.at_least else self.got - self.limit)
+
+    @property
+    def sentence(self) -> str:
+        """Say by how much it does not hold."""
+        remedy = f" ({self.remedy} would do)" if self.remedy else ""
+        return f"{self.name} ({self.asked}): {self.got:.1f} {self.unit}, {self.residual:.1f} {self.unit} short{remedy}"
+
+    def as_row(self) -> dict[str, Any]:
+        """Return the wish as a report shows it."""
+        return {
+            "wish": self.name,
+            "asked": self.asked,
+            "got": self.got,
+            "unit": self.unit,
+            "residual": self.residual,
+            "holds": self.holds,
+            "remedy": self.remedy,
+        }
+
+
+def check_wishes(request: ShotRequest, way: Way, motion: Motion) -> tuple[Wish, ...]:
+    """Measure every wish of a request on its motion, at PRIOR_FPS."""
+    positions = motion.joint_positions()
+    hips = positions[:, 0, ::2]
+    found = [_check_path(request, way, hips)]
+    for reach in request.reaches:
+        targets = ReachTargets.of((reach,), motion.num_frames).targets
+        miss = 100 * float(measure_misses(positions, targets).max())
+        name = f"{', '.join(reach.places)} at {reach.seconds:g} s"
+        asked = f"held {reach.hold_seconds:g} s" if reach.hold_seconds else "there"
+        limit = 100 * max(_REACH_TOLERANCE, reach.tolerance)
+        remedy = _find_remedy(reach, motion) if miss > limit else ""
+        found.append(Wish(name, asked, miss, limit, "cm", remedy=remedy))
+    for look in request.looks:
+        worst = float(measure_look_errors(motion, look).max())
+        found.append(Wish(f"look at {look.seconds:g} s", "straight", worst, _LOOK_TOLERANCE_DEG, "degrees"))
+    if request.obstacles:
+        clear = 100 * float(measure_clearance(request.obstacles, positions[..., ::2]).amin())
+        found.append(Wish("obstacles", "no joint within", clear, 0.0, "cm", at_least=True))
+    if request.others is not None:
+        last = request.others.hips.shape[1] - 1
+        there = request.others.hips[:, torch.arange(len(hips)).clamp(max=last)]
+        apart = 100 * float(vectors.length(hips[None] - there).amin())
+        asked = f"{request.others.distance:g} m"
+        found.append(Wish("keep apart", asked, apart, 100 * request.others.distance - 1.0, "cm", at_least=True))
+    still = 100 * vectors.length(torch.diff(hips, dim=0)) * PRIOR_FPS
+    if request.stand_at_start:
+        found.append(Wish("stand at the start", "0.4 s", float(still[:12].mean()), 100 * _STILL_TOLERANCE, "cm/s"))
+    if request.stand_at_end:
+        found.append(Wish("stand at the end", "0.8 s", float(still[-24:].mean()), 100 * _STILL_TOLERANCE, "cm/s"))
+    return tuple(found)
+
+
+def _find_remedy(reach: Reach, motion: Motion) -> str:
+    """Find when the character comes within reach of the place, or by how much nearer it would have to be."""
+    lacking = torch.zeros(motion.num_frames, dtype=torch.float64)
+    for name, place in reach.places.items():
+        limb = LIMBS[name]
+        bones = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+        away = motion.joint_positions()[:, limb.upper] - motion.root_position.new_tensor(place)
+        lacking = torch.maximum(lacking, vectors.length(away) - 0.97 * bones)
+    wanted = reach.seconds * PRIOR_FPS
+    within = (lacking <= 0).nonzero()[:, 0]
+    if len(within):
+        late = (float(within[(within - wanted).abs().argmin()]) - wanted) / PRIOR_FPS
+        return f"{abs(late):.1f} s {'later' if late > 0 else 'earlier'}"
+    return f"{100 * float(lacking.min()):.0f} cm nearer"
+
+
+def _check_path(request: ShotRequest, way: Way, hips: Tensor) -> Wish:
+    """Measure the mean distance to the way, away from reaches."""
+    away = torch.ones(len(hips), dtype=torch.bool)
+    for reach in request.reaches:
+        first = (reach.seconds - _NEAR_REACH_SECONDS) * PRIOR_FPS
+        last = (reach.seconds + reach.hold_seconds + _NEAR_REACH_SECONDS) * PRIOR_FPS
+        away[max(0, math.floor(first)) : max(0, math.ceil(last))] = False
+    if not bool(away.any()):
+        away[:] = True
+    near = way.curve.nearest(hips, way.arcs)
+    off = vectors.length(hips - way.curve.point(near)[:, :: way.curve.dims - 1])
+    return Wish("path", "on the curve", 100 * float(off[away].mean()), 100 * _PATH_TOLERANCE, "cm")

@@ -1,0 +1,16 @@
+"""`mapctl bench shots`: random wishes that are to hold at once."""
+
+import priors
+from controllers.benchmarks.shots import benchmark_shots
+from mapctl.commands.bench import Shots
+from mapctl.commands.bench.output import print_rows
+from mapctl.commands.shared.progress_bar import show_progress
+
+
+def run(table: Shots) -> int:
+    """Measure and print."""
+    prior, inbetweener = priors.load(table.prior), priors.load_inbetweener(table.inbetweener)
+    prior.warm_up()
+    with show_progress("shots") as progress:
+        rows = benchmark_shots(prior, inbetweener, count=table.count, seed=table.seed, progress=progress)
+    return print_rows(table, rows)

@@ -1,0 +1,214 @@
+"""Characters who do more than walk along a curve, for follow and run."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from controllers.common.character import Character
+from controllers.following.follow import FollowSettings
+from controllers.shots.lead import Lead
+from controllers.shots.request import Look, Others, Reach, ShotRequest
+from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
+from mapctl import formats, report
+from mapctl.curves import Curve
+from mapctl.curves.obstacles import Obstacle
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.path import SpeedProfile
+from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.mesh.primitives import Surface
+from mapctl.motion import Motion
+from mapctl.problem.solution import Outcome
+from mapctl.protocols import Inbetweener
+from mapctl.recording.frequency_bands import resample_by_splines
+from mapctl.retarget.carry import RiggedCharacter
+from mapctl.runtime.progress import Progress
+from mapctl.terms import FootContact
+from priors.lstm_gmm.density import LstmGmmDensity
+from scenes.props import build_obstacle, build_target
+from scenes.scene_file import Actor
+
+
+@dataclass(frozen=True, eq=False)
+class ShotPlan:
+    """What an actor is asked to do, and on what body."""
+
+    actor: Actor
+    """The actor's table."""
+    request: ShotRequest
+    """Its wishes."""
+    prior: LstmGmmDensity
+    """Density of its walks."""
+    character: Character
+    """Its body."""
+    fps: Fraction
+    """Rate of its motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedShot:
+    """A solved shot of one actor."""
+
+    plan: ShotPlan
+    """What was asked."""
+    solution: ShotSolution
+    """What came of it, on canonical joints at PRIOR_FPS."""
+
+    @property
+    def request(self) -> ShotRequest:
+        """Request of the shot."""
+        return self.plan.request
+
+    @property
+    def on_rig(self) -> Motion:
+        """Motion on the actor's rig, at its rate."""
+        return self.plan.character.on_rig(_resample_smoothly(self.solution.motion, self.plan.fps))
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the solve."""
+        return self.solution.status.outcome is Outcome.INTERRUPTED
+
+    @cached_property
+    def measures(self) -> Mapping[str, float]:
+        """Measures of the motion against the way that was planned."""
+        way = self.solution.way
+        return report.measure_path(self.solution.motion, way.curve, wanted_m=float(way.arcs[-1]))
+
+    def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Build the report of this shot; `request` is what the user wrote."""
+        card = self.plan.prior.card
+        prior = {"name": self.plan.prior.name, "licence": card.licence, "quality": card.quality}
+        seed = self.plan.actor.seed
+        return report.build_report(self.solution, request=request, measures=self.measures, seed=seed, prior=prior)
+
+    def summary(self) -> list[str]:
+        """Format a few lines for the user."""
+        motion = self.solution.motion
+        wishes = [
+            f"wish      {wish.name} ({wish.asked}): {wish.got:.1f} {wish.unit}" + ("" if wish.holds else ", NOT HELD")
+            for wish in self.solution.wishes
+        ]
+        return [
+            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s",
+            *wishes,
+            f"cost      {1000 * self.solution.seconds / motion.num_frames:.1f} ms a frame",
+            f"status    {self.solution.status.text}",
+        ]
+
+
+def plan_shot(
+    actor: Actor,
+    curve: Curve,
+    prior: LstmGmmDensity,
+    *,
+    character: Character,
+    folder: Path,
+    obstacles: Sequence[Obstacle] = (),
+    fps: Fraction | None = None,
+) -> ShotPlan:
+    """Plan an actor's shot; a clip that it goes on from is read, and gives it its body and its rate. RequestError for
+    wishes that do not fit each other, and for labels that the prior does not know."""
+    lead, rate = None, Fraction(PRIOR_FPS)
+    if actor.clip_frame is not None:
+        name, frame = actor.clip_frame
+        clip = formats.load(folder / name)
+        if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
+            raise RequestError(f"{name} is of another rig than the character; what goes on from a clip is on its rig")
+        canonical, body = RiggedCharacter.of(clip)
+        character = Character(canonical.skeleton, float(body.stance.toe_height.mean()), body.rigmap, body.source)
+        lead, rate = Lead.of(canonical, frame), clip.fps
+        if actor.offset is None and actor.turn_deg is None:
+            curve = lead.bring_curve(curve)
+        else:
+            lead = lead.bring_to(curve)
+    rate = rate if fps is None else fps
+    speed = SpeedProfile.parse(str(1.2 if actor.speed is None else actor.speed))
+    if actor.speed_by_time is not None:
+        speed = TimedSpeed.parse(actor.speed_by_time)
+        if actor.curve is not None and not any(speed.speeds):
+            raise RequestError(f"the speed is zero throughout, with a curve of {curve.length:.1f} m to go")
+    elif actor.curve is None:
+        speed = TimedSpeed((0.0,), (0.0,))
+    when = {number: key.at_seconds(float(rate)) for number, key in enumerate(actor.keys)}
+    request = ShotRequest(
+        curve,
+        speed,
+        actor.seconds,
+        lead=lead,
+        stand_at_start=actor.start == "stand",
+        stand_at_end=actor.end == "stand",
+        reaches=tuple(
+            Reach(when[number], key.reach, key.hold_seconds, key.tolerance)
+            for number, key in enumerate(actor.keys)
+            if key.reach
+        ),
+        looks=tuple(
+            Look(when[number], key.look_at, key.hold_seconds)
+            for number, key in enumerate(actor.keys)
+            if key.look_at is not None
+        ),
+        obstacles=tuple(obstacles),
+    )
+    labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
+    return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate)
+
+
+def play_shot(
+    plan: ShotPlan,
+    earlier: Sequence[PlayedShot],
+    inbetweener: Inbetweener,
+    *,
+    keep_apart: float | None = None,
+    progress: Progress | None = None,
+) -> PlayedShot:
+    """Solve an actor's shot; who was solved earlier is walked around."""
+    plan.prior.warm_up()
+    if keep_apart is not None and earlier:
+        plan = replace(plan, request=replace(plan.request, others=_find_others(plan, earlier, keep_apart)))
+    footing = FootContact(rest_height=plan.character.toe_rest_height)
+    solution = solve_shot(
+        plan.prior,
+        inbetweener,
+        plan.request,
+        generator=torch.Generator().manual_seed(plan.actor.seed),
+        settings=ShotSettings(follow=FollowSettings(footing=footing)),
+        skeleton=plan.character.skeleton,
+        progress=progress,
+    )
+    return PlayedShot(plan, solution)
+
+
+def _find_others(plan: ShotPlan, earlier: Sequence[PlayedShot], distance: float) -> Others:
+    """Collect the others' hips from the actor's first frame on; who has not begun stands in the first pose, who has
+    ended in the last."""
+    hips = []
+    longest = max(one.solution.motion.num_frames for one in earlier)
+    for one in earlier:
+        late = round((plan.actor.start_seconds - one.plan.actor.start_seconds) * PRIOR_FPS)
+        motion = one.solution.motion
+        frames = torch.arange(late, late + longest + abs(late)).clamp(0, motion.num_frames - 1)
+        hips.append(motion.root_position[frames, ::2])
+    count = min(len(each) for each in hips)
+    return Others(torch.stack([each[:count] for each in hips]), distance)
+
+
+def _resample_smoothly(motion: Motion, fps: Fraction) -> Motion:
+    """Resample to another rate, a higher one by splines."""
+    if fps <= motion.fps:
+        return motion.resample(fps)
+    seconds = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
+    frames = int((motion.num_frames - 1) * fps / motion.fps) + 1
+    return resample_by_splines(motion, seconds, fps=fps, frames=frames)
+
+
+def list_props(requests: Sequence[ShotRequest]) -> list[Surface]:
+    """List what a film shows of requests: each obstacle once, and the targets of hands and feet."""
+    obstacles = dict.fromkeys(obstacle for request in requests for obstacle in request.obstacles)
+    places = [place for request in requests for reach in request.reaches for place in reach.places.values()]
+    return [*map(build_obstacle, obstacles), *map(build_target, places)]

@@ -1,0 +1,92 @@
+"""Keeping clear: of obstacles on the ground, and of others who move."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.numerics import vectors
+from mapctl.skeleton import CANONICAL
+from mapctl.terms.trial import Trial
+
+_WIDEST = CANONICAL.indices(("hips", "leftHand", "rightHand", "leftLowerArm", "rightLowerArm", "leftToes", "rightToes"))
+
+
+@dataclass(frozen=True, eq=False)
+class KeepClear:
+    """No joint is inside an obstacle, or nearer to it than a margin."""
+
+    obstacles: tuple[Obstacle, ...]
+    """Obstacles in the world."""
+    margin: float = 0.05
+    """Distance from their edges within which a joint costs, metres."""
+    sigma: float = 0.02
+    """Standard deviation of the distance by which a joint is too near, metres."""
+    name: str = "clear"
+    unit: str = "m"
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Energies of the joints that reach farthest from the body, nats."""
+        return 0.5 * (self._trespass(trial) / self.sigma).square().sum(-1)
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Distance by which the joint that is nearest to an obstacle is nearer than the margin, metres."""
+        return self._trespass(trial).amax(-1)
+
+    def _trespass(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
+        ground = trial.joints_world[..., list(_WIDEST), ::2]
+        return (self.margin - measure_clearance(self.obstacles, ground)).clamp_min(0)
+
+
+@dataclass(frozen=True, eq=False)
+class KeepApart:
+    """The hips stay away from those of others, whose way is known."""
+
+    others: Float[Tensor, "others frames 2"]
+    """Hips of the others on the ground in each frame of the window, x and z, metres."""
+    distance: float
+    """Least distance of hips, metres."""
+    sigma: float = 0.02
+    """Standard deviation of the distance that is lacking, metres."""
+    name: str = "apart"
+    unit: str = "m"
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Energies, nats, summed over the others."""
+        return 0.5 * (self._lacking(trial) / self.sigma).square().sum(1)
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Distance that is lacking to the nearest other, metres."""
+        return self._lacking(trial).amax(1)
+
+    def _lacking(self, trial: Trial) -> Float[Tensor, "batch others frames"]:
+        away = trial.root_xz_world[:, None] - self.others.to(trial.features)
+        return (self.distance - vectors.length(away)).clamp_min(0)
+
+
+@dataclass(frozen=True, eq=False)
+class WithinReach:
+    """A shoulder is near enough to a target for the hand to reach it."""
+
+    shoulder: int
+    """Canonical joint from which the limb reaches."""
+    place: Float[Tensor, "frames 3"]
+    """Target in each frame of the window, world, metres; anything finite where there is none."""
+    wanted: Bool[Tensor, " frames"]
+    """Whether there is a target in a frame."""
+    reach: float
+    """Distance that the limb reaches without strain, metres."""
+    sigma: float = 0.02
+    """Standard deviation of the distance that it would have to be longer, metres."""
+    name: str = "within reach"
+    unit: str = "m"
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Energies, nats."""
+        return 0.5 * (self.residual(trial) / self.sigma).square()
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Distance beyond reach, metres; 0 where the limb reaches."""
+        away = trial.joints_world[..., self.shoulder, :] - self.place.to(trial.features)
+        return (vectors.length(away) - self.reach).clamp_min(0) * self.wanted

@@ -1,0 +1,60 @@
+"""`mapctl bench transitions` as a user types it."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import tiny_transformer
+from helpers import run, walk
+from tiny_infiller import save_tiny_infiller
+
+from mapctl import retarget
+from priors import checkpoints
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Clips of which training did not see two, and a transformer whose card says so."""
+    path = tmp_path_factory.mktemp("transitions")
+    for number in range(5):
+        motion = walk(80, turn_rate=0.3 * number, seed=number)
+        clip = path / "data" / "bandai" / f"a_walk_{number}.bvh"
+        clip.parent.mkdir(parents=True, exist_ok=True)
+        retarget.from_canonical(motion, retarget.identify_rig(motion.skeleton)).save(clip)
+    held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
+    card = replace(tiny_transformer.card(), data={"held_out": held})
+    checkpoints.save(tiny_transformer.network(drawn=0.05).state_dict(), card, path / "ours.safetensors")
+    save_tiny_infiller(path / "other.safetensors", drawn=0.1)
+    return path
+
+
+def measure(folder, capsys, *words):
+    asked = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors", "--json", *words]
+    assert run("bench", "transitions", *asked) == 0
+    return json.loads(capsys.readouterr().out)["rows"]
+
+
+@pytest.mark.parametrize("past", ["1", "10", "all"])
+def test_rows_of_methods_kinds_and_lengths_on_unseen_clips(folder, capsys, past):
+    rows = measure(folder, capsys, "--past", past, "--raw", "--baselines", folder / "other.safetensors")
+    methods = {"mocap", "zero velocity", "slerp", "retrieval"}
+    methods |= {f"{folder / name}.safetensors, raw" for name in ("ours", "other")}
+    assert {row["method"] for row in rows} == methods
+    assert {row["frames"] for row in rows} == {5, 15, 30, 45}
+    assert all(row["windows"] == 2 for row in rows)  # one of 65 frames in each of two clips
+    ours = {row["frames"]: row for row in rows if row["method"].startswith(str(folder / "ours"))}
+    assert all(row["ade_cm"] > 0.1 and row["frame_ms"] > 0 for row in ours.values())
+
+
+@pytest.mark.slow
+def test_finished_rows_and_auto_if_asked(folder, capsys):
+    rows = measure(folder, capsys, "--auto")
+    methods = {row["method"] for row in rows}
+    assert {"auto", f"{folder / 'ours.safetensors'}, finished"} <= methods
+
+
+def test_clips_that_are_no_longer_there_are_said(folder, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    words = ["--data", tmp_path / "empty", "--inbetweener", folder / "ours.safetensors"]
+    assert run("bench", "transitions", *words) == 2
+    assert "does not hold the clips kept from training" in capsys.readouterr().err

@@ -1,0 +1,72 @@
+"""Discs and boxes on the ground: how far points are from them, against sampled outlines."""
+
+import math
+
+import pytest
+import torch
+from helpers import generator
+
+from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.errors import RequestError
+
+SHAPES = {
+    "disc": Obstacle((0.4, -1.2), 0.7),
+    "box": Obstacle((-0.3, 0.8), size=(1.4, 0.6)),
+    "turned box": Obstacle((0.2, 0.1), size=(1.4, 0.6), turn_deg=35),
+}
+
+
+@pytest.mark.parametrize("obstacle", SHAPES.values(), ids=SHAPES)
+def test_distance_is_that_to_the_nearest_point_of_the_outline_and_negative_within(obstacle):
+    corners = obstacle.outline()
+    ends = corners.roll(-1, 0)
+    share = torch.linspace(0, 1, 400, dtype=torch.float64)[:, None, None]
+    edge = (corners + share * (ends - corners)).flatten(0, 1)
+    points = 4 * torch.rand(300, 2, generator=generator(1)).double() - 2
+    nearest = torch.cdist(points, edge).amin(1)
+    found = obstacle.distance(points)
+    torch.testing.assert_close(found.abs(), nearest, atol=0.004, rtol=0)
+    centre = torch.tensor([obstacle.place], dtype=torch.float64)
+    assert float(obstacle.distance(centre)) < 0
+    inside = found < 0
+    towards = obstacle.distance(points + 0.3 * (centre - points))
+    assert bool((towards[inside] < 0).all())  # all of them are convex
+
+
+def test_a_positive_turn_turns_z_toward_x():
+    box = Obstacle((0.0, 0.0), size=(0.2, 2.0), turn_deg=90)  # long along +Z before, along +X after
+    assert float(box.distance(torch.tensor([0.9, 0.0]))) < 0 < float(box.distance(torch.tensor([0.0, 0.9])))
+    slanted = Obstacle((0.0, 0.0), size=(0.2, 2.0), turn_deg=45)
+    assert float(slanted.distance(torch.tensor([0.6, 0.6]))) < 0 < float(slanted.distance(torch.tensor([-0.6, 0.6])))
+
+
+def test_clearance_is_that_of_the_nearest_and_infinite_without_any():
+    points = torch.tensor([[0.4, 0.0], [3.0, 3.0]])
+    both = tuple(SHAPES.values())
+    expected = torch.stack([one.distance(points) for one in both]).amin(0)
+    torch.testing.assert_close(measure_clearance(both, points), expected)
+    assert bool(measure_clearance((), points).isinf().all())
+
+
+def test_gradients_lead_away():
+    point = torch.tensor([0.5, -1.0], requires_grad=True)
+    SHAPES["disc"].distance(point).backward()
+    assert point.grad is not None
+    assert math.isclose(float(point.grad.norm()), 1.0, rel_tol=1e-5)
+
+
+@pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,3,4", "0,0,0", "0,0,-1", "0,0,nan"])
+def test_what_is_no_disc_is_refused(text):
+    with pytest.raises(RequestError):
+        Obstacle.parse(text)
+
+
+def test_a_disc_is_parsed():
+    assert Obstacle.parse("0.5,-2,0.3") == Obstacle((0.5, -2.0), 0.3)
+
+
+def test_an_obstacle_is_a_disc_or_a_box():
+    with pytest.raises(RequestError, match="one of them"):
+        Obstacle((0, 0))
+    with pytest.raises(RequestError, match="one of them"):
+        Obstacle((0, 0), 1.0, (1.0, 1.0))

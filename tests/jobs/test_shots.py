@@ -1,0 +1,312 @@
+"""Shots: parts on their own, and one short shot by the bundled models, measured where a viewer looks."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from helpers import walk
+
+import priors
+from controllers.common.character import Character
+from controllers.shots import shot as shot_module
+from controllers.shots.lead import Lead
+from controllers.shots.looking import measure_look_errors, turn_heads
+from controllers.shots.reaching import ReachTargets
+from controllers.shots.request import Look, Others, Reach, ShotRequest
+from controllers.shots.rest_pose import build_rest_pose
+from controllers.shots.shot import solve_shot
+from controllers.shots.timeline import Span, StandingEnds, lay_timeline, limit_timed_speeds, plan_speeds
+from controllers.shots.way import cut_curve, plan_way
+from mapctl import curves
+from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.errors import RequestError
+from mapctl.intent.path import SpeedProfile
+from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.metrics import worst_frame
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
+
+LINE = curves.line(length=3)
+STANDING = StandingEnds(start=True, end=True)
+
+
+# What is done when
+
+
+def test_a_character_stands_walks_and_stands_again():
+    speeds = TimedSpeed.parse(((0, 0), (1, 0), (2, 1.2), (5, 1.2), (6, 0), (7, 0), (8, 1.0))).at(270, 30)
+    spans = lay_timeline(speeds, slowest=0.5)
+    assert [span.what for span in spans] == ["stand", "walk", "stand", "walk"]
+    for span in spans:
+        part = speeds[span.start : span.stop]
+        assert bool((part < 0.05).all()) if span.what == "stand" else float(part.min()) > 0.6
+    assert all(one.stop <= other.start for one, other in pairwise(spans))
+    assert (spans[0].start, spans[-1].stop) == (0, 270)
+
+
+def test_who_never_stands_walks_throughout_and_who_never_walks_stands():
+    assert lay_timeline(torch.full((90,), 0.9), slowest=0.5) == [Span("walk", 0, 90)]
+    assert lay_timeline(torch.zeros(90), slowest=0.5) == [Span("stand", 0, 90)]
+
+
+def test_what_is_too_short_for_a_walk_is_a_step_between_two_standings():
+    speeds = torch.zeros(120)
+    speeds[50:60] = 0.8
+    assert [span.what for span in lay_timeline(speeds, slowest=0.5)] == ["stand", "stand"]
+
+
+@pytest.mark.parametrize("seconds", [None, 6.0])
+def test_speeds_rise_from_standing_and_end_at_the_curves_end(seconds):
+    speeds = plan_speeds(SpeedProfile.constant(1.2), 3.0, 30, STANDING, seconds=seconds, most=10_000)
+    assert float(speeds.sum()) / 30 == pytest.approx(3.0, abs=0.06)
+    assert float(speeds.diff().abs().max()) * 30 < 5  # no lurch
+    assert bool((speeds[:15] == 0).all())
+    assert bool((speeds[-29:] < 0.05).all())
+    assert float(speeds.max()) == pytest.approx(1.2, abs=0.05)
+    if seconds is not None:
+        assert len(speeds) == round(30 * seconds)
+
+
+def test_a_walk_that_has_no_time_for_its_curve_still_stops_in_time():
+    speeds = plan_speeds(SpeedProfile.constant(1.2), 30.0, 30, STANDING, seconds=4.0, most=10_000)
+    assert bool((speeds[-28:] < 0.05).all())
+    assert 1.0 < float(speeds.sum()) / 30 < 3.5
+
+
+def test_too_many_frames_are_refused():
+    with pytest.raises(RequestError, match="frames allowed"):
+        plan_speeds(SpeedProfile.constant(0.1), 1000.0, 30, STANDING, seconds=None, most=3000)
+
+
+def test_timed_speeds_that_do_not_stand_are_made_to():
+    speeds = limit_timed_speeds(torch.full((150,), 1.2, dtype=torch.float64), 30, STANDING)
+    assert bool((speeds[:15] == 0).all())
+    assert bool((speeds[-30:] == 0).all())
+    told = TimedSpeed.parse(((0, 0), (1, 1.2), (4, 0))).at(150, 30)
+    torch.testing.assert_close(limit_timed_speeds(told, 30, STANDING), told)
+
+
+# Where
+
+
+def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet():
+    seconds = 5.0
+    towards = torch.stack([torch.full((150,), 0.1), 6 - 1.2 * torch.arange(150) / 30], -1).double()
+    request = ShotRequest(curves.line(length=6), seconds=seconds, others=Others(towards[None], 0.6))
+    way = plan_way(request)
+    assert way.note is None
+    there = way.curve.point(way.arcs)
+    assert float((there - towards[: len(there)]).norm(dim=-1).min()) > 0.6
+    alone = plan_way(replace(request, others=None))
+    assert float((alone.curve.point(alone.arcs) - towards[: len(alone.arcs)]).norm(dim=-1).min()) < 0.2
+
+
+def test_a_wall_leaves_the_curve_and_a_note():
+    way = plan_way(ShotRequest(LINE, obstacles=(Obstacle((0.0, 1.5), size=(30.0, 0.2)),)))
+    assert way.note is not None
+    assert way.curve is LINE
+
+
+def test_a_piece_of_a_curve_begins_where_it_is_cut():
+    circle = curves.circle(radius=2)
+    piece = cut_curve(circle, 1.0, 3.5)
+    assert piece.length == pytest.approx(2.5, abs=1e-3)
+    torch.testing.assert_close(piece.point(1.0), circle.point(2.0), atol=1e-3, rtol=0)
+
+
+# Bad wishes
+
+
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"speed": TimedSpeed((0.0,), (1.0,))}, "need the shot's seconds"),
+        ({"obstacles": (Obstacle((0.1, 0.0), 0.5),)}, "on the start"),
+        ({"seconds": 2.0, "reaches": (Reach(1.9, {"leftHand": (0, 1, 1)}, 0.3),)}, "not within the shot's 2 s"),
+        (
+            {"reaches": (Reach(1.0, {"leftHand": (0.3, 1, 1)}), Reach(1.05, {"leftHand": (0.3, 1.4, 1)}))},
+            "two places 40 cm apart within two frames",
+        ),
+        ({"seconds": 2.0, "looks": (Look(2.5, (0, 1, 1)),)}, "not within the shot's 2 s"),
+    ],
+)
+def test_wishes_that_make_no_sense_are_refused(wishes, said):
+    with pytest.raises(RequestError, match=said):
+        ShotRequest(LINE, **wishes)
+
+
+@pytest.mark.parametrize("place", [(0.3, 2.6, 1.0), (2.6, 1.2, 1.2), (0.0, 1.2, 12.0)], ids=["high", "aside", "ahead"])
+def test_what_no_arm_reaches_is_refused_with_its_distance(place):
+    request = ShotRequest(LINE, seconds=2.0, reaches=(Reach(1.0, {"leftHand": place}),))
+    with pytest.raises(RequestError, match=r"leftHand at 1 s is to be \d"):
+        solve_shot(priors.load("locomotion"), priors.load_inbetweener(), request)
+
+
+def test_only_hands_and_feet_reach():
+    with pytest.raises(RequestError, match="head"):
+        Reach(1.0, {"head": (0, 1, 1)})
+
+
+# Going on from a clip
+
+
+def test_a_lead_ends_in_its_frame_at_the_densitys_rate():
+    clip = walk(200, fps=120)
+    lead = Lead.of(clip, 150)
+    assert lead.motion.fps == 30
+    torch.testing.assert_close(lead.motion.root_position[-1], clip.root_position[150])
+    torch.testing.assert_close(lead.motion.root_position[-2], clip.root_position[146])
+
+
+def test_a_curve_is_brought_to_a_lead_or_the_lead_to_the_curve():
+    lead = Lead.of(walk(90, turn_rate=0.5), 80)
+    brought = lead.bring_curve(curves.wave(amplitude=0.5, length=4))
+    torch.testing.assert_close(brought.start, lead.motion.root_position[-1, ::2])
+    assert abs(math.remainder(brought.start_heading - lead.direction, 2 * math.pi)) < 0.02
+    curve = curves.circle(radius=3)
+    moved = lead.bring_to(curve)
+    torch.testing.assert_close(moved.motion.root_position[-1, ::2], curve.start)
+    assert abs(math.remainder(moved.direction - curve.start_heading, 2 * math.pi)) < 1e-6
+    steps = [each.motion.root_position.diff(dim=0).norm(dim=-1) for each in (lead, moved)]
+    torch.testing.assert_close(*steps)
+
+
+@pytest.mark.parametrize("frame", [0, 1, 90, 200])
+def test_a_clip_has_frames_before_the_one_it_is_gone_on_from(frame):
+    with pytest.raises(RequestError, match="2:90"):
+        Lead.of(walk(90), frame)
+
+
+def test_a_walk_begins_in_the_leads_last_pose():
+    prior, lead = priors.load("locomotion"), Lead.of(walk(90), 70)
+    start = lead.start(prior, Character())
+    torch.testing.assert_close(
+        start.committed.joints_world[0].double(), lead.last_pose.joint_positions()[0], atol=1e-3, rtol=0
+    )
+
+
+# Poses
+
+
+def test_the_rest_pose_stands_on_both_feet_and_faces_forward():
+    pose = build_rest_pose(priors.load("locomotion"), CANONICAL, TOE_REST_HEIGHT)
+    places = pose.joint_positions()[0]
+    toes = places[list(CANONICAL.indices(TOES))]
+    torch.testing.assert_close(toes[:, 1], torch.full((2,), TOE_REST_HEIGHT).double(), atol=1e-3, rtol=0)
+    assert 0.12 < float((toes[0] - toes[1]).norm()) < 0.4
+    assert float(places[CANONICAL.index("head"), 1]) > 1.3
+    hands = places[list(CANONICAL.indices(("leftHand", "rightHand")))]
+    assert bool((hands[:, 1] < 1.0).all())
+    assert float(hands[0, 0]) == pytest.approx(-float(hands[1, 0]), abs=1e-6)
+
+
+def test_a_head_looks_where_it_is_told_and_back_without_a_jump():
+    motion = walk(120)
+    look = Look(2.0, (3.0, 1.4, 4.0), 0.5)
+    turned = turn_heads(motion, (look,))
+    assert float(measure_look_errors(turned, look).max()) < 5 < float(measure_look_errors(motion, look).min())
+    head = CANONICAL.index("head")
+    same = torch.tensor([*range(44), *range(92, 120)])
+    torch.testing.assert_close(turned.joint_rotations()[same, head], motion.joint_rotations()[same, head])
+    one, other = turned.joint_rotations()[:-1, head], turned.joint_rotations()[1:, head]
+    assert float(torch.rad2deg(2 * (one * other).sum(-1).abs().clamp(max=1).acos()).max()) < 12  # a frame
+
+
+def test_a_head_does_not_turn_farther_than_necks_do():
+    motion = walk(120)
+    behind = Look(2.0, (0.0, 1.4, -20.0))
+    turned = turn_heads(motion, (behind,))
+    chest, head = (turned.joint_rotations()[60, CANONICAL.index(name)] for name in ("chest", "head"))
+    assert float(torch.rad2deg(2 * (chest * head).sum().abs().clamp(max=1).acos())) < 110
+    assert float(measure_look_errors(turned, behind)) > 20
+
+
+def test_targets_beyond_reach_are_brought_within_it():
+    motion = walk(60)
+    shoulder = motion.joint_positions()[30, CANONICAL.index("leftUpperArm")]
+    far = ReachTargets.of((Reach(1.0, {"leftHand": tuple((shoulder + torch.tensor([2.0, 0, 0])).tolist())}, 0.2),), 60)
+    near = far.within_reach(motion).targets
+    hand = CANONICAL.index("leftHand")
+    assert int(near.wanted[:, hand].sum()) == 1
+    at = int(near.wanted[:, hand].nonzero())
+    shoulder = motion.joint_positions()[at, CANONICAL.index("leftUpperArm")]
+    assert 0.3 < float((near.places[at, hand] - shoulder).norm()) < 0.75
+
+
+# All at once
+
+
+@pytest.fixture(scope="module")
+def shot():
+    prior = priors.load("locomotion")
+    prior.warm_up()
+    request = ShotRequest(
+        curves.line(length=3.6),
+        stand_at_start=True,
+        stand_at_end=True,
+        obstacles=(Obstacle((0.35, 2.4), 0.3),),
+        reaches=(Reach(2.3, {"rightHand": (-0.45, 1.2, 1.5)}),),
+        looks=(Look(3.5, (2.0, 1.5, 4.0)),),
+    )
+    return request, solve_shot(prior, priors.load_inbetweener(), request, generator=torch.Generator().manual_seed(1))
+
+
+def test_all_wishes_of_a_shot_hold(shot):
+    _, done = shot
+    assert done.status.ok, done.status.text
+    assert {wish.name.split(" at")[0] for wish in done.wishes} >= {"path", "rightHand", "look", "obstacles", "stand"}
+    assert all(wish.holds and wish.residual == 0 for wish in done.wishes)
+
+
+def test_the_motion_of_a_shot_does_what_its_wishes_say(shot):
+    request, done = shot
+    places = done.motion.joint_positions()
+    miss = places[69, CANONICAL.index("rightHand")] - torch.tensor([-0.45, 1.2, 1.5]).double()
+    assert float(miss.norm()) < 0.01
+    assert float(measure_clearance(request.obstacles, places[..., ::2]).amin()) > 0
+    toes = places[:, list(CANONICAL.indices(TOES))]
+    for part in (slice(0, 12), slice(-24, None)):
+        assert float(toes[part].diff(dim=0).norm(dim=-1).mean()) * 30 < 0.02
+        assert float((toes[part][:, 0] - toes[part][:, 1]).norm(dim=-1).max()) < 0.45
+    torch.testing.assert_close(places[-1, 0, ::2], torch.tensor([0.0, 3.6]).double(), atol=0.08, rtol=0)
+
+
+def test_nothing_jumps_in_a_shot(shot):
+    _, done = shot
+    ends = done.motion.joint_positions()[:, list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))]
+    peaks = worst_frame.measure_peaks(ends, done.motion.root_position, 30.0)
+    assert peaks.step * 30 < 5.5
+    assert peaks.acceleration < 110
+
+
+def test_a_shot_is_the_same_again(shot):
+    request, done = shot
+    prior = priors.load("locomotion")
+    again = solve_shot(prior, priors.load_inbetweener(), request, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(again.motion.local_quat_xyzw, done.motion.local_quat_xyzw)
+
+
+def test_a_shot_that_is_interrupted_is_not_half_a_shot(monkeypatch):
+    """What the horizon has solved by then is kept for a walk; the rest of a shot would stand still."""
+    prior = priors.load("locomotion")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    solve = shot_module.walk_arcs
+    monkeypatch.setattr(shot_module, "walk_arcs", lambda *args, **words: solve(*args, **words, progress=stop))
+    with pytest.raises(KeyboardInterrupt):
+        solve_shot(prior, priors.load_inbetweener(), ShotRequest(LINE, seconds=3.0))
+
+
+def test_a_reach_that_is_far_off_is_told_with_its_distance():
+    prior = priors.load("locomotion")
+    request = ShotRequest(curves.line(length=2.5), seconds=2.0, reaches=(Reach(1.0, {"leftHand": (1.5, 1.2, 1.2)}),))
+    done = solve_shot(prior, priors.load_inbetweener(), request)
+    assert not done.status.ok
+    assert "leftHand at 1 s" in done.status.text
+    missed = next(wish for wish in done.wishes if wish.name.startswith("leftHand"))
+    assert missed.residual > 20
+    assert missed.remedy.endswith("cm nearer")
+    assert missed.remedy in done.status.text
