@@ -12,11 +12,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
+from mapctl.kinematics import inverse
+from mapctl.numerics import easing
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle, last_observed, next_observed
 from mapctl.skeleton import CANONICAL, LIMBS, mirror_name
 
 EFFECTORS = tuple(limb.end for limb in LIMBS.values())
 """Canonical joints that may have a target: hands and feet."""
+_REACH_FRAMES = 15  # frames before and after a target over which a limb goes there and back
+_NEGLIGIBLE = 1e-5  # metres
 _PARTNERS = CANONICAL.mirror_partners()
 _EFFECTOR_PARTNERS = [EFFECTORS.index(CANONICAL.index(mirror_name(CANONICAL.names[joint]))) for joint in EFFECTORS]
 
@@ -147,6 +151,7 @@ def interpolate_partial_motion(
     """Interpolate a motion where it is not known: rotations along the shortest arc from the last known frame to the
     next, positions and heading linearly; beyond the first and the last they are held. Unknown values may be anything
     finite, but a rough path is followed. What is known in no frame is the mean pose's, over the origin, facing +Z.
+    Unknown limbs then bend to their targets, from what they do half a second earlier and later.
     """
     known, root = motion.known, motion.root_position
     shown = known.ground | known.path
@@ -155,12 +160,51 @@ def interpolate_partial_motion(
     heading = _where_ever(known.heading, fill_missing_angle(motion.heading, known.heading)[..., None], 0.0)
     quats = _interpolate_quats(motion.quats, known.rotations)
     ever = known.rotations.any(dim=1, keepdim=True)[..., None]
-    return replace(
-        motion,
-        root_position=torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
-        heading=heading[..., 0],
-        quats=torch.where(ever, quats, mean_quats.to(quats)),
+    return _reach_targets(
+        replace(
+            motion,
+            root_position=torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
+            heading=heading[..., 0],
+            quats=torch.where(ever, quats, mean_quats.to(quats)),
+        )
     )
+
+
+def _reach_targets(motion: PartialMotion) -> PartialMotion:
+    """Bend limbs that are not known to their targets."""
+    known = motion.known
+    rows = known.effectors.flatten(1).any(dim=1)
+    if not bool(rows.any()):
+        return motion
+    places, matrices = (each[rows] for each in motion.world_poses())
+    world, quats, offsets = rotations.from_matrix(matrices), motion.quats[rows].clone(), motion.offsets[rows, None]
+    for number, limb in enumerate(LIMBS.values()):
+        free = ~known.rotations[rows][..., [limb.upper, limb.lower]].any(dim=-1)
+        wanted = known.effectors[rows][..., number] & free
+        error = torch.where(wanted[..., None], motion.targets[rows][..., number, :] - places[..., limb.end, :], 0.0)
+        spread = _fade_between(error, wanted | ~free)
+        moved = free & (spread.norm(dim=-1) > _NEGLIGIBLE)
+        aim = places[..., limb.end, :] + spread - places[..., limb.upper, :]
+        turn, bent = inverse.reach(limb, world[..., limb.upper, :], quats[..., limb.lower, :], aim, offsets)
+        above = world[..., CANONICAL.parents[limb.upper], :]
+        bends = torch.stack([rotations.multiply(rotations.inverse(above), turn), bent], dim=-2)
+        joints = [limb.upper, limb.lower]
+        quats[..., joints, :] = torch.where(moved[..., None, None], bends, quats[..., joints, :])
+    return replace(motion, quats=motion.quats.index_put((rows,), quats))
+
+
+def _fade_between(
+    values: Float[Tensor, "batch frames 3"], firm: Bool[Tensor, "batch frames"]
+) -> Float[Tensor, "batch frames 3"]:
+    """Ease from each firm frame's value to the next one's, by way of 0 if that is far."""
+    frame = torch.arange(firm.shape[1])
+    before, after = last_observed(firm), next_observed(firm)
+    gap = torch.where(after > before, after - before, _REACH_FRAMES).clamp(1, _REACH_FRAMES)
+    result = torch.zeros_like(values)
+    for nearest, counts in ((before, True), (after, after != before)):
+        share = counts * (1 - easing.smootherstep((frame - nearest).abs() / gap))
+        result += share[..., None] * torch.take_along_dim(values, nearest[..., None], dim=1)
+    return result
 
 
 def mirror_quats(quats: Float[Tensor, "*batch joints 4"]) -> Float[Tensor, "*batch joints 4"]:

@@ -85,27 +85,69 @@ def _solve_two_bones(
     target.
     """
     upper, lower = offsets[limb.lower], offsets[limb.end]
-    long, short = upper.norm(), lower.norm()
     direction = positions[:, limb.end] - at
-    distance = direction.norm(dim=-1, keepdim=True).clamp_min(_TINY)
-    axis = direction / distance
-    reach = distance.clamp((long - short).abs() + _STRAIGHT_MARGIN, long + short - _STRAIGHT_MARGIN)
-    knee = rotations.rotate(turn, upper.expand(len(turn), 3))
-    foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(len(turn), 3))
-    toward = rotations.between_vectors(foot, direction)
-    usual = rotations.rotate(
-        rotations.multiply(toward, turn), offsets.new_tensor(limb.bend_direction).expand(len(turn), 3)
-    )
+    usual, toward = _find_usual_middle(limb, turn, bent, direction, upper, lower)
     proposed = torch.stack(
         [positions[:, limb.lower] - positions[:, limb.upper], positions[:, limb.end] - positions[:, limb.lower]], dim=1
     )
-    whole = (proposed.norm(dim=-1) / torch.stack([long, short])).amin(dim=1, keepdim=True).clamp(max=1)
+    whole = (proposed.norm(dim=-1) / torch.stack([upper.norm(), lower.norm()])).amin(dim=1, keepdim=True).clamp(max=1)
     trust = whole**_TRUST_POWER
-    side = trust * (positions[:, limb.lower] - at) + (1 - trust) * rotations.rotate(toward, knee) + _BEND_OFFSET * usual
+    side = trust * (positions[:, limb.lower] - at) + (1 - trust) * toward + _BEND_OFFSET * usual
+    return torch.stack([at + each for each in _close_triangle(direction, side, upper, lower)], dim=1)
+
+
+def reach(
+    limb: Limb,
+    turn: Float[Tensor, "*batch 4"],
+    bent: Float[Tensor, "*batch 4"],
+    direction: Float[Tensor, "*batch 3"],
+    offsets: Float[Tensor, "*batch joints 3"],
+) -> tuple[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 4"]]:
+    """Bend limbs so that their effectors reach a `direction` from their first joints, metres, or point there.
+
+    `turn` is the first joint's world rotation (xyzw) and `bent` the second's local one; both come back, rotated by as
+    little as that takes.
+    """
+    upper, lower = offsets[..., limb.lower, :], offsets[..., limb.end, :]
+    usual, toward = _find_usual_middle(limb, turn, bent, direction, upper, lower)
+    middle, end = _close_triangle(direction, toward + _BEND_OFFSET * usual, upper, lower)
+    turned = rotations.multiply(rotations.between_vectors(rotations.rotate(turn, upper), middle), turn)
+    world = rotations.multiply(turned, bent)
+    world = rotations.multiply(rotations.between_vectors(rotations.rotate(world, lower), end - middle), world)
+    return turned, rotations.multiply(rotations.inverse(turned), world)
+
+
+def _find_usual_middle(
+    limb: Limb,
+    turn: Float[Tensor, "*batch 4"],
+    bent: Float[Tensor, "*batch 4"],
+    direction: Float[Tensor, "*batch 3"],
+    upper: Float[Tensor, "*#batch 3"],
+    lower: Float[Tensor, "*#batch 3"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+    """Return where elbow or knee go when the whole limb rotates toward a direction: where a straight one would bend,
+    and the bone's vector."""
+    knee = rotations.rotate(turn, upper.expand(direction.shape))
+    foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(direction.shape))
+    toward = rotations.between_vectors(foot, direction)
+    bend = upper.new_tensor(limb.bend_direction).expand(direction.shape)
+    return rotations.rotate(rotations.multiply(toward, turn), bend), rotations.rotate(toward, knee)
+
+
+def _close_triangle(
+    direction: Float[Tensor, "*batch 3"],
+    side: Float[Tensor, "*batch 3"],
+    upper: Float[Tensor, "*#batch 3"],
+    lower: Float[Tensor, "*#batch 3"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+    """Return elbow or knee, on one side, and the effector along a direction as far as two bones reach."""
+    long, short = (bone.norm(dim=-1, keepdim=True) for bone in (upper, lower))
+    distance = direction.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+    axis = direction / distance
+    distance = distance.clamp(min=(long - short).abs() + _STRAIGHT_MARGIN, max=long + short - _STRAIGHT_MARGIN)
     side = torch.nn.functional.normalize(side - (side * axis).sum(-1, keepdim=True) * axis, dim=-1)
-    along = (long.square() - short.square() + reach.square()) / (2 * reach)
-    between = at + along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side
-    return torch.stack([between, at + reach * axis], dim=1)
+    along = (long.square() - short.square() + distance.square()) / (2 * distance)
+    return along * axis + (long.square() - along.square()).clamp_min(0).sqrt() * side, distance * axis
 
 
 def _align_bones(
