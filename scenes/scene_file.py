@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path, PurePath
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -58,8 +58,10 @@ class Actor:
     start: Annotated[str, Field(min_length=1)] = "walk"
     """How it begins: `walk`, `stand`, or `CLIP:FRAME`, going on from that frame of a motion file, on its rig and at its
     rate, in its place unless `offset` or `turn_deg` are given."""
-    end: Literal["walk", "stand"] = "walk"
-    """How it ends."""
+    end: Annotated[str, Field(min_length=1)] = "walk"
+    """How it ends: `walk`, `stand`, or `CLIP:FRAME`, in that frame of a motion file."""
+    loop: bool = False
+    """Whether its last frame leads into its first: once around a closed curve."""
     keys: tuple[ShotKey, ...] = ()
     """What it does on the way, one [[actors.keys]] table each."""
     offset: tuple[Coordinate, Coordinate] | None = None
@@ -70,10 +72,14 @@ class Actor:
     """Start time, seconds; until then the actor holds its first pose."""
 
     @property
-    def clip_frame(self) -> tuple[str, int] | None:
+    def start_clip(self) -> tuple[str, int] | None:
         """The clip that it goes on from, and the frame; None where it begins by itself."""
-        clip, colon, frame = self.start.rpartition(":")
-        return (clip, int(frame)) if colon and clip and frame.isdecimal() else None
+        return _parse_clip_frame(self.start)
+
+    @property
+    def end_clip(self) -> tuple[str, int] | None:
+        """The clip that it ends in, and the frame; None where it ends by itself."""
+        return _parse_clip_frame(self.end)
 
     @property
     def fault(self) -> str | None:
@@ -86,8 +92,9 @@ class Actor:
             return f"speed: {error}"
         if self.seconds is None and (self.speed_by_time is not None or self.curve is None):
             return "seconds: this key is needed with speed_by_time, and without a curve"
-        if self.start not in ("walk", "stand") and not self.clip_frame:
-            return f"start: expected walk, stand or CLIP:FRAME, got {self.start!r}"
+        for name, value in (("start", self.start), ("end", self.end)):
+            if value not in ("walk", "stand") and _parse_clip_frame(value) is None:
+                return f"{name}: expected walk, stand or CLIP:FRAME, got {value!r}"
         for number, key in enumerate(self.keys):
             if key.fault is not None:
                 return f"keys[{number}].{key.fault}"
@@ -98,7 +105,12 @@ class Actor:
         """Whether more is wished than to walk along a curve."""
         ends = self.start != "walk" or self.end != "walk"
         told = self.curve is None or self.speed_by_time is not None or self.gait or self.style
-        return bool(ends or told or self.keys)
+        return bool(ends or told or self.keys or self.loop)
+
+
+def _parse_clip_frame(text: str) -> tuple[str, int] | None:
+    clip, colon, frame = text.rpartition(":")
+    return (clip, int(frame)) if colon and clip and frame.isdecimal() else None
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """A clip that a shot goes on from: where it ends, the shot begins, in the same pose and the same stride."""
 
-import math
 from dataclasses import dataclass, replace
 
 from controllers.common.character import Character
@@ -9,14 +8,16 @@ from mapctl import kinematics
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
-from mapctl.kinematics.placing import move_to, rotate_about_vertical
+from mapctl.kinematics.placing import bring_curve_points, measure_travel, move_to, rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.problem.receding_horizon import replay
 from mapctl.protocols import Density
 
 _MEMORY_FRAMES = 120  # at PRIOR_FPS, that warm up the density's state
-_TRAVEL_FRAMES = 15  # over which the direction of travel is measured
-_STANDING_SPEED = 0.3  # m/s below which the hips' heading is the direction
+TRAVEL_FRAMES = 15
+"""Frames at PRIOR_FPS over which a clip's direction of travel is measured."""
+STANDING_SPEED = 0.3
+"""m/s below which a clip stands, and its hips' heading is its direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,33 +43,28 @@ class Lead:
         return self.motion.slice(self.motion.num_frames - 1, self.motion.num_frames)
 
     @property
-    def speed(self) -> float:
-        """Speed of the hips over the ground at its end, m/s."""
-        ground = self.motion.root_position[-_TRAVEL_FRAMES:, ::2]
-        return float((ground[-1] - ground[0]).norm()) * PRIOR_FPS / max(1, len(ground) - 1)
-
-    @property
     def stands(self) -> bool:
         """Whether it ends standing."""
-        return self.speed < _STANDING_SPEED
+        return self._travel[0] < STANDING_SPEED
 
     @property
     def direction(self) -> float:
         """Direction of travel at its end, radians; the hips' heading of somebody who stands."""
-        ground = self.motion.root_position[-_TRAVEL_FRAMES:, ::2]
         if self.stands:
             return float(kinematics.heading(self.motion.local_quat_xyzw[-1:, 0]))
-        x, z = (ground[-1] - ground[0]).tolist()
-        return math.atan2(x, z)
+        return self._travel[1]
+
+    @property
+    def _travel(self) -> tuple[float, float]:
+        frames = self.motion.num_frames
+        return measure_travel(self.motion.slice(max(0, frames - TRAVEL_FRAMES), frames))
 
     def bring_curve(self, curve: Curve) -> Curve:
         """Return a curve moved so that it begins at the lead's end and leads on."""
-        ground = slice(0, None, curve.dims - 1)
         angle = self.direction - curve.start_heading
-        turn = curve.points.new_tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        points = curve.points.clone()
-        points[:, ground] = (points[:, ground] - points[0, ground]) @ turn + self.motion.root_position[-1, ::2]
-        return replace(curve, points=points)
+        return replace(
+            curve, points=bring_curve_points(curve.points, curve.points[0], angle, self.motion.root_position[-1, ::2])
+        )
 
     def bring_to(self, curve: Curve) -> "Lead":
         """Return the lead moved so that it ends where a curve begins, on its way along it."""

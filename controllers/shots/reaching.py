@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.shots.request import Reach
@@ -27,6 +27,7 @@ _BENT_SHARE = 0.85  # of its length, from which on the way to a place is shorten
 _LEAN = 0.05  # metres that leaning adds to what a limb reaches
 _TIPTOE, _CROUCH = 0.15, 1.0  # metres by which a body rises or goes down for a reach
 _STEP_ASIDE = 1.2  # metres between the way and a body that leans and leaves it for a reach
+_TOLERANCE_SHARE = 0.9  # of a tolerance that is made use of
 _TRUNK = list(CANONICAL.indices(("spine", "chest", "neck", "head")))
 
 
@@ -36,19 +37,30 @@ class ReachTargets:
 
     targets: EffectorTargets
     """World positions of hands and feet."""
+    tolerances: Float[Tensor, "frames joints"]
+    """How far from there they may be, metres."""
 
     @staticmethod
     def of(reaches: Sequence[Reach], frames: int) -> "ReachTargets":
         """Collect the targets of all reaches."""
         places = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
         wanted = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
+        tolerances = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.float64)
         for reach in reaches:
-            first = round(reach.seconds * PRIOR_FPS)
+            first = min(round(reach.seconds * PRIOR_FPS), frames - 1)
             held = slice(first, first + round(reach.hold_seconds * PRIOR_FPS) + 1)
             for name, place in reach.places.items():
                 places[held, CANONICAL.index(name)] = places.new_tensor(place)
                 wanted[held, CANONICAL.index(name)] = True
-        return ReachTargets(EffectorTargets(places, wanted))
+                tolerances[held, CANONICAL.index(name)] = reach.tolerance_of(name)
+        return ReachTargets(EffectorTargets(places, wanted), tolerances)
+
+    def relaxed(self, motion: Motion) -> "ReachTargets":
+        """Return targets as much nearer to where limbs are anyway as their tolerances allow."""
+        toward = motion.joint_positions() - self.targets.places
+        far = toward.norm(dim=-1).clamp_min(1e-6)
+        share = (_TOLERANCE_SHARE * self.tolerances / far).clamp(max=1.0)
+        return self._at(self.targets.places + share[..., None] * toward)
 
     def terms(self, skeleton: Skeleton, first: int, frames: int) -> list[WithinReach]:
         """Build the terms that lead a walk near enough, for frames of the shot; lengths are of the skeleton's size."""
@@ -82,7 +94,7 @@ class ReachTargets:
                 wanted[first:last, limb.end] = reached
             near = positions[:, limb.upper] + away * (most / far.clamp_min(1e-6)).clamp(max=1.0)[:, None]
             places[:, limb.end] = near
-        return ReachTargets(EffectorTargets(places, wanted))
+        return replace(self, targets=EffectorTargets(places, wanted))
 
     def led_there(self, motion: Motion) -> "ReachTargets":
         """Return targets in all frames around a reach: from where limbs are, smoothly to the place and back.
@@ -105,18 +117,42 @@ class ReachTargets:
             near = _widen(reached, _AROUND_FRAMES)
             places[:, limb.end] = torch.where(reached[:, None], places[:, limb.end], shoulder + way)
             wanted[:, limb.end] = near
-        return ReachTargets(EffectorTargets(places, wanted))
+        return replace(self, targets=EffectorTargets(places, wanted))
 
-    def free_limbs(self, joints: int) -> MissingMask:
-        """Return what the in-betweener makes anew: trunk and limb around every reach."""
+    def _at(self, places: Float[Tensor, "frames joints 3"]) -> "ReachTargets":
+        return replace(self, targets=EffectorTargets(places, self.targets.wanted))
+
+    def free_limbs(self, joints: int, posed: Bool[Tensor, " frames"]) -> MissingMask:
+        """Return what the in-betweener makes anew: trunk and limb around every reach, but in `posed` frames."""
         frames = len(self.targets.wanted)
         free = torch.zeros(frames, joints, dtype=torch.bool)
         for name, limb in LIMBS.items():
             near = _widen(self.targets.wanted[:, limb.end], _AROUND_FRAMES)
             own = [CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end]
             freed = own + _TRUNK if name.endswith("Hand") else own[1:]
-            free[:, freed] |= near[:, None]
+            free[:, freed] |= (near & ~posed)[:, None]
         return MissingMask(free, torch.zeros(frames, dtype=torch.bool))
+
+
+def settle_reaches(reaches: Sequence[Reach], motion: Motion) -> tuple[Reach, ...]:
+    """Return reaches at the times, within the frames that each allows, at which their limbs are nearest to there."""
+    positions, found = motion.joint_positions(), []
+    for reach in reaches:
+        if not reach.within_frames:
+            found.append(reach)
+            continue
+        hold, at = round(reach.hold_seconds * PRIOR_FPS), round(reach.seconds * PRIOR_FPS)
+        first = max(0, at - reach.within_frames)
+        last = min(motion.num_frames - 1 - hold, at + reach.within_frames)
+        away = torch.stack(
+            [
+                (positions[:, CANONICAL.index(name)] - positions.new_tensor(place)).norm(dim=-1)
+                for name, place in reach.places.items()
+            ]
+        ).sum(dim=0)
+        best = first + int(away[first : max(first, last) + 1].argmin())
+        found.append(replace(reach, seconds=best / PRIOR_FPS))
+    return tuple(found)
 
 
 def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:

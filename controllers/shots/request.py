@@ -8,6 +8,7 @@ from itertools import combinations
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.shots.arrival import Arrival
 from controllers.shots.lead import Lead
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
@@ -16,6 +17,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.intent.keyframes import WorldPosition
 from mapctl.intent.path import SpeedProfile
 from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.motion import Motion
 from mapctl.skeleton import LIMBS
 
 _SAME_PLACE = 0.05  # metres
@@ -31,8 +33,14 @@ class Reach:
     """Canonical hands and feet and where they are to be, world, metres."""
     hold_seconds: float = 0.0
     """For how long they stay there."""
-    tolerance: float = 0.0
-    """How far from there they may be, metres; 0 is exact."""
+    tolerance: float | Mapping[str, float] = 0.0
+    """How far from there they may be, metres, of all or by limb; 0 is exact."""
+    within_frames: int = 0
+    """How many frames of PRIOR_FPS earlier or later it may be."""
+
+    def tolerance_of(self, name: str) -> float:
+        """Return how far from its place a hand or a foot may be, metres."""
+        return self.tolerance.get(name, 0.0) if isinstance(self.tolerance, Mapping) else self.tolerance
 
     def __post_init__(self):
         unknown = [name for name in self.places if name not in LIMBS]
@@ -50,6 +58,56 @@ class Look:
     """What it looks at, world, metres."""
     hold_seconds: float = 0.0
     """For how long."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseKey:
+    """A pose, or where the hips are or face, at a time or held; what is not told is found."""
+
+    seconds: float
+    """When, seconds since the first frame."""
+    pose: Motion | None = None
+    """One frame on canonical joints with the character's bones; None where only the hips are told."""
+    place: tuple[float, float] | None = None
+    """Hips over the ground, x and z, metres; on the way if not given."""
+    height: float | None = None
+    """Height of the hips, metres; the pose's if not given."""
+    facing_deg: float | None = None
+    """Heading of the hips, degrees from +Z toward +X; that of a pose is along the way if not given."""
+    joints: tuple[str, ...] = ()
+    """Canonical hands and feet whose positions in the pose are all that counts."""
+    root_only: bool = False
+    """Whether only position and rotation of the pose's hips count."""
+    hold_seconds: float = 0.0
+    """For how long."""
+    tolerance: float | Mapping[str, float] = 0.0
+    """How far any joint may be from there, metres, of all or, where only `joints` count, by joint; degrees of a key
+    that tells no more than a facing; 0 is exact."""
+    within_frames: int = 0
+    """How many frames of PRIOR_FPS earlier or later it may be."""
+
+    def __post_init__(self):
+        if self.pose is None and self.place is None and self.height is None and self.facing_deg is None:
+            raise RequestError(f"the key at {self.seconds:g} s tells nothing")
+        if isinstance(self.tolerance, Mapping) and not self.joints:
+            raise RequestError(
+                f"the key at {self.seconds:g} s tells more than hands and feet: its tolerance is one number"
+            )
+
+    @property
+    def most(self) -> float:
+        """How far anything may be from there: `tolerance`, or the largest of them."""
+        return max(self.tolerance.values(), default=0.0) if isinstance(self.tolerance, Mapping) else self.tolerance
+
+    @property
+    def tells_facing(self) -> bool:
+        """Whether it tells the hips' rotation."""
+        return self.pose is not None or self.facing_deg is not None
+
+    @property
+    def tells_facing_alone(self) -> bool:
+        """Whether it tells a facing and nothing else."""
+        return self.pose is None and self.place is None and self.height is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +136,16 @@ class ShotRequest:
     """Whether it begins standing at ease; if not it begins in its stride."""
     stand_at_end: bool = False
     """Whether it ends standing at ease."""
+    arrival: Arrival | None = None
+    """A clip to end in, which begins where the curve ends; None ends by itself."""
+    loop: bool = False
+    """Whether the last frame leads into the first: once around a closed curve."""
     reaches: tuple[Reach, ...] = ()
     """Places for hands and feet."""
     looks: tuple[Look, ...] = ()
     """Places to look at."""
+    poses: tuple[PoseKey, ...] = ()
+    """Poses, places and headings of the hips."""
     obstacles: tuple[Obstacle, ...] = ()
     """Obstacles to walk around."""
     others: Others | None = None
@@ -96,23 +160,57 @@ class ShotRequest:
         """Whether it begins standing: at ease, or as the clip does that it goes on from."""
         return self.stand_at_start or (self.lead is not None and self.lead.stands)
 
+    @property
+    def ends_standing(self) -> bool:
+        """Whether it ends standing: at ease, or as the clip does that it ends in."""
+        return self.stand_at_end or (self.arrival is not None and self.arrival.stands)
+
+    @property
+    def _named_keys(self) -> list[tuple[str, Reach | Look | PoseKey]]:
+        kinds = {"reach": self.reaches, "look": self.looks, "pose": self.poses}
+        return [(what, key) for what, keys in kinds.items() for key in keys]
+
     def __post_init__(self):
         if self.seconds is None and isinstance(self.speed, TimedSpeed):
             raise RequestError("speeds by time need the shot's seconds")
         if self.lead is not None and self.stand_at_start:
             raise RequestError("a shot goes on from a clip or begins standing, not both")
-        for key in (*self.reaches, *self.looks):
+        if self.arrival is not None and self.stand_at_end:
+            raise RequestError("a shot ends in a clip or standing, not both")
+        self._check_loop()
+        for what, key in self._named_keys:
             if self.seconds is not None and not 0 <= key.seconds <= self.seconds - key.hold_seconds:
-                what = "reach" if isinstance(key, Reach) else "look"
                 raise RequestError(
                     f"a {what} from {key.seconds:g} s to {key.seconds + key.hold_seconds:g} s is not within "
                     f"the shot's {self.seconds:g} s"
                 )
         for one, other in combinations(self.reaches, 2):
             _check_contradiction(one, other)
+        for one, other in combinations(self.poses, 2):
+            _check_poses_apart(one, other)
         inside = [obstacle for obstacle in self.obstacles if float(obstacle.distance(self._start)) < 0]
         if inside:
             raise RequestError(f"the obstacle at {inside[0].place[0]:g}, {inside[0].place[1]:g} stands on the start")
+
+    def _check_loop(self) -> None:
+        if not self.loop:
+            return
+        if not self.curve.closed:
+            raise RequestError("a loop needs a closed curve, and this one is open")
+        ends = self.begins_standing or self.ends_standing or self.lead is not None or self.arrival is not None
+        if ends or self.seconds is not None or isinstance(self.speed, TimedSpeed):
+            raise RequestError(
+                "a loop is walked once around, in its stride: without start, end, seconds, speeds by time"
+            )
+
+
+def _check_poses_apart(one: PoseKey, other: PoseKey) -> None:
+    """Raise RequestError for two poses within two frames."""
+    first, second = sorted((one, other), key=lambda key: key.seconds)
+    if second.seconds - first.seconds - first.hold_seconds <= 2 / PRIOR_FPS:
+        raise RequestError(
+            f"two poses are to be held within two frames, from {first.seconds:g} s on and at {second.seconds:g} s"
+        )
 
 
 def _check_contradiction(one: Reach, other: Reach) -> None:

@@ -17,8 +17,11 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.pipeline import fill
+from controllers.shots.arrival import arrive
 from controllers.shots.looking import turn_heads
-from controllers.shots.reaching import ReachTargets, check_reaches
+from controllers.shots.loop import OVERLAP, close_loop
+from controllers.shots.posing import as_reaches, meet_poses, pose_frames
+from controllers.shots.reaching import ReachTargets, check_reaches, settle_reaches
 from controllers.shots.request import ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.timeline import Span, lay_timeline
@@ -99,9 +102,13 @@ def solve_shot(
     character = Character(skeleton, settings.follow.footing.rest_height)
     way = plan_way(request)
     frames = len(way.speeds)
-    reach = ReachTargets.of(request.reaches, frames)
-    spans = lay_timeline(way.speeds, slowest=character.data_limits(prior.limits).slowest)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
+    told = as_reaches(request.poses, way, rest)
+    poses = tuple(key for key in request.poses if not key.joints)
+    request = replace(request, reaches=(*request.reaches, *told), poses=poses)
+    reach = ReachTargets.of(request.reaches, frames)
+    walked_way = way.walked_on(OVERLAP) if request.loop else way
+    spans = lay_timeline(walked_way.speeds, slowest=character.data_limits(prior.limits).slowest)
     check_reaches(request.reaches, way, rest)
     pieces, walked = [], []
     for span in spans:
@@ -113,20 +120,28 @@ def solve_shot(
             pieces.append(_Piece(span, _spread_over(standing, 0, frames)))
             continue
         motion, ledger, windows = _walk(
-            prior, way, span, request, reach, character=character, settings=settings, generator=generator
+            prior, walked_way, span, request, reach, character=character, settings=settings, generator=generator
         )
-        pieces.append(_Piece(span, _spread_over(motion, span.start, frames)))
+        pieces.append(_Piece(span, _spread_over(motion, span.start, len(walked_way.speeds))))
         walked.append((ledger, windows))
         if progress is not None:
-            progress(span.stop, frames)
+            progress(span.stop, len(walked_way.speeds))
     motion, missing = _join_pieces(pieces, inbetweener, settings)
     if bool(missing.any()):
         motion = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
-    if bool(reach.targets.wanted.any()):
-        targets = reach.within_reach(motion).led_there(motion).targets
-        motion = fill(motion, reach.free_limbs(motion.num_joints), inbetweener, targets=targets).motion
+    if request.loop:
+        motion = close_loop(motion, frames, inbetweener)
+    if request.arrival is not None:
+        arrival = request.arrival.bring_to(way.curve, float(way.arcs[-1]))
+        motion = arrive(motion, arrival, inbetweener)
+    motion, met = meet_poses(motion, request.poses, way, inbetweener)
+    reaches = settle_reaches(request.reaches, motion)
+    if reaches:
+        reach = ReachTargets.of(reaches, frames).relaxed(motion).within_reach(motion)
+        free = reach.free_limbs(motion.num_joints, pose_frames(met, frames))
+        motion = fill(motion, free, inbetweener, targets=reach.led_there(motion).targets).motion
     motion = turn_heads(motion, request.looks)
-    wishes = check_wishes(request, way, motion)
+    wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)
     notes = [way.note] if way.note else []
     notes += [wish.sentence for wish in wishes if not wish.holds]
     return ShotSolution(
@@ -222,7 +237,7 @@ def _join_pieces(pieces: Sequence[_Piece], inbetweener: Inbetweener, settings: S
             for one in _list_transitions(before.span, after.span, joined.num_frames, settings)
             if one.start >= earliest
         ] or [_lay_hasty_transition(before.span, after.span, joined.num_frames, earliest)]
-        chosen, _ = choose_transition(joined, after.motion, candidates, inbetweener)
+        chosen = choose_transition(joined, after.motion, candidates, inbetweener)
         joined = join_across(joined, after.motion, chosen)
         missing[chosen.start : chosen.stop] = True
         earliest = chosen.stop + _SETTLED

@@ -2,12 +2,12 @@
 and the in-betweener's answer that a viewer would mind least is taken.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
-from controllers.inbetweening.pipeline import fill
+from controllers.inbetweening.pipeline import InfillSettings, fill
 from controllers.inbetweening.proposers.auto import ChoiceSettings, compute_artefact_cost
 from mapctl import contacts
 from mapctl.inbetweening.missing import MissingMask
@@ -31,26 +31,54 @@ class Transition:
     """One past the last frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class Filling:
+    """A shot's motion of which a part is to be made anew."""
+
+    motion: Motion
+    """All frames of the shot."""
+    missing: MissingMask
+    """What is to be made."""
+    around: tuple[int, int]
+    """Frames start to stop that it is within."""
+
+
 def choose_transition(
-    before: Motion, after: Motion, candidates: Iterable[Transition], inbetweener: Inbetweener
-) -> tuple[Transition, float]:
-    """Choose the transition from one motion to another, both of the whole shot's frames, that costs a viewer least:
-    sliding, skating, detours, time on no foot (see `compute_artefact_cost`), and the worst acceleration; m/s.
-    """
-    found: list[tuple[float, Transition]] = []
-    for one in candidates:
-        first, last = max(0, one.start - _CONTEXT), min(before.num_frames, one.stop + _CONTEXT)
-        gap = (one.start - first, one.stop - first)
-        joined = join_across(before, after, one).slice(first, last)
-        missing = torch.zeros(last - first, dtype=torch.bool)
-        missing[gap[0] : gap[1]] = True
-        done = fill(joined, MissingMask.of_frames(missing, joined.num_joints), inbetweener)
-        cost = compute_artefact_cost(done.motion, contacts.to_logits(done.contacts), gap, ChoiceSettings())
-        shown = done.motion.slice(max(0, gap[0] - 2), gap[1] + 2)
-        peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
-        found.append((cost + _ACCELERATION_WEIGHT * peaks.acceleration, one))
-    cost, best = min(found, key=lambda each: each[0])
-    return best, cost
+    before: Motion, after: Motion, candidates: Sequence[Transition], inbetweener: Inbetweener
+) -> Transition:
+    """Choose the transition from one motion to another, both of the whole shot's frames, that costs a viewer least."""
+    frame = torch.arange(before.num_frames)
+
+    def join(one: Transition) -> Filling:
+        missing = (frame >= one.start) & (frame < one.stop)
+        mask = MissingMask.of_frames(missing, before.num_joints)
+        return Filling(join_across(before, after, one), mask, (one.start, one.stop))
+
+    return candidates[choose_filling([join(one) for one in candidates], inbetweener)]
+
+
+def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> int:
+    """Choose the candidate that costs a viewer least: sliding, skating, detours, time on no foot (see
+    `compute_artefact_cost`), and the worst acceleration. The in-betweener's proposals are compared, without MAP."""
+    if len(candidates) == 1:
+        return 0
+    costs = [_measure_cost(one, inbetweener) for one in candidates]
+    return costs.index(min(costs))
+
+
+def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
+    """Measure what a viewer would mind, m/s."""
+    start, stop = filling.around
+    first, last = max(0, start - _CONTEXT), min(filling.motion.num_frames, stop + _CONTEXT)
+    gap = (max(1, start - first), min(stop, filling.motion.num_frames - 1) - first)
+    part, missing = filling.motion.slice(first, last), filling.missing.slice(first, last)
+    if not bool(missing.frames.any()):
+        return 0.0
+    done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
+    cost = compute_artefact_cost(done.motion, contacts.to_logits(done.contacts), gap, ChoiceSettings())
+    shown = done.motion.slice(max(0, gap[0] - 2), gap[1] + 2)
+    peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
+    return cost + _ACCELERATION_WEIGHT * peaks.acceleration
 
 
 def join_across(before: Motion, after: Motion, transition: Transition) -> Motion:

@@ -36,6 +36,11 @@ class Way:
     note: str | None = None
     """What was changed about the request, or why it cannot hold."""
 
+    def walked_on(self, frames: int) -> "Way":
+        """Return the way of a loop, walked on for some more frames."""
+        arcs = torch.cat([self.arcs, self.curve.length + self.arcs[:frames]])
+        return replace(self, speeds=torch.cat([self.speeds, self.speeds[:frames]]), arcs=arcs)
+
 
 def plan_way(request: ShotRequest) -> Way:
     """Plan the way of a shot: first around obstacles, then past others, who are met where the plan is when they are
@@ -67,7 +72,7 @@ def plan_way(request: ShotRequest) -> Way:
 
 def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]:
     """Plan the speed at each frame; a shot without a duration lasts until the curve ends."""
-    ends = StandingEnds(request.begins_standing, request.stand_at_end)
+    ends = StandingEnds(request.begins_standing, request.ends_standing)
     if isinstance(request.speed, TimedSpeed):
         frames = max(2, round((request.seconds or 0.0) * PRIOR_FPS))
         return limit_timed_speeds(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS, ends)
@@ -77,7 +82,9 @@ def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]
         length = math.inf if curve.closed and request.seconds is not None else curve.length
         return plan_speeds(path.profile, length, PRIOR_FPS, ends, seconds=request.seconds, most=_MOST_FRAMES)
     arcs = path.arcs(frames, PRIOR_FPS)
-    return torch.tensor([path.profile.at(float(arc)) for arc in arcs], dtype=torch.float64)
+    speeds = torch.tensor([path.profile.at(float(arc)) for arc in arcs], dtype=torch.float64)
+    # A loop's frame after its last is its first again.
+    return speeds * (curve.length * PRIOR_FPS / speeds.sum()) if request.loop else speeds
 
 
 def _clear_of_others(

@@ -1,6 +1,7 @@
 """What became of the wishes of a shot: asked, got, and the residual of each."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from controllers.shots.looking import measure_look_errors
+from controllers.shots.posing import MetPose, measure_pose_error
 from controllers.shots.reaching import ReachTargets, measure_misses
 from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.way import Way
@@ -19,6 +21,7 @@ from mapctl.skeleton import LIMBS
 
 _PATH_TOLERANCE = 0.15  # metres
 _REACH_TOLERANCE = 0.01  # metres
+_POSE_TOLERANCE, _FACING_TOLERANCE_DEG = 0.001, 0.1  # metres
 _LOOK_TOLERANCE_DEG = 15.0
 _STILL_TOLERANCE = 0.06  # m/s
 _NEAR_REACH_SECONDS = 1.0
@@ -72,8 +75,8 @@ class Wish:
         }
 
 
-def check_wishes(request: ShotRequest, way: Way, motion: Motion) -> tuple[Wish, ...]:
-    """Measure every wish of a request on its motion, at PRIOR_FPS."""
+def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[MetPose] = ()) -> tuple[Wish, ...]:
+    """Measure every wish of a request on its motion, at PRIOR_FPS; poses as they were met."""
     positions = motion.joint_positions()
     hips = positions[:, 0, ::2]
     found = [_check_path(request, way, hips)]
@@ -82,9 +85,11 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion) -> tuple[Wish, 
         miss = 100 * float(measure_misses(positions, targets).max())
         name = f"{', '.join(reach.places)} at {reach.seconds:g} s"
         asked = f"held {reach.hold_seconds:g} s" if reach.hold_seconds else "there"
-        limit = 100 * max(_REACH_TOLERANCE, reach.tolerance)
+        limit = 100 * max(_REACH_TOLERANCE, max(map(reach.tolerance_of, reach.places)))
         remedy = _find_remedy(reach, motion) if miss > limit else ""
         found.append(Wish(name, asked, miss, limit, "cm", remedy=remedy))
+    for one in met:
+        found.append(_check_pose(one, motion))
     for look in request.looks:
         worst = float(measure_look_errors(motion, look).max())
         found.append(Wish(f"look at {look.seconds:g} s", "straight", worst, _LOOK_TOLERANCE_DEG, "degrees"))
@@ -103,6 +108,19 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion) -> tuple[Wish, 
     if request.stand_at_end:
         found.append(Wish("stand at the end", "0.8 s", float(still[-24:].mean()), 100 * _STILL_TOLERANCE, "cm/s"))
     return tuple(found)
+
+
+def _check_pose(met: MetPose, motion: Motion) -> Wish:
+    """Measure how far what a key tells is missed."""
+    metres, degrees = measure_pose_error(motion, met)
+    key = met.key
+    asked = f"held {key.hold_seconds:g} s" if key.hold_seconds else "there"
+    if key.tells_facing_alone:
+        limit = max(_FACING_TOLERANCE_DEG, key.most)
+        return Wish(f"facing {key.facing_deg:g} degrees at {key.seconds:.2f} s", asked, degrees, limit, "degrees")
+    what = "hips" if key.pose is None or key.root_only else "pose"
+    limit = 100 * max(_POSE_TOLERANCE, key.most)
+    return Wish(f"{what} at {key.seconds:.2f} s", asked, 100 * metres, limit, "cm")
 
 
 def _find_remedy(reach: Reach, motion: Motion) -> str:

@@ -14,9 +14,11 @@ from mapctl.skeleton import LIMBS
 
 _MOST_SECONDS = 3600.0
 _MOST_FRAMES = 108_000
+_MOST_SHIFT = 600
 
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 Seconds = Annotated[float, Field(ge=0, le=_MOST_SECONDS)]
+Tolerance = Annotated[float, Field(ge=0, le=180)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -32,22 +34,63 @@ class ShotKey:
     """Frame of the motion."""
     reach: Mapping[str, Place] = field(default_factory=dict)
     """Hands and feet (leftHand, rightHand, leftFoot, rightFoot) and where they are to be, x, y, z, metres."""
+    pose: Annotated[str, Field(min_length=1)] | None = None
+    """A motion file, relative to the file of the key, of which a frame is the pose."""
+    pose_frame: Annotated[int, Field(ge=0, le=_MOST_FRAMES)] = 0
+    """Frame of the pose in its file."""
+    place: tuple[Coordinate, Coordinate] | None = None
+    """Hips over the ground, x and z, metres; on the way if not given."""
+    height: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Height of the hips, metres; that of the pose if not given."""
+    facing_deg: Annotated[float, Field(ge=-3600, le=3600)] | None = None
+    """Heading of the hips, degrees: 0 along +Z, 90 along +X; that of a pose is along the way if not given."""
+    joints: tuple[str, ...] = ()
+    """Hands and feet whose positions in the pose are all that counts of it."""
+    root_only: bool = False
+    """Whether only position and rotation of the pose's hips count."""
     look_at: Place | None = None
     """What the head looks at, x, y, z, metres."""
     hold_seconds: Seconds = 0.0
     """For how long."""
-    tolerance: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """How far from its place a hand or a foot may stay, metres; 0 is exact."""
+    tolerance: Tolerance | Mapping[str, Tolerance] = 0.0
+    """How far from there a joint may be, metres, of all or by hand and foot; degrees of a key that tells a facing and
+    nothing else; 0 is exact."""
+    within_frames: Annotated[int, Field(ge=0, le=_MOST_SHIFT)] = 0
+    """How many frames of the motion earlier or later it may be."""
 
     @property
     def fault(self) -> str | None:
         """A fault that the types cannot express, after the key it is of; None without any."""
         if (self.seconds is None) == (self.frame is None):
             return "seconds: a key is at seconds or at a frame, one of them"
-        if not self.reach and self.look_at is None:
-            return "reach: a key tells a reach, a look_at or both"
-        unknown = [name for name in self.reach if name not in LIMBS]
-        return f"reach.{unknown[0]}: hands and feet are {', '.join(LIMBS)}" if unknown else None
+        if not (self.reach or self.look_at or self.tells_hips):
+            return "reach: a key tells a reach, a look_at, a pose, or a place, a height or a facing of the hips"
+        return self._pose_fault or self._limb_fault
+
+    @property
+    def _pose_fault(self) -> str | None:
+        if self.pose is None:
+            idle = {"pose_frame": self.pose_frame, "joints": self.joints, "root_only": self.root_only}
+            found = next((name for name, value in idle.items() if value), None)
+            return None if found is None else f"{found}: this is of a pose, and the key has none"
+        if self.root_only and self.joints:
+            return "root_only: of a pose only the hips count, or some joints; choose one"
+        return None
+
+    @property
+    def _limb_fault(self) -> str | None:
+        tolerated = self.tolerance if isinstance(self.tolerance, Mapping) else {}
+        for name, limbs in (("reach", self.reach), ("joints", self.joints), ("tolerance", tolerated)):
+            unknown = [limb for limb in limbs if limb not in LIMBS]
+            if unknown:
+                return f"{name}.{unknown[0]}: hands and feet are {', '.join(LIMBS)}"
+        idle = [limb for limb in tolerated if limb not in {*self.reach, *self.joints}]
+        return f"tolerance.{idle[0]}: the key tells no place of it" if idle else None
+
+    @property
+    def tells_hips(self) -> bool:
+        """Whether it tells a pose, or where the hips are or face."""
+        return any(value is not None for value in (self.pose, self.place, self.height, self.facing_deg))
 
     def at_seconds(self, fps: float) -> float:
         """Return when it is, seconds, of a motion at a rate."""

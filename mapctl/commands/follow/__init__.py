@@ -1,7 +1,7 @@
 """`mapctl follow`: a character walks a drawn curve."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -31,10 +31,12 @@ class FollowCurve(Command):
     start: Annotated[str, arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
     """How it begins: in its stride, standing, or going on from a frame of a motion file, on that file's rig and at its
     rate."""
-    end: Literal["walk", "stand"] = "walk"
-    """How it ends: in its stride, or standing."""
+    end: Annotated[str, arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
+    """How it ends: in its stride, standing, or in a frame of a motion file."""
+    loop: bool = False
+    """The last frame leads into the first: once around a closed curve."""
     keys: options.MaybeFile = None
-    """TOML file of [[key]] tables: what hands and feet reach for and the head looks at, and when."""
+    """TOML file of [[key]] tables: what hands and feet reach for, the head looks at, which pose is held, and when."""
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
     gait: options.MaybeName = None

@@ -10,8 +10,9 @@ from mapctl.commands.follow import FollowCurve
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
-from mapctl.commands.shared.played_shot import PlayedShot, ShotPlan, list_props, plan_shot, play_shot
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
+from mapctl.commands.shared.shots.play import PlayedShot, list_props, play_shot
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -47,7 +48,7 @@ def run(command: FollowCurve) -> int:
 def _wishes_more(command: FollowCurve) -> bool:
     """Return whether more is wished than to walk along a curve."""
     told = command.keys is not None or command.gait or command.style or command.fps is not None
-    return bool(told or command.avoid or command.start != "walk" or command.end != "walk")
+    return bool(told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop)
 
 
 def _plan(command: FollowCurve, curve: Curve, prior: LstmGmmDensity, character: Character) -> ShotPlan:
@@ -61,6 +62,7 @@ def _plan(command: FollowCurve, curve: Curve, prior: LstmGmmDensity, character: 
         style=command.style,
         start=command.start,
         end=command.end,
+        loop=command.loop,
         keys=() if command.keys is None else read_shot_keys(command.keys),
     )
     if actor.fault is not None:

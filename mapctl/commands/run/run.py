@@ -13,8 +13,9 @@ from mapctl.commands.run import RunScene
 from mapctl.commands.shared import exit_status, options, outputs, results
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
-from mapctl.commands.shared.played_shot import PlayedShot, ShotPlan, list_props, plan_shot, play_shot
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
+from mapctl.commands.shared.shots.play import PlayedShot, list_props, play_shot
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.path import PathRequest

@@ -1,53 +1,27 @@
-"""Characters who do more than walk along a curve, for follow and run."""
+"""Shots solved, measured and reported, for follow and run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from controllers.common.character import Character
 from controllers.following.follow import FollowSettings
-from controllers.shots.lead import Lead
-from controllers.shots.request import Look, Others, Reach, ShotRequest
+from controllers.shots.request import Others, ShotRequest
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
-from mapctl import formats, report
-from mapctl.curves import Curve
-from mapctl.curves.obstacles import Obstacle
-from mapctl.errors import RequestError
+from mapctl import report
+from mapctl.commands.shared.shots.plan import ShotPlan
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import SpeedProfile
-from mapctl.intent.timed_speed import TimedSpeed
 from mapctl.mesh.primitives import Surface
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.protocols import Inbetweener
 from mapctl.recording.frequency_bands import resample_by_splines
-from mapctl.retarget.carry import RiggedCharacter
 from mapctl.runtime.progress import Progress
 from mapctl.terms import FootContact
-from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.props import build_obstacle, build_target
-from scenes.scene_file import Actor
-
-
-@dataclass(frozen=True, eq=False)
-class ShotPlan:
-    """What an actor is asked to do, and on what body."""
-
-    actor: Actor
-    """The actor's table."""
-    request: ShotRequest
-    """Its wishes."""
-    prior: LstmGmmDensity
-    """Density of its walks."""
-    character: Character
-    """Its body."""
-    fps: Fraction
-    """Rate of its motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,63 +74,6 @@ class PlayedShot:
             f"cost      {1000 * self.solution.seconds / motion.num_frames:.1f} ms a frame",
             f"status    {self.solution.status.text}",
         ]
-
-
-def plan_shot(
-    actor: Actor,
-    curve: Curve,
-    prior: LstmGmmDensity,
-    *,
-    character: Character,
-    folder: Path,
-    obstacles: Sequence[Obstacle] = (),
-    fps: Fraction | None = None,
-) -> ShotPlan:
-    """Plan an actor's shot; a clip that it goes on from is read, and gives it its body and its rate. RequestError for
-    wishes that do not fit each other, and for labels that the prior does not know."""
-    lead, rate = None, Fraction(PRIOR_FPS)
-    if actor.clip_frame is not None:
-        name, frame = actor.clip_frame
-        clip = formats.load(folder / name)
-        if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
-            raise RequestError(f"{name} is of another rig than the character; what goes on from a clip is on its rig")
-        canonical, body = RiggedCharacter.of(clip)
-        character = Character(canonical.skeleton, float(body.stance.toe_height.mean()), body.rigmap, body.source)
-        lead, rate = Lead.of(canonical, frame), clip.fps
-        if actor.offset is None and actor.turn_deg is None:
-            curve = lead.bring_curve(curve)
-        else:
-            lead = lead.bring_to(curve)
-    rate = rate if fps is None else fps
-    speed = SpeedProfile.parse(str(1.2 if actor.speed is None else actor.speed))
-    if actor.speed_by_time is not None:
-        speed = TimedSpeed.parse(actor.speed_by_time)
-        if actor.curve is not None and not any(speed.speeds):
-            raise RequestError(f"the speed is zero throughout, with a curve of {curve.length:.1f} m to go")
-    elif actor.curve is None:
-        speed = TimedSpeed((0.0,), (0.0,))
-    when = {number: key.at_seconds(float(rate)) for number, key in enumerate(actor.keys)}
-    request = ShotRequest(
-        curve,
-        speed,
-        actor.seconds,
-        lead=lead,
-        stand_at_start=actor.start == "stand",
-        stand_at_end=actor.end == "stand",
-        reaches=tuple(
-            Reach(when[number], key.reach, key.hold_seconds, key.tolerance)
-            for number, key in enumerate(actor.keys)
-            if key.reach
-        ),
-        looks=tuple(
-            Look(when[number], key.look_at, key.hold_seconds)
-            for number, key in enumerate(actor.keys)
-            if key.look_at is not None
-        ),
-        obstacles=tuple(obstacles),
-    )
-    labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
-    return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate)
 
 
 def play_shot(

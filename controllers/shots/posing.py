@@ -1,0 +1,191 @@
+"""Keys of a shot that tell a pose, where the hips are, or which way they face: met on the way, by the in-betweener."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from controllers.inbetweening.pipeline import fill
+from controllers.shots.request import PoseKey, Reach
+from controllers.shots.transitions import Filling, choose_filling
+from controllers.shots.way import Way
+from mapctl import kinematics, rotations
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.skeleton import CANONICAL
+
+_WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried
+_MOST_WIDTH = 75
+_HIPS_SPEED, _JOINT_SPEED, _TURN_RATE = 1.3, 2.0, 2.5  # m/s, m/s about the hips, rad/s: at most, on the way to a key
+
+
+@dataclass(frozen=True, eq=False)
+class MetPose:
+    """A key and when and how it was met."""
+
+    key: PoseKey
+    """The key, at the time at which it was met."""
+    wanted: Motion
+    """One frame: the pose in its place as the key asks for it; what it does not tell is as it was found."""
+    start: int
+    """First frame of the key."""
+    stop: int
+    """One past its last frame."""
+
+
+def meet_poses(
+    motion: Motion, keys: Sequence[PoseKey], way: Way, inbetweener: Inbetweener
+) -> tuple[Motion, tuple[MetPose, ...]]:
+    """Change a shot's motion so that it meets the keys; how far around them, and when within the frames that a key
+    allows, costs a viewer least."""
+    met: list[MetPose] = []
+    waiting = sorted(keys, key=lambda key: key.seconds)
+    for number, key in enumerate(waiting):
+        earliest = met[-1].stop if met else 0
+        following = [_frame_of(other.seconds, motion) - other.within_frames for other in waiting[number + 1 :]]
+        latest = min([motion.num_frames, *following])
+        tried = list(_list_fillings(motion, key, way, earliest, latest))
+        filling, chosen = tried[choose_filling([filling for filling, _ in tried], inbetweener)]
+        if bool(filling.missing.frames.any()):
+            motion = fill(filling.motion, filling.missing, inbetweener).motion
+        else:
+            motion = filling.motion
+        met.append(chosen)
+    return motion, tuple(met)
+
+
+def measure_pose_error(motion: Motion, met: MetPose) -> tuple[float, float]:
+    """Measure the largest distance of what a key tells from where it is to be, metres, and of the heading, degrees."""
+    held, key = slice(met.start, met.stop), met.key
+    away = (motion.joint_positions()[held] - met.wanted.joint_positions()).norm(dim=-1)
+    counted = away if key.pose is not None and not key.root_only else away[:, :1]
+    turned = kinematics.heading(motion.local_quat_xyzw[held, 0]) - kinematics.heading(met.wanted.local_quat_xyzw[:, 0])
+    return float(counted.max()), float(torch.rad2deg(rotations.wrap_angle(turned).abs().max()))
+
+
+def as_reaches(keys: Sequence[PoseKey], way: Way, found: Motion) -> tuple[Reach, ...]:
+    """Return the keys of which only hands and feet count as reaches for where these are in the pose; `found` is any
+    frame of the character."""
+    reaches = []
+    for key in keys:
+        if key.joints:
+            frame = min(round(key.seconds * PRIOR_FPS), len(way.arcs) - 1)
+            positions = _place_pose(found, key, way, frame).joint_positions()[0]
+            places = {name: tuple(positions[CANONICAL.index(name)].tolist()) for name in key.joints}
+            reaches.append(Reach(key.seconds, places, key.hold_seconds, key.tolerance, key.within_frames))
+    return tuple(reaches)
+
+
+def pose_frames(met: Sequence[MetPose], frames: int) -> Bool[Tensor, " frames"]:
+    """Mark the frames in which a whole pose is held."""
+    held = torch.zeros(frames, dtype=torch.bool)
+    for one in met:
+        if one.key.pose is not None and not one.key.root_only:
+            held[one.start : one.stop] = True
+    return held
+
+
+def _frame_of(seconds: float, motion: Motion) -> int:
+    return min(round(seconds * PRIOR_FPS), motion.num_frames - 1)
+
+
+def _list_fillings(
+    motion: Motion, key: PoseKey, way: Way, earliest: int, latest: int
+) -> Iterator[tuple[Filling, MetPose]]:
+    """List what may be made anew around a key, by when it is met and how far around it."""
+    shifts = {0, key.within_frames, -key.within_frames, key.within_frames // 2, -(key.within_frames // 2)}
+    hold = round(key.hold_seconds * PRIOR_FPS) + 1
+    for shift in sorted(shifts, key=abs):
+        start = max(earliest, min(_frame_of(key.seconds, motion) + shift, latest - 1))
+        stop = min(start + hold, latest)
+        asked = _place_pose(motion.slice(start, start + 1), key, way, start)
+        shown = _relax(asked, motion.slice(start, start + 1), key)
+        least = _find_least_width(motion, shown, start)
+        for width in sorted({min(_MOST_WIDTH, max(least, width)) for width in _WIDTHS}):
+            found = _build_filling(
+                motion, key, shown, (start, stop), (max(earliest, start - width), min(latest, stop + width))
+            )
+            yield found, MetPose(replace(key, seconds=start / PRIOR_FPS), asked, start, stop)
+
+
+def _place_pose(found: Motion, key: PoseKey, way: Way, frame: int) -> Motion:
+    """Return one frame as a key asks for it, what it does not tell as found; a pose without a place and a facing is on
+    the way and along it."""
+    pose = found if key.pose is None else key.pose
+    root, quats = pose.root_position.double().clone(), pose.local_quat_xyzw.double().clone()
+    arc = way.arcs[frame : frame + 1]
+    if key.place is not None:
+        root[0, ::2] = root.new_tensor(key.place)
+    elif key.pose is not None:
+        root[0, ::2] = way.curve.point(arc)[0, :: way.curve.dims - 1]
+    if key.height is not None:
+        root[0, 1] = key.height
+    angle = None
+    if key.facing_deg is not None:
+        angle = torch.deg2rad(root.new_tensor([key.facing_deg]))
+    elif key.pose is not None:
+        tangent = way.curve.tangent(arc)[0]
+        angle = torch.atan2(tangent[0], tangent[-1])[None].to(root)
+    if angle is not None:
+        turn = rotations.about_y(angle - kinematics.heading(quats[:, 0]))
+        quats[:, 0] = rotations.multiply(turn, quats[:, 0])
+    return replace(found, root_position=root, local_quat_xyzw=quats)
+
+
+def _relax(asked: Motion, found: Motion, key: PoseKey) -> Motion:
+    """Return a pose nearer to what the character does anyway, as far as the tolerance allows."""
+    if key.most == 0:
+        return asked
+    away = float((asked.joint_positions() - found.joint_positions()).norm(dim=-1).max())
+    turned = kinematics.heading(asked.local_quat_xyzw[:, 0]) - kinematics.heading(found.local_quat_xyzw[:, 0])
+    degrees = float(torch.rad2deg(rotations.wrap_angle(turned).abs())[0])
+    off = degrees if key.tells_facing_alone else 100 * away
+    allowed = key.most if key.tells_facing_alone else 100 * key.most
+    share = 1.0 if off <= allowed else 0.95 * allowed / off  # a slerp's joints stray a little from the chord
+    quats = rotations.slerp(asked.local_quat_xyzw, found.local_quat_xyzw.to(asked.local_quat_xyzw), torch.tensor(share))
+    root = torch.lerp(asked.root_position, found.root_position.to(asked.root_position), share)
+    return replace(asked, root_position=root, local_quat_xyzw=quats)
+
+
+def _find_least_width(motion: Motion, pose: Motion, frame: int) -> int:
+    """Find the fewest frames in which one gets to a pose without haste."""
+    here = motion.slice(frame, frame + 1)
+    moved = pose.joint_positions()[0] - here.joint_positions()[0]
+    turned = kinematics.heading(pose.local_quat_xyzw[:, 0]) - kinematics.heading(here.local_quat_xyzw[:, 0])
+    seconds = (
+        float(moved[0].norm()) / _HIPS_SPEED,
+        float((moved - moved[0]).norm(dim=-1).max()) / _JOINT_SPEED,
+        float(rotations.wrap_angle(turned).abs()) / _TURN_RATE,
+    )
+    return round(max(seconds) * PRIOR_FPS)
+
+
+def _build_filling(
+    motion: Motion, key: PoseKey, pose: Motion, held: tuple[int, int], around: tuple[int, int]
+) -> Filling:
+    frames, joints = motion.num_frames, motion.num_joints
+    root, quats = motion.root_position.double().clone(), motion.local_quat_xyzw.double().clone()
+    part = slice(*held)
+    missing = torch.zeros(frames, dtype=torch.bool)
+    missing[around[0] : around[1]] = True
+    # A shot's first and last frame stay, where no key tells them.
+    missing[0] = missing[-1] = False
+    mask = MissingMask.of_frames(missing, joints)
+    mask = MissingMask(mask.joints.clone(), mask.root.clone())
+    if key.pose is not None and not key.root_only:
+        root[part], quats[part] = pose.root_position, pose.local_quat_xyzw
+        mask.root[part], mask.joints[part] = False, False
+    else:
+        still = key.hold_seconds > 0 and key.place is not None
+        travelled = root[part] - root[held[0] : held[0] + 1]
+        root[part] = pose.root_position + (0.0 if still else 1.0) * travelled * root.new_tensor([1.0, 0.0, 1.0])
+        quats[part, 0] = pose.local_quat_xyzw[:, 0]
+        mask.root[part] = False
+        if key.tells_facing:
+            mask.joints[part, 0] = False
+    changed = replace(motion, root_position=root, local_quat_xyzw=quats)
+    return Filling(changed, mask, around)
