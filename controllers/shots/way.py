@@ -1,7 +1,9 @@
 """The way of a shot: its curve led around obstacles and others, and the arc along it at each frame."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -13,12 +15,14 @@ from mapctl.curves import Curve
 from mapctl.curves.detour import apply_detour, find_detour
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import PathRequest
+from mapctl.intent.cornering import find_reversals, slow_for_corners
+from mapctl.intent.path import PathRequest, SpeedProfile
 from mapctl.intent.timed_speed import TimedSpeed, integrate_speeds
 from mapctl.numerics import vectors
 
 _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far
 _APART_MARGIN = 0.15  # metres beyond the distance to others: hips sway, and are early or late
+_TURN_SECONDS = 0.6  # of standing where a curve reverses
 _MOST_FRAMES = 108_000
 _MEETING_FRAMES = 6  # frames by which either may be early or late
 
@@ -76,7 +80,9 @@ def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]
     if isinstance(request.speed, TimedSpeed):
         frames = max(2, round((request.seconds or 0.0) * PRIOR_FPS))
         return limit_timed_speeds(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS, ends)
-    path, _ = PathRequest(curve, request.speed, request.seconds).fitted(PRIOR_FPS)
+    if (reversals := find_reversals(curve)) and not curve.closed:
+        return _plan_reversals(request, curve, reversals, ends)
+    path, _ = PathRequest(curve, slow_for_corners(curve, request.speed), request.seconds).fitted(PRIOR_FPS)
     frames = path.frames(PRIOR_FPS)
     if ends.start or ends.end:
         length = math.inf if curve.closed and request.seconds is not None else curve.length
@@ -85,6 +91,32 @@ def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]
     speeds = torch.tensor([path.profile.at(float(arc)) for arc in arcs], dtype=torch.float64)
     # A loop's frame after its last is its first again.
     return speeds * (curve.length * PRIOR_FPS / speeds.sum()) if request.loop else speeds
+
+
+def _plan_reversals(
+    request: ShotRequest, curve: Curve, reversals: Sequence[float], ends: StandingEnds
+) -> Float[Tensor, " frames"]:
+    """Plan speeds along a curve that reverses: to a standing at each reversal, and on from there."""
+    assert isinstance(request.speed, SpeedProfile)
+    profile, stops, speeds = slow_for_corners(curve, request.speed), [0.0, *reversals, curve.length], []
+    for number, (start, stop) in enumerate(pairwise(stops)):
+        last = number == len(reversals)
+        piece = replace(
+            ends,
+            start=ends.start if number == 0 else True,
+            end=ends.end if last else True,
+            still=ends.still if number == 0 else _TURN_SECONDS / 2,
+            settled=ends.settled if last else _TURN_SECONDS / 2,
+        )
+        onward = SpeedProfile(tuple(arc - start for arc in profile.arcs), profile.speeds)
+        found = plan_speeds(onward, stop - start, PRIOR_FPS, piece, seconds=None, most=_MOST_FRAMES)
+        # Rounded to frames, a piece's arcs miss its length by a little.
+        speeds.append(found * ((stop - start) * PRIOR_FPS / found.sum()))
+    planned = torch.cat(speeds)
+    if request.seconds is None:
+        return planned
+    frames = max(2, round(request.seconds * PRIOR_FPS))
+    return torch.cat([planned, planned.new_zeros(frames)])[:frames]
 
 
 def _clear_of_others(

@@ -1,5 +1,6 @@
 """Requests to walk along a path, before they become terms."""
 
+import bisect
 import math
 from dataclasses import dataclass
 
@@ -10,6 +11,8 @@ from torch import Tensor
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 
+USUAL_SPEED = 1.2
+"""m/s, of walks that are asked for without a speed."""
 _SUBSTEPS = 10  # integration steps a frame
 
 
@@ -51,12 +54,13 @@ class SpeedProfile:
     def at(self, arc: float) -> float:
         """Return the speed at an arc, m/s."""
         arcs, speeds = self.arcs, self.speeds
-        if arc <= arcs[0]:
+        after = bisect.bisect_left(arcs, arc)
+        if after == 0:
             return speeds[0]
-        for (a, v), (b, w) in zip(zip(arcs, speeds, strict=True), zip(arcs[1:], speeds[1:], strict=True), strict=False):
-            if arc <= b:
-                return v + (w - v) * (arc - a) / (b - a)
-        return speeds[-1]
+        if after == len(arcs):
+            return speeds[-1]
+        (a, b), (v, w) = arcs[after - 1 : after + 1], speeds[after - 1 : after + 1]
+        return v + (w - v) * (arc - a) / (b - a)
 
 
 @dataclass(frozen=True, eq=False)

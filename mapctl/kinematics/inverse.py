@@ -101,14 +101,14 @@ def reach(
     turn: Float[Tensor, "*batch 4"],
     bent: Float[Tensor, "*batch 4"],
     direction: Float[Tensor, "*batch 3"],
-    offsets: Float[Tensor, "*batch joints 3"],
+    offsets: Float[Tensor, "*#batch joints 3"],
 ) -> tuple[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 4"]]:
     """Bend limbs so that their effectors reach a `direction` from their first joints, metres, or point there.
 
     `turn` is the first joint's world rotation (xyzw) and `bent` the second's local one; both come back, rotated by as
     little as that takes.
     """
-    upper, lower = offsets[..., limb.lower, :], offsets[..., limb.end, :]
+    upper, lower = (offsets[..., joint, :].expand(direction.shape) for joint in (limb.lower, limb.end))
     usual, toward = _find_usual_middle(limb, turn, bent, direction, upper, lower)
     middle, end = _close_triangle(direction, toward + _BEND_OFFSET * usual, upper, lower)
     turned = rotations.multiply(rotations.between_vectors(rotations.rotate(turn, upper), middle), turn)

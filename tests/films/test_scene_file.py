@@ -52,7 +52,7 @@ WRONG = {
     "no curve, no duration": (OUT + "[[actors]]\nstart = 'stand'", "actors[0].seconds: this key is needed"),
     "speed below zero": (OUT + ACTOR + "speed_by_time = [[0, -1]]", "actors[0].speed_by_time[0][1]: "),
     "start": (OUT + ACTOR + "start = 'sit'", "actors[0].start: expected walk, stand or CLIP:FRAME, got 'sit'"),
-    "end": (OUT + ACTOR + "end = 'sit'", "actors[0].end: input should be 'walk' or 'stand'"),
+    "end": (OUT + ACTOR + "end = 'sit'", "actors[0].end: expected walk, stand or CLIP:FRAME, got 'sit'"),
     "unknown key of a key": (
         OUT + ACTOR + "[[actors.keys]]\nsecond = 1",
         "actors[0].keys[0].second: there is no such key; ",

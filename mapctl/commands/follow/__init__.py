@@ -17,8 +17,9 @@ class FollowCurve(Command):
     """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or x,y,z, or an SVG file."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
-    speed: options.Speed = "1.2"
-    """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m."""
+    speed: options.MaybeSpeed = None
+    """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m; 1.2 if not given,
+    and less in corners that turn faster than people who walk do."""
     seconds: options.MaybeNumber = None
     """Duration of the walk; once along the curve if not given."""
     prior: options.Name = "locomotion"

@@ -16,6 +16,7 @@ from mapctl.commands.shared.shots.play import PlayedShot, list_props, play_shot
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
+from mapctl.intent.cornering import turns_sharply
 from mapctl.intent.shot_keys import read_shot_keys
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.cameras import CameraSettings
@@ -31,7 +32,8 @@ def run(command: FollowCurve) -> int:
     curve = inputs.read_curve(command.curve, command.metres_per_unit)
     request = parse_follow(curve, command.speed, command.seconds)
     character, prior = read_character(command.rig), priors.load(command.prior)
-    plan = _plan(command, curve, prior, character) if _wishes_more(command) else None
+    cornering = command.speed is None and turns_sharply(curve)
+    plan = _plan(command, curve, prior, character) if cornering or _wishes_more(command) else None
     with show_progress("walking", quiet=command.quiet) as progress:
         if plan is not None:
             done = play_shot(plan, [], priors.load_inbetweener(), progress=progress)

@@ -18,6 +18,7 @@ from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
 from mapctl.commands.shared.shots.play import PlayedShot, list_props, play_shot
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.intent.cornering import turns_sharply
 from mapctl.intent.path import PathRequest
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.film import film
@@ -52,7 +53,8 @@ def _plan(
     scene: SceneDescription, actor: Actor, curve: Curve, prior: LstmGmmDensity, character: Character, path: Path
 ) -> PathRequest | ShotPlan:
     """Plan what an actor does: a walk along its curve, or a shot where it is to do more."""
-    if not (actor.wishes_more or scene.obstacles or scene.keep_apart is not None):
+    cornering = actor.speed is None and turns_sharply(curve)
+    if not (actor.wishes_more or scene.obstacles or scene.keep_apart is not None or cornering):
         return parse_follow(curve, actor.speed, actor.seconds)
     obstacles = [obstacle.build() for obstacle in scene.obstacles]
     try:

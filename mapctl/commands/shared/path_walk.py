@@ -12,7 +12,7 @@ from controllers.following.follow import FollowSettings, follow
 from mapctl import report
 from mapctl.curves.curve import Curve
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import PathRequest, SpeedProfile
+from mapctl.intent.path import USUAL_SPEED, PathRequest, SpeedProfile
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.runtime.progress import Progress
@@ -103,7 +103,7 @@ def walk(
 
 def parse_follow(curve: Curve, speed: str | float | None, seconds: float | None) -> PathRequest:
     """Parse and check a request: RequestError for speeds and durations that make no sense or take too long."""
-    profile = SpeedProfile.parse(str(1.2 if speed is None else speed))
+    profile = SpeedProfile.parse(str(USUAL_SPEED if speed is None else speed))
     request = PathRequest(curve, profile, seconds)
     request.frames(PRIOR_FPS)
     return request

@@ -15,15 +15,13 @@ from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import SpeedProfile
+from mapctl.intent.path import USUAL_SPEED, SpeedProfile
 from mapctl.intent.shot_keys import ShotKey
 from mapctl.intent.timed_speed import TimedSpeed
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.scene_file import Actor
-
-_SPEED = 1.2  # m/s, where none is given
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +97,7 @@ def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed:
         return speed
     if actor.curve is None:
         return TimedSpeed((0.0,), (0.0,))
-    return SpeedProfile.parse(str(_SPEED if actor.speed is None else actor.speed))
+    return SpeedProfile.parse(str(USUAL_SPEED if actor.speed is None else actor.speed))
 
 
 def _build_pose_key(body: "_Body", key: ShotKey, seconds: float, within: int) -> PoseKey:

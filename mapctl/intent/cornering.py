@@ -1,0 +1,71 @@
+"""Slowing down before corners: speeds along a curve that leave time to turn."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.curves import Curve
+from mapctl.intent.path import USUAL_SPEED, SpeedProfile
+from mapctl.numerics.intervals import true_intervals
+
+_STEP = 0.05  # metres between the arcs that are looked at
+_AHEAD = 0.35  # metres before and after an arc over which the direction changes: half a step
+_TURN_RATE = 1.8  # rad/s at which one turns a corner without leaving it by more than a few centimetres
+_SLOWEST = 0.75  # m/s, to which corners slow one down at most: who is slower hardly walks
+_REVERSAL_STEP = 0.02  # metres before and after an arc, over which a reversal turns
+_REVERSAL_ANGLE = math.radians(150.0)
+_BRAKING = 0.9  # m/s^2, before a corner and after it
+
+
+def slow_for_corners(curve: Curve, profile: SpeedProfile) -> SpeedProfile:
+    """Return a speed profile that is lower before and in corners that turn faster than people who walk do; the same
+    one where none does."""
+    count = max(2, round(curve.length / _STEP) + 1)
+    arcs = torch.linspace(0, curve.length, count, dtype=torch.float64)
+    wanted = torch.tensor([profile.at(arc) for arc in arcs.tolist()], dtype=torch.float64)
+    limit = _limit_speeds(curve, arcs)
+    if bool((wanted <= limit).all()):
+        return profile
+    speeds = torch.minimum(wanted, limit)
+    step = float(arcs[1])
+    for _ in range(2 if curve.closed else 1):  # what is before a loop's first corner is its end
+        for order in (range(count - 2, -1, -1), range(1, count)):
+            sign = 1 if order.step < 0 else -1
+            for at in order:
+                reached = (speeds[at + sign] ** 2 + 2 * _BRAKING * step).sqrt()
+                speeds[at] = torch.minimum(speeds[at], reached)
+        if curve.closed:
+            speeds[0] = speeds[-1] = torch.minimum(speeds[0], speeds[-1])
+    return SpeedProfile(tuple(arcs.tolist()), tuple(speeds.tolist()))
+
+
+def turns_sharply(curve: Curve) -> bool:
+    """Return whether a curve has corners, at the usual speed, or reverses."""
+    usual = SpeedProfile.constant(USUAL_SPEED)
+    return slow_for_corners(curve, usual) is not usual or bool(find_reversals(curve))
+
+
+def find_reversals(curve: Curve) -> list[float]:
+    """Find the arcs, metres, at which a curve goes back the way it came: who walks it turns on the spot there."""
+    count = max(2, round(curve.length / _REVERSAL_STEP) + 1)
+    arcs = torch.linspace(0, curve.length, count, dtype=torch.float64)[2:-2]
+    turned = rotations.wrap_angle(_heading(curve, arcs + _REVERSAL_STEP) - _heading(curve, arcs - _REVERSAL_STEP)).abs()
+    runs = true_intervals((turned > _REVERSAL_ANGLE)[:, None])
+    return [float(arcs[start:stop].mean()) for _, start, stop in runs]
+
+
+def _heading(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:
+    tangent = curve.tangent(arcs if curve.closed else arcs.clamp(0, curve.length))
+    return torch.atan2(tangent[..., 0], tangent[..., -1])
+
+
+def _limit_speeds(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:
+    """Return the speed, m/s, at which the curve turns no faster than people do."""
+
+    # Two halves, so that a hairpin's half turn is not taken for none.
+    turned = rotations.wrap_angle(_heading(curve, arcs) - _heading(curve, arcs - _AHEAD)).abs()
+    turned = turned + rotations.wrap_angle(_heading(curve, arcs + _AHEAD) - _heading(curve, arcs)).abs()
+    return (2 * _AHEAD * _TURN_RATE / turned.clamp_min(1e-6)).clamp_min(_SLOWEST)
