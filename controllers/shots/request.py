@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -188,9 +189,21 @@ class ShotRequest:
             _check_contradiction(one, other)
         for one, other in combinations(self.poses, 2):
             _check_poses_apart(one, other)
+        self._check_places()
         inside = [obstacle for obstacle in self.obstacles if float(obstacle.distance(self._start)) < 0]
         if inside:
             raise RequestError(f"the obstacle at {inside[0].place[0]:g}, {inside[0].place[1]:g} stands on the start")
+
+    def _check_places(self) -> None:
+        told = [(key.seconds, place[0], place[2]) for key in self.reaches for place in key.places.values()]
+        told += [(key.seconds, *key.place) for key in self.poses if key.place is not None]
+        for obstacle in self.obstacles:
+            for seconds, x, z in told:
+                if float(obstacle.distance(torch.tensor([x, z], dtype=torch.float64))) < 0:
+                    raise RequestError(
+                        f"the key at {seconds:g} s is at {x:g}, {z:g}, within the obstacle at "
+                        f"{obstacle.place[0]:g}, {obstacle.place[1]:g}"
+                    )
 
     def _check_loop(self) -> None:
         if not self.loop:

@@ -21,13 +21,14 @@ from controllers.shots.arrival import arrive
 from controllers.shots.looking import turn_heads
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.posing import as_reaches, meet_poses, pose_frames
+from controllers.shots.prices import Price
 from controllers.shots.reaching import ReachTargets, check_reaches, settle_reaches
 from controllers.shots.request import ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.timeline import Span, lay_timeline
 from controllers.shots.transitions import Transition, choose_transition, join_across
 from controllers.shots.way import Way, cut_curve, plan_way
-from controllers.shots.wishes import Wish, check_wishes
+from controllers.shots.wishes import Wish, check_wishes, describe_fights
 from mapctl.errors import MapctlError
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics.placing import move_to, rotate_about_vertical
@@ -69,10 +70,13 @@ class ShotSolution(Solution):
     """The way that was planned."""
     wishes: tuple[Wish, ...] = ()
     """Each wish: asked, got, and the residual."""
+    prices: tuple[Price, ...] = ()
+    """What each wish costs the others, where that was measured."""
 
     def details(self) -> dict:
-        """Return the wishes."""
-        return {"wishes": [wish.as_row() for wish in self.wishes]}
+        """Return the wishes, and their prices where these were measured."""
+        rows = {"wishes": [wish.as_row() for wish in self.wishes]}
+        return rows | {"prices": [price.as_row() for price in self.prices]} if self.prices else rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +147,7 @@ def solve_shot(
     motion = turn_heads(motion, request.looks)
     wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)
     notes = [way.note] if way.note else []
-    notes += [wish.sentence for wish in wishes if not wish.holds]
+    notes += describe_fights(wishes, way, motion)
     return ShotSolution(
         motion,
         Status(Outcome.DONE).with_notes(notes, infeasible=bool(notes)),

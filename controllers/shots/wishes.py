@@ -11,7 +11,7 @@ from torch import Tensor
 from controllers.shots.looking import measure_look_errors
 from controllers.shots.posing import MetPose, measure_pose_error
 from controllers.shots.reaching import ReachTargets, measure_misses
-from controllers.shots.request import Reach, ShotRequest
+from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.way import Way
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
@@ -25,6 +25,8 @@ _POSE_TOLERANCE, _FACING_TOLERANCE_DEG = 0.001, 0.1  # metres
 _LOOK_TOLERANCE_DEG = 15.0
 _STILL_TOLERANCE = 0.06  # m/s
 _NEAR_REACH_SECONDS = 1.0
+_STILL_AT_START, _STILL_AT_END = 12, 24  # frames at PRIOR_FPS in which one is to stand, beginning and ending
+_FIGHT_FRAMES = 20  # before and after a wish, in which others are against it
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class Wish:
     """Whether `limit` is a least value; else a largest one."""
     remedy: str = ""
     """What would let it hold; empty where it does, or where nothing is known to."""
+    seconds: tuple[float, float] | None = None
+    """From when to when it is wished; None is throughout."""
 
     @property
     def holds(self) -> bool:
@@ -72,6 +76,7 @@ class Wish:
             "residual": self.residual,
             "holds": self.holds,
             "remedy": self.remedy,
+            "seconds": self.seconds,
         }
 
 
@@ -87,12 +92,13 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
         asked = f"held {reach.hold_seconds:g} s" if reach.hold_seconds else "there"
         limit = 100 * max(_REACH_TOLERANCE, max(map(reach.tolerance_of, reach.places)))
         remedy = _find_remedy(reach, motion) if miss > limit else ""
-        found.append(Wish(name, asked, miss, limit, "cm", remedy=remedy))
+        found.append(Wish(name, asked, miss, limit, "cm", remedy=remedy, seconds=_span(reach)))
     for one in met:
         found.append(_check_pose(one, motion))
     for look in request.looks:
         worst = float(measure_look_errors(motion, look).max())
-        found.append(Wish(f"look at {look.seconds:g} s", "straight", worst, _LOOK_TOLERANCE_DEG, "degrees"))
+        name = f"look at {look.seconds:g} s"
+        found.append(Wish(name, "straight", worst, _LOOK_TOLERANCE_DEG, "degrees", seconds=_span(look)))
     if request.obstacles:
         clear = 100 * float(measure_clearance(request.obstacles, positions[..., ::2]).amin())
         found.append(Wish("obstacles", "no joint within", clear, 0.0, "cm", at_least=True))
@@ -102,12 +108,46 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
         apart = 100 * float(vectors.length(hips[None] - there).amin())
         asked = f"{request.others.distance:g} m"
         found.append(Wish("keep apart", asked, apart, 100 * request.others.distance - 1.0, "cm", at_least=True))
-    still = 100 * vectors.length(torch.diff(hips, dim=0)) * PRIOR_FPS
+    still, last = 100 * vectors.length(torch.diff(hips, dim=0)) * PRIOR_FPS, (motion.num_frames - 1) / PRIOR_FPS
+    limit = 100 * _STILL_TOLERANCE
     if request.stand_at_start:
-        found.append(Wish("stand at the start", "0.4 s", float(still[:12].mean()), 100 * _STILL_TOLERANCE, "cm/s"))
+        moved = float(still[:_STILL_AT_START].mean())
+        seconds = (0.0, _STILL_AT_START / PRIOR_FPS)
+        found.append(Wish("stand at the start", "still", moved, limit, "cm/s", seconds=seconds))
     if request.stand_at_end:
-        found.append(Wish("stand at the end", "0.8 s", float(still[-24:].mean()), 100 * _STILL_TOLERANCE, "cm/s"))
+        moved = float(still[-_STILL_AT_END:].mean())
+        seconds = (last - _STILL_AT_END / PRIOR_FPS, last)
+        found.append(Wish("stand at the end", "still", moved, limit, "cm/s", seconds=seconds))
     return tuple(found)
+
+
+def describe_fights(wishes: Sequence[Wish], way: Way, motion: Motion) -> list[str]:
+    """Describe every wish that does not hold: by how much, what else is wished at that time and how that fares there,
+    and what would settle it."""
+    sentences, offsets = [], _measure_offsets(way, motion.root_position[:, ::2])
+    for one in wishes:
+        if one.holds:
+            continue
+        rivals = [other for other in wishes if other is not one and not other.holds and _overlap(one, other)]
+        fares = [f"{other.name}, {other.residual:.1f} {other.unit} short" for other in rivals]
+        if one.seconds is not None:
+            first, last = (round(second * PRIOR_FPS) for second in one.seconds)
+            near = slice(max(0, first - _FIGHT_FRAMES), last + _FIGHT_FRAMES)
+            fares.append(f"the path, {100 * float(offsets[near].max()):.0f} cm off at that time")
+        sentences.append(one.sentence + (f"; against {', '.join(fares)}" if fares else ""))
+    return sentences
+
+
+def _overlap(one: Wish, other: Wish) -> bool:
+    """Return whether two wishes are at one time."""
+    if one.seconds is None or other.seconds is None:
+        return True
+    apart = _FIGHT_FRAMES / PRIOR_FPS
+    return one.seconds[0] - apart < other.seconds[1] and other.seconds[0] - apart < one.seconds[1]
+
+
+def _span(key: Reach | Look | PoseKey) -> tuple[float, float]:
+    return key.seconds, key.seconds + key.hold_seconds
 
 
 def _check_pose(met: MetPose, motion: Motion) -> Wish:
@@ -117,10 +157,11 @@ def _check_pose(met: MetPose, motion: Motion) -> Wish:
     asked = f"held {key.hold_seconds:g} s" if key.hold_seconds else "there"
     if key.tells_facing_alone:
         limit = max(_FACING_TOLERANCE_DEG, key.most)
-        return Wish(f"facing {key.facing_deg:g} degrees at {key.seconds:.2f} s", asked, degrees, limit, "degrees")
+        name = f"facing {key.facing_deg:g} degrees at {key.seconds:.2f} s"
+        return Wish(name, asked, degrees, limit, "degrees", seconds=_span(key))
     what = "hips" if key.pose is None or key.root_only else "pose"
     limit = 100 * max(_POSE_TOLERANCE, key.most)
-    return Wish(f"{what} at {key.seconds:.2f} s", asked, 100 * metres, limit, "cm")
+    return Wish(f"{what} at {key.seconds:.2f} s", asked, 100 * metres, limit, "cm", seconds=_span(key))
 
 
 def _find_remedy(reach: Reach, motion: Motion) -> str:
@@ -148,6 +189,11 @@ def _check_path(request: ShotRequest, way: Way, hips: Tensor) -> Wish:
         away[max(0, math.floor(first)) : max(0, math.ceil(last))] = False
     if not bool(away.any()):
         away[:] = True
-    near = way.curve.nearest(hips, way.arcs)
-    off = vectors.length(hips - way.curve.point(near)[:, :: way.curve.dims - 1])
+    off = _measure_offsets(way, hips)
     return Wish("path", "on the curve", 100 * float(off[away].mean()), 100 * _PATH_TOLERANCE, "cm")
+
+
+def _measure_offsets(way: Way, hips: Tensor) -> Tensor:
+    """Measure the distance of the hips to the way by frame, metres."""
+    near = way.curve.nearest(hips, way.arcs)
+    return vectors.length(hips - way.curve.point(near)[:, :: way.curve.dims - 1])

@@ -18,8 +18,8 @@ class FollowCurve(Command):
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     speed: options.MaybeSpeed = None
-    """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m; 1.2 if not given,
-    and less in corners that turn faster than people who walk do."""
+    """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m; 1.2 if it is not
+    given, and less in corners that turn faster than people who walk do."""
     seconds: options.MaybeNumber = None
     """Duration of the walk; once along the curve if not given."""
     prior: options.Name = "locomotion"
@@ -46,6 +46,8 @@ class FollowCurve(Command):
     """Style of the motion, of those that the prior knows."""
     fps: options.MaybeNumber = None
     """Frame rate of the motion; 30, or that of the clip it goes on from, if not given."""
+    prices: bool = False
+    """Solve again without each wish, and tell what it costs the others."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
     camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None

@@ -36,7 +36,7 @@ def run(command: FollowCurve) -> int:
     plan = _plan(command, curve, prior, character) if cornering or _wishes_more(command) else None
     with show_progress("walking", quiet=command.quiet) as progress:
         if plan is not None:
-            done = play_shot(plan, [], priors.load_inbetweener(), progress=progress)
+            done = play_shot(plan, [], priors.load_inbetweener(), prices=command.prices, progress=progress)
         else:
             done = walk(prior, request, seed=command.seed, progress=progress, character=character)
     video = None if done.interrupted else command.video
@@ -50,7 +50,9 @@ def run(command: FollowCurve) -> int:
 def _wishes_more(command: FollowCurve) -> bool:
     """Return whether more is wished than to walk along a curve."""
     told = command.keys is not None or command.gait or command.style or command.fps is not None
-    return bool(told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop)
+    return bool(
+        told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop or command.prices
+    )
 
 
 def _plan(command: FollowCurve, curve: Curve, prior: LstmGmmDensity, character: Character) -> ShotPlan:

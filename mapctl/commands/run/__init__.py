@@ -21,6 +21,8 @@ class RunScene(Command):
     rig: options.OutRig = "canonical"
     """Body of the actors: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
+    prices: bool = False
+    """Solve every actor's shot again without each of its wishes, and tell what it costs the others."""
     strict: bool = False
     """Exit with status 3 where not all that was asked of every actor holds."""
     quiet: bool = False

@@ -82,7 +82,15 @@ def _solve(
                     done.append(walk(prior, plan, seed=actor.seed, progress=progress, character=character))
                 else:
                     earlier = [one for one in done if isinstance(one, PlayedShot)]
-                    done.append(play_shot(plan, earlier, inbetweener, keep_apart=scene.keep_apart, progress=progress))
+                    made = play_shot(
+                        plan,
+                        earlier,
+                        inbetweener,
+                        keep_apart=scene.keep_apart,
+                        prices=command.prices,
+                        progress=progress,
+                    )
+                    done.append(made)
         except KeyboardInterrupt:
             if not done:
                 raise

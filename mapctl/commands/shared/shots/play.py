@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from controllers.following.follow import FollowSettings
+from controllers.shots.prices import measure_prices
 from controllers.shots.request import Others, ShotRequest
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from mapctl import report
@@ -71,6 +72,7 @@ class PlayedShot:
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s",
             *wishes,
+            *(f"price     {price.sentence}" for price in self.solution.prices),
             f"cost      {1000 * self.solution.seconds / motion.num_frames:.1f} ms a frame",
             f"status    {self.solution.status.text}",
         ]
@@ -82,22 +84,31 @@ def play_shot(
     inbetweener: Inbetweener,
     *,
     keep_apart: float | None = None,
+    prices: bool = False,
     progress: Progress | None = None,
 ) -> PlayedShot:
-    """Solve an actor's shot; who was solved earlier is walked around."""
+    """Solve an actor's shot; who was solved earlier is walked around. For `prices` it is solved again without each
+    wish."""
     plan.prior.warm_up()
     if keep_apart is not None and earlier:
         plan = replace(plan, request=replace(plan.request, others=_find_others(plan, earlier, keep_apart)))
     footing = FootContact(rest_height=plan.character.toe_rest_height)
-    solution = solve_shot(
-        plan.prior,
-        inbetweener,
-        plan.request,
-        generator=torch.Generator().manual_seed(plan.actor.seed),
-        settings=ShotSettings(follow=FollowSettings(footing=footing)),
-        skeleton=plan.character.skeleton,
-        progress=progress,
-    )
+
+    def solve(request: ShotRequest, shown: Progress | None = None) -> ShotSolution:
+        return solve_shot(
+            plan.prior,
+            inbetweener,
+            request,
+            generator=torch.Generator().manual_seed(plan.actor.seed),
+            settings=ShotSettings(follow=FollowSettings(footing=footing)),
+            skeleton=plan.character.skeleton,
+            progress=shown,
+        )
+
+    solution = solve(plan.request, progress)
+    if prices:
+        found = measure_prices(lambda request: solve(request).wishes, plan.request, solution.wishes)
+        solution = replace(solution, prices=found)
     return PlayedShot(plan, solution)
 
 

@@ -1,0 +1,61 @@
+"""Slowing down before corners: gentle curves are left alone, corners are slowed for in time, reversals are found."""
+
+import numpy as np
+import pytest
+import torch
+
+from mapctl import curves
+from mapctl.intent.cornering import find_reversals, slow_for_corners, turns_sharply
+from mapctl.intent.path import SpeedProfile
+
+USUAL = SpeedProfile.constant(1.2)
+
+
+def polygon(*points, closed=False):
+    return curves.from_points(np.array(points, dtype=float), closed=closed)
+
+
+@pytest.mark.parametrize("shape", ["line:5", "circle:1", "circle:4", "wave:0.8x8", "figure8:1.5", "s:8"])
+def test_gentle_curves_are_walked_as_fast_as_asked(shape):
+    assert slow_for_corners(curves.read(shape), USUAL) is USUAL
+    assert not turns_sharply(curves.read(shape))
+
+
+@pytest.mark.parametrize("degrees", [90, 130, -90])
+def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
+    turn = np.radians(degrees)
+    curve = polygon((0, 0), (0, 4), (4 * np.sin(turn), 4 + 4 * np.cos(turn)))
+    profile = slow_for_corners(curve, USUAL)
+    assert turns_sharply(curve)
+    assert 0.7 < profile.at(4.0) <= 0.81
+    assert profile.at(1.0) == profile.at(7.0) == 1.2
+    arcs = np.arange(0.0, 8.0, 0.05)
+    squares = np.array([profile.at(arc) for arc in arcs]) ** 2
+    assert np.abs(np.diff(squares)).max() / (2 * 0.05) < 0.95, "braking and setting off, m/s^2"
+
+
+def test_who_is_slow_already_does_not_slow_down():
+    slow = SpeedProfile.constant(0.7)
+    assert slow_for_corners(polygon((0, 0), (0, 4), (4, 4)), slow) is slow
+
+
+def test_a_loop_slows_down_for_the_corner_at_its_beginning():
+    square = polygon((0, 0), (0, 4), (4, 4), (4, 0), (0, 0), closed=True)
+    profile = slow_for_corners(square, USUAL)
+    assert profile.at(0.0) == pytest.approx(profile.at(square.length), abs=1e-9)
+    assert profile.at(0.0) < 0.9
+    assert profile.at(square.length - 0.3) < 1.15
+
+
+def test_reversals_are_found_where_they_are_and_hairpins_are_none():
+    there = find_reversals(polygon((0, 0), (0, 4), (0, 1), (2, 1)))
+    assert there == pytest.approx([4.0], abs=0.05)
+    assert find_reversals(polygon((0, 0), (0, 4), (0.5, 4), (0.5, 0))) == []
+    assert find_reversals(curves.read("figure8:1.5")) == []
+
+
+def test_profiles_with_many_arcs_are_linear_between_them():
+    profile = SpeedProfile((0.0, 1.0, 4.0), (1.0, 2.0, 0.5))
+    at = torch.tensor([-1.0, 0.0, 0.25, 1.0, 2.0, 4.0, 9.0])
+    expected = np.interp(at.numpy(), profile.arcs, profile.speeds)
+    assert [profile.at(float(arc)) for arc in at] == pytest.approx(expected.tolist())

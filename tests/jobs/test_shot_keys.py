@@ -1,0 +1,239 @@
+"""Keys of shots that tell poses, places and facings; ends in a clip's frame; loops; and what wishes cost."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import walk
+
+import priors
+from controllers.shots.arrival import Arrival, arrive
+from controllers.shots.loop import OVERLAP, close_loop
+from controllers.shots.posing import as_reaches, measure_pose_error, meet_poses
+from controllers.shots.prices import measure_prices
+from controllers.shots.reaching import ReachTargets, settle_reaches
+from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
+from controllers.shots.way import Way, plan_way
+from controllers.shots.wishes import Wish, describe_fights
+from mapctl import curves, kinematics
+from mapctl.errors import RequestError
+from mapctl.intent.path import SpeedProfile
+from mapctl.metrics import worst_frame
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, TOES
+
+LINE = curves.line(length=4)
+ENDS = list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))
+
+
+@pytest.fixture(scope="module")
+def inbetweener():
+    return priors.load_inbetweener()
+
+
+@pytest.fixture(scope="module")
+def way() -> Way:
+    return plan_way(ShotRequest(LINE, seconds=4.0, speed=SpeedProfile.constant(1.0)))
+
+
+@pytest.fixture(scope="module")
+def walked(way) -> Motion:
+    motion = walk(len(way.speeds))
+    along = torch.zeros_like(motion.root_position)
+    along[:, 2] = way.arcs
+    return replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]) + along)
+
+
+def crouched() -> Motion:
+    """One frame with a lifted left arm and bent knees."""
+    motion = walk(1)
+    quats = motion.local_quat_xyzw.clone()
+    for name, x in (("leftUpperArm", 0.9), ("leftLowerLeg", 0.3), ("rightLowerLeg", 0.3)):
+        quats[0, CANONICAL.index(name)] = torch.tensor([math.sin(x / 2), 0.0, 0.0, math.cos(x / 2)])
+    return replace(motion, local_quat_xyzw=quats)
+
+
+# Poses, places, facings
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        PoseKey(2.0, crouched()),
+        PoseKey(2.0, crouched(), hold_seconds=0.4, facing_deg=40.0),
+        PoseKey(2.0, place=(0.15, 2.1)),
+        PoseKey(2.0, facing_deg=50.0),
+        PoseKey(2.0, height=0.8),
+        PoseKey(2.0, crouched(), root_only=True, facing_deg=-30.0),
+    ],
+    ids=["pose", "held and turned", "place", "facing", "height", "hips"],
+)
+def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, way, inbetweener):
+    made, (met,) = meet_poses(walked, (key,), way, inbetweener)
+    metres, degrees = measure_pose_error(made, met)
+    if key.tells_facing_alone:
+        assert degrees < 0.1
+    else:
+        assert metres < 0.001
+    if key.facing_deg is not None:
+        there = float(torch.rad2deg(kinematics.heading(made.local_quat_xyzw[60:61, 0])))
+        assert there == pytest.approx(key.facing_deg, abs=0.1)
+    if key.place is not None:
+        torch.testing.assert_close(made.root_position[60, ::2], torch.tensor(key.place).double(), atol=1e-3, rtol=0)
+    if key.height is not None:
+        assert float(made.root_position[60, 1]) == pytest.approx(0.8, abs=1e-3)
+    torch.testing.assert_close(made.root_position[:20], walked.root_position[:20])
+    torch.testing.assert_close(made.local_quat_xyzw[-15:], walked.local_quat_xyzw[-15:])
+    peaks = worst_frame.measure_peaks(made.joint_positions()[:, ENDS], made.root_position, 30.0)
+    assert peaks.step * 30 < 5.5
+
+
+def test_a_rough_key_may_be_missed_by_its_tolerance_and_no_more(walked, way, inbetweener):
+    key = PoseKey(2.0, crouched(), tolerance=0.12)
+    made, (met,) = meet_poses(walked, (key,), way, inbetweener)
+    assert 0.01 < measure_pose_error(made, met)[0] <= 0.12
+    facing = PoseKey(2.0, facing_deg=60.0, tolerance=20.0)
+    made, (met,) = meet_poses(walked, (facing,), way, inbetweener)
+    assert 10 < measure_pose_error(made, met)[1] <= 20
+
+
+def test_a_key_may_be_met_within_its_frames(walked, way, inbetweener):
+    key = PoseKey(2.0, crouched(), within_frames=8)
+    _, (met,) = meet_poses(walked, (key,), way, inbetweener)
+    assert abs(met.start - 60) <= 8
+
+
+def test_two_keys_close_together_are_both_met(walked, way, inbetweener):
+    keys = (PoseKey(2.0, crouched()), PoseKey(2.4, facing_deg=20.0, place=(0.0, 2.5)))
+    made, met = meet_poses(walked, keys, way, inbetweener)
+    assert max(measure_pose_error(made, one)[0] for one in met) < 0.001
+
+
+def test_limbs_of_a_pose_become_reaches_to_where_they_are_in_it(walked, way):
+    key = PoseKey(2.0, crouched(), joints=("leftHand",), place=(0.2, 2.2), facing_deg=0.0)
+    (reach,) = as_reaches((key,), way, walked.slice(0, 1))
+    hips = crouched().joint_positions()[0]
+    expected = hips[CANONICAL.index("leftHand")] - hips[0] + torch.tensor([0.2, float(hips[0, 1]), 2.2]).double()
+    torch.testing.assert_close(torch.tensor(reach.places["leftHand"]).double(), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: PoseKey(1.0), "tells nothing"),
+        (lambda: PoseKey(1.0, crouched(), tolerance={"leftHand": 0.1}), "one number"),
+        (lambda: ShotRequest(LINE, poses=(PoseKey(1.0, facing_deg=0), PoseKey(1.05, facing_deg=9))), "two frames"),
+        (lambda: ShotRequest(LINE, seconds=2.0, poses=(PoseKey(3.0, facing_deg=0.0),)), "not within the shot's 2 s"),
+        (lambda: ShotRequest(LINE, loop=True), "closed curve"),
+        (lambda: ShotRequest(curves.circle(radius=2), loop=True, seconds=3.0), "once around"),
+    ],
+    ids=["nothing", "tolerance", "two at once", "too late", "open loop", "loop with seconds"],
+)
+def test_keys_that_make_no_sense_are_refused(make, said):
+    with pytest.raises(RequestError, match=said):
+        make()
+
+
+# Rough reaches
+
+
+def test_a_reach_happens_when_its_hand_is_nearest(walked):
+    hand = walked.joint_positions()[:, CANONICAL.index("leftHand")]
+    reach = Reach(2.0, {"leftHand": tuple(hand[66].tolist())}, within_frames=10)
+    (settled,) = settle_reaches((reach,), walked)
+    assert settled.seconds == pytest.approx(66 / 30)
+    (exact,) = settle_reaches((replace(reach, within_frames=0),), walked)
+    assert exact.seconds == 2.0
+    (near,) = settle_reaches((replace(reach, within_frames=3),), walked)
+    assert abs(near.seconds - 2.0) <= 3 / 30 + 1e-9
+
+
+def test_a_rough_reach_asks_for_less(walked):
+    hand = walked.joint_positions()[60, CANONICAL.index("leftHand")]
+    place = hand + torch.tensor([0.3, 0.0, 0.0])
+    told = {"leftHand": tuple(place.tolist())}
+
+    def relaxed(tolerance) -> torch.Tensor:
+        targets = ReachTargets.of((Reach(2.0, told, 0.0, tolerance),), walked.num_frames)
+        return targets.relaxed(walked).targets.places[60, CANONICAL.index("leftHand")]
+
+    torch.testing.assert_close(relaxed(0.0), place)
+    assert 0.07 < float((relaxed(0.1) - place).norm()) < 0.1
+    torch.testing.assert_close(relaxed({"leftHand": 0.1}), relaxed(0.1))
+    torch.testing.assert_close(relaxed({"rightHand": 0.1}), place)
+    torch.testing.assert_close(relaxed(0.5), hand, atol=1e-6, rtol=0)
+
+
+# Ends in a clip, loops
+
+
+def test_a_shot_ends_in_a_clips_frame_and_moves_as_the_clip_does(walked, inbetweener):
+    arrival = Arrival.of(walk(120, turn_rate=0.4), 70).bring_to(LINE, 3.9)
+    made = arrive(walked, arrival, inbetweener)
+    assert made.num_frames == walked.num_frames
+    torch.testing.assert_close(made.joint_positions()[-1], arrival.motion.joint_positions()[0], atol=1e-6, rtol=0)
+    ahead = torch.cat([made.joint_positions(), arrival.motion.joint_positions()[1:3]])
+    peaks = worst_frame.measure_peaks(ahead[-30:, ENDS], ahead[-30:, 0], 30.0)
+    assert peaks.step * 30 < 5.5
+    torch.testing.assert_close(made.root_position[:60], walked.root_position[:60])
+
+
+def test_a_curve_is_brought_to_where_a_clip_is():
+    arrival = Arrival.of(walk(90, turn_rate=0.5), 50)
+    brought = arrival.bring_curve(curves.wave(amplitude=0.5, length=4))
+    torch.testing.assert_close(brought.points[-1], arrival.motion.root_position[0, ::2])
+    tangent = brought.tangent(brought.length)
+    assert abs(math.remainder(math.atan2(*tangent.tolist()) - arrival.direction, 2 * math.pi)) < 0.02
+
+
+@pytest.mark.parametrize("frame", [-1, 88, 200])
+def test_a_clip_has_frames_after_the_one_it_is_ended_in(frame):
+    with pytest.raises(RequestError, match="0:88"):
+        Arrival.of(walk(90), frame)
+
+
+def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
+    """One lap of a walk whose stride does not divide it."""
+    frames = 127
+    long = walk(frames + OVERLAP, turn_rate=2 * math.pi / (frames / 30))
+    made = close_loop(long, frames, inbetweener)
+    assert made.num_frames == frames
+    twice = torch.cat([made.joint_positions(), made.joint_positions()])
+    steps = torch.diff(twice, dim=0).norm(dim=-1)[:, ENDS].amax(dim=1)
+    assert float(steps[frames - 1]) <= 1.5 * float(steps[: frames - 1].max())
+    torch.testing.assert_close(made.root_position[60:], long.root_position[60:frames])
+
+
+# What wishes cost
+
+
+def test_what_a_wish_costs_is_what_others_gain_without_it():
+    request = ShotRequest(
+        LINE, seconds=4.0, looks=(Look(1.0, (0, 1, 9)),), poses=(PoseKey(2.0, facing_deg=9.0),), stand_at_end=True
+    )
+
+    def solve(without: ShotRequest) -> tuple[Wish, ...]:
+        off = 1.0 + 6.0 * bool(without.poses)
+        still = Wish("stand at the end", "still", 2.0, 6.0, "cm/s")
+        return (Wish("path", "on the curve", off, 15.0, "cm"), still)
+
+    prices = measure_prices(solve, request, solve(request))
+    by_name = {price.wish: price.gains for price in prices}
+    assert by_name == {"look at 1 s": (), "pose at 2 s": (("path", 6.0, "cm"),), "stand at the end": ()}
+    assert "path 6.0 cm" in prices[0].sentence
+
+
+def test_wishes_that_fight_are_named_together(walked, way):
+    wishes = (
+        Wish("leftHand at 2 s", "there", 14.0, 1.0, "cm", remedy="0.4 s later", seconds=(2.0, 2.0)),
+        Wish("look at 2.2 s", "straight", 40.0, 15.0, "degrees", seconds=(2.2, 2.2)),
+        Wish("look at 3.9 s", "straight", 40.0, 15.0, "degrees", seconds=(3.9, 3.9)),
+        Wish("path", "on the curve", 1.0, 15.0, "cm"),
+    )
+    first = describe_fights(wishes, way, walked)[0]
+    assert "leftHand at 2 s" in first
+    assert "13.0 cm short (0.4 s later would do)" in first
+    assert "look at 2.2 s, 25.0 degrees short" in first
+    assert "3.9" not in first
+    assert "cm off at that time" in first
