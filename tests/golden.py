@@ -126,10 +126,27 @@ def prepare(folder: Path) -> None:
 
 
 def kind_of_machine() -> str:
-    """What bits depend on: processor, instruction sets and libraries."""
+    """What bits depend on: processor, instruction sets, libraries, and how these add: two processors of one name, whose
+    caches are shared otherwise, may not add in the same order."""
     processor = llvmlite.binding.get_host_cpu_name()
     versions = f"torch {torch.__version__}, numpy {numpy.__version__}, numba {numba.__version__}"
-    return f"{processor}, {torch.backends.cpu.get_cpu_capability()}, {versions}"
+    return f"{processor}, {torch.backends.cpu.get_cpu_capability()}, {versions}, sums {_hash_sums()}"
+
+
+def _hash_sums() -> str:
+    """Hash what the libraries' sums and functions come to, on one thread."""
+    generator, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
+    torch.set_num_threads(1)
+    bits = hashlib.sha256(llvmlite.binding.get_host_cpu_features().flatten().encode())
+    for rows, inner, columns in ((1, 17, 64), (8, 64, 256), (32, 500, 2000), (200, 130, 130), (1000, 3, 3)):
+        for kind in (torch.float32, torch.float64):
+            one = torch.randn(rows, inner, generator=generator, dtype=kind)
+            other = torch.randn(inner, columns, generator=generator, dtype=kind)
+            product = one @ other
+            for values in (product, product.tanh().exp().sum(dim=0), torch.linalg.svdvals(one), product.numpy().sum()):
+                bits.update(numpy.asarray(values).tobytes())
+    torch.set_num_threads(threads)
+    return bits.hexdigest()[:12]
 
 
 def run_command(name: str) -> dict[str, dict]:

@@ -146,7 +146,11 @@ def _relax(asked: Motion, found: Motion, key: PoseKey) -> Motion:
     off = degrees if key.tells_facing_alone else 100 * away
     allowed = key.most if key.tells_facing_alone else 100 * key.most
     share = 1.0 if off <= allowed else 0.95 * allowed / off  # a slerp's joints stray a little from the chord
-    quats = rotations.slerp(asked.local_quat_xyzw, found.local_quat_xyzw.to(asked.local_quat_xyzw), torch.tensor(share))
+    quats = rotations.slerp(
+        asked.local_quat_xyzw,
+        found.local_quat_xyzw.to(asked.local_quat_xyzw),
+        torch.full((1, asked.num_joints), share, dtype=torch.float64),
+    )
     root = torch.lerp(asked.root_position, found.root_position.to(asked.root_position), share)
     return replace(asked, root_position=root, local_quat_xyzw=quats)
 
