@@ -20,6 +20,8 @@ from mapctl.skeleton import CANONICAL
 
 _WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried
 _MOST_WIDTH = 75
+_TOLERANCE_SHARE = 0.95  # of a tolerance that is made use of
+_MOST_EASINGS = 8
 _HIPS_SPEED, _JOINT_SPEED, _TURN_RATE = 1.3, 2.0, 2.5  # m/s, m/s about the hips, rad/s: at most, on the way to a key
 
 
@@ -140,19 +142,31 @@ def _relax(asked: Motion, found: Motion, key: PoseKey) -> Motion:
     """Return a pose nearer to what the character does anyway, as far as the tolerance allows."""
     if key.most == 0:
         return asked
-    away = float((asked.joint_positions() - found.joint_positions()).norm(dim=-1).max())
-    turned = kinematics.heading(asked.local_quat_xyzw[:, 0]) - kinematics.heading(found.local_quat_xyzw[:, 0])
-    degrees = float(torch.rad2deg(rotations.wrap_angle(turned).abs())[0])
-    off = degrees if key.tells_facing_alone else 100 * away
     allowed = key.most if key.tells_facing_alone else 100 * key.most
-    share = 1.0 if off <= allowed else 0.95 * allowed / off  # a slerp's joints stray a little from the chord
-    quats = rotations.slerp(
-        asked.local_quat_xyzw,
-        found.local_quat_xyzw.to(asked.local_quat_xyzw),
-        torch.full((1, asked.num_joints), share, dtype=torch.float64),
-    )
-    root = torch.lerp(asked.root_position, found.root_position.to(asked.root_position), share)
-    return replace(asked, root_position=root, local_quat_xyzw=quats)
+    share, eased = 1.0, found
+    for _ in range(_MOST_EASINGS):
+        eased = _blend(asked, found, share)
+        off = _measure_off(eased, asked, key)
+        if off <= allowed:
+            break
+        share *= _TOLERANCE_SHARE * allowed / off  # a slerp's joints stray from the chord
+    return eased
+
+
+def _blend(one: Motion, other: Motion, share: float) -> Motion:
+    """Return one frame so far from one pose to another."""
+    weight = torch.full((1, one.num_joints), share, dtype=torch.float64)
+    quats = rotations.slerp(one.local_quat_xyzw, other.local_quat_xyzw.to(one.local_quat_xyzw), weight)
+    root = torch.lerp(one.root_position, other.root_position.to(one.root_position), share)
+    return replace(one, root_position=root, local_quat_xyzw=quats)
+
+
+def _measure_off(pose: Motion, asked: Motion, key: PoseKey) -> float:
+    """Measure how far off a pose is, centimetres, or degrees where only a facing is told."""
+    if key.tells_facing_alone:
+        turned = kinematics.heading(pose.local_quat_xyzw[:, 0]) - kinematics.heading(asked.local_quat_xyzw[:, 0])
+        return float(torch.rad2deg(rotations.wrap_angle(turned).abs())[0])
+    return 100 * float((pose.joint_positions() - asked.joint_positions()).norm(dim=-1).max())
 
 
 def _find_least_width(motion: Motion, pose: Motion, frame: int) -> int:
