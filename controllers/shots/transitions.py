@@ -1,11 +1,11 @@
-"""Transitions between standing and walking: when the first step begins and which foot takes the last one are tried,
-and the in-betweener's answer that a viewer would mind least is taken.
-"""
+"""What the in-betweener is to make of a shot, and which of several ways to ask it a viewer would mind least."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from controllers.inbetweening.pipeline import InfillSettings, fill
 from controllers.inbetweening.proposers.auto import ChoiceSettings, compute_artefact_cost
@@ -43,23 +43,17 @@ class Filling:
     """Frames start to stop that it is within."""
 
 
-def choose_transition(
-    before: Motion, after: Motion, candidates: Sequence[Transition], inbetweener: Inbetweener
-) -> Transition:
-    """Choose the transition from one motion to another, both of the whole shot's frames, that costs a viewer least."""
+def measure_transition_cost(before: Motion, after: Motion, one: Transition, inbetweener: Inbetweener) -> float:
+    """Measure what a viewer would mind of a transition from one motion to another, both of the whole shot's frames,
+    m/s (see `judge`)."""
     frame = torch.arange(before.num_frames)
-
-    def join(one: Transition) -> Filling:
-        missing = (frame >= one.start) & (frame < one.stop)
-        mask = MissingMask.of_frames(missing, before.num_joints)
-        return Filling(join_across(before, after, one), mask, (one.start, one.stop))
-
-    return candidates[choose_filling([join(one) for one in candidates], inbetweener)]
+    missing = MissingMask.of_frames((frame >= one.start) & (frame < one.stop), before.num_joints)
+    return _measure_cost(Filling(join_across(before, after, one), missing, (one.start, one.stop)), inbetweener)
 
 
 def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> int:
-    """Choose the candidate that costs a viewer least: sliding, skating, detours, time on no foot (see
-    `compute_artefact_cost`), and the worst acceleration. The in-betweener's proposals are compared, without MAP."""
+    """Choose the candidate that costs a viewer least (see `judge`). The in-betweener's proposals are compared, without
+    MAP."""
     if len(candidates) == 1:
         return 0
     costs = [_measure_cost(one, inbetweener) for one in candidates]
@@ -75,8 +69,14 @@ def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
     if not bool(missing.frames.any()):
         return 0.0
     done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
-    cost = compute_artefact_cost(done.motion, contacts.to_logits(done.contacts), gap, ChoiceSettings())
-    shown = done.motion.slice(max(0, gap[0] - 2), gap[1] + 2)
+    return judge(done.motion, done.contacts, gap)
+
+
+def judge(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
+    """Judge a filled gap as a viewer would, m/s: sliding, skating, detours, time on no foot (see
+    `compute_artefact_cost`), and the worst acceleration."""
+    cost = compute_artefact_cost(motion, contacts.to_logits(planted), gap, ChoiceSettings())
+    shown = motion.slice(max(0, gap[0] - 2), gap[1] + 2)
     peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
     return cost + _ACCELERATION_WEIGHT * peaks.acceleration
 

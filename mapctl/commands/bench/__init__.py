@@ -50,6 +50,9 @@ class Ablation(PriorTable):
 
     work = "mapctl.commands.bench.ablation"
 
+    shots: options.Count = 0
+    """Instead of walks along curves: the first and last steps of so many random shots, chosen in several ways."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FreeRun(PriorTable):
