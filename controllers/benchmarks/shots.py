@@ -12,7 +12,7 @@ from controllers.shots.request import Look, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
 from controllers.shots.way import plan_way
 from mapctl import curves
-from mapctl.curves.obstacles import Obstacle
+from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.timed_speed import TimedSpeed
@@ -104,9 +104,12 @@ def draw_shot(generator: torch.Generator) -> tuple[ShotRequest, tuple[str, ...]]
         request = replace(request, obstacles=(Obstacle((float(centre[0]), float(centre[1])), uniform(0.2, 0.6)),))
     way = plan_way(request)
     if "reach" in chosen:
-        seconds, left = uniform(2.0, 6.0), bool(choose(2))
-        aside = uniform(0.1, 0.55) if choose(5) else uniform(0.9, 1.4)
-        place = _find_place(way, seconds, ahead=uniform(0.0, 0.35), aside=aside if left else -aside)
+        while True:
+            seconds, left = uniform(2.0, 6.0), bool(choose(2))
+            aside = uniform(0.1, 0.55) if choose(5) else uniform(0.9, 1.4)
+            place = _find_place(way, seconds, ahead=uniform(0.0, 0.35), aside=aside if left else -aside)
+            if float(measure_clearance(request.obstacles, torch.tensor([place]))) >= 0:
+                break
         limb, height = "leftHand" if left else "rightHand", uniform(0.7, 1.7)
         reach = Reach(seconds, {limb: (place[0], height, place[1])}, uniform(0.0, 0.3))
         request = replace(request, reaches=(reach,))
