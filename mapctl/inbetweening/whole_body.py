@@ -25,8 +25,8 @@ _SIGMA_LEAN = 0.08
 """Standard deviation of the hips' offset over feet that stay, metres."""
 _SIGMA_REACH, _SIGMA_BALANCE = 0.004, 0.06  # metres
 _IS_FOOT = torch.tensor([float(name.endswith("Foot")) for name in LIMBS])
-_STRETCH_LIMIT = torch.where(_IS_FOOT > 0, 0.985, 0.9).double()
-"""Share of a limb's length beyond which its target pulls the body nearer."""
+_STRETCH_LIMIT = 0.985
+"""Share of a limb's length beyond which its target pulls the body nearer: arms at one's sides are nearly straight."""
 _FOLD_LIMIT = 0.3
 """Share of a limb's length below which its target pushes the body away."""
 _SOFTPLUS_WIDTH = 0.015  # metres over which either sets in

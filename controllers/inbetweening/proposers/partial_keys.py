@@ -32,6 +32,7 @@ _MIN_ROOT_UNCERTAINTY = 0.02  # metres, of the position of a standing body
 _ROOT_UNCERTAINTY_SHARE = 0.4  # of the distance travelled since the last known position
 _MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory determines the facing
 _STEP_SECONDS = 0.25
+_STRETCH_SHARE = 0.985  # of a limb's length that it reaches
 _MIN_LIMB_SECONDS, _LIMB_ACCELERATION = 0.15, 15.0
 """Least time in which a limb goes to its target, and its acceleration (m/s^2) beyond that: a sixth of what hands and
 feet reach in walking."""
@@ -80,16 +81,31 @@ def propose_through_keys(
 def _reach_exactly(
     query: GapQuery, answer: Proposal, wanted: Bool[Tensor, " frames"]
 ) -> tuple[Proposal, EffectorTargets | None]:
-    """Move a motion that was made through effector targets onto them, by the little that it misses them."""
+    """Move a motion that was made through effector targets so that limbs reach them: the body where limbs alone do
+    not, and no more than that, or it would leave where the network has it."""
     targets = query.effector_targets
     if targets is None:
         return answer, None
+    far = wanted & _find_out_of_reach(answer.motion, targets)
+    if not bool(far.any()):
+        return answer, targets
+    targets, wanted = EffectorTargets(targets.places, targets.wanted & far[:, None]), far
     turning, moving = query.missing.joints, query.missing.root
     stray = torch.full(wanted.shape, _MIN_ROOT_UNCERTAINTY)
     posed = reach_targets(answer.motion, targets, turning=turning, moving=moving, stray=stray)[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
     there = replace(answer, motion=_blend_key_poses(answer.motion, posed, wanted, query))
-    return there, EffectorTargets(reached, targets.wanted)
+    return there, EffectorTargets(reached, query.effector_targets.wanted)
+
+
+def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor, " frames"]:
+    """Find the frames in which a target is farther away than its limb is long."""
+    positions, far = motion.joint_positions(), torch.zeros(motion.num_frames, dtype=torch.bool)
+    for limb in LIMBS.values():
+        length = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+        away = (targets.places[:, limb.end] - positions[:, limb.upper]).norm(dim=-1)
+        far |= targets.wanted[:, limb.end] & (away > _STRETCH_SHARE * length)
+    return far
 
 
 def _add_root_targets(query: GapQuery, hips: Bool[Tensor, " frames"]) -> EffectorTargets | None:
