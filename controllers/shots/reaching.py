@@ -1,5 +1,6 @@
 """Hands and feet that reach: the walk comes near enough, then trunk and limb are made anew around the moment."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -7,9 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.shots.request import Reach
-from controllers.shots.way import Way
+from controllers.shots.request import PoseKey, Reach, ShotRequest
+from controllers.shots.way import Way, bend_way
 from mapctl import rotations
+from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
@@ -28,6 +30,13 @@ _LEAN = 0.05  # metres that leaning adds to what a limb reaches
 _TIPTOE, _CROUCH = 0.15, 1.0  # metres by which a body rises or goes down for a reach
 _STEP_ASIDE = 1.2  # metres between the way and a body that leans and leaves it for a reach
 _TOLERANCE_SHARE = 0.9  # of a tolerance that is made use of
+_BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which the way bends toward a reach, and between its offsets
+_LEAST_BEND, _USUAL_BEND, _MOST_BEND = 0.1, 0.5, 0.9
+"""Metres aside: less the walk makes up for, more takes longer, more still is another way."""
+_BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle is in the way of all of it
+_STRAIGHT_AHEAD = 0.6  # of a limb's length that it reaches down beside whatever it reaches aside
+_LEAST_CROUCH, _MOST_CROUCH, _CROUCH_SECONDS = 0.03, 0.35, 0.7  # metres down; seconds between two crouches
+_BODY = 0.25  # metres from the hips to an obstacle's edge
 _TRUNK = list(CANONICAL.indices(("spine", "chest", "neck", "head")))
 
 
@@ -174,6 +183,73 @@ def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:
                     f"{name} at {reach.seconds:g} s is to be {aside:.1f} m from where the way is then, and {up:.1f} m "
                     f"above or below the joint it reaches from; it is {bones:.2f} m long"
                 )
+
+
+def lean_way(way: Way, request: ShotRequest, rest: Motion) -> Way:
+    """Return a way that is bent toward what is reached for where that is too far aside for an arm and a lean."""
+    length = way.curve.length
+    if not request.reaches or (way.curve.closed and float(way.arcs[-1]) > length):
+        return way
+    along = torch.linspace(0, length, max(2, round(length / _BEND_STEP) + 1), dtype=torch.float64)
+    offsets, met = torch.zeros_like(along), []
+    for reach in request.reaches:
+        arc = way.arcs[min(round(reach.seconds * PRIOR_FPS), len(way.arcs) - 1)]
+        for name, place in reach.places.items():
+            aside = _find_lacking_aside(way, arc, rest, name, place)
+            if abs(aside) > _LEAST_BEND:
+                met.append(float(arc))
+                offsets += aside * smootherstep(1 - (along - arc).abs() / _find_bend_length(aside))
+    offsets = offsets.clamp(-_STEP_ASIDE, _STEP_ASIDE) * smootherstep(along / (0.5 * _BEND_LENGTH))
+    if bool((offsets.abs() < 1e-3).all()):
+        return way
+    # A closed curve is walked once at most here, and bent it is an open one.
+    tried = (bend_way(way, share * offsets, met) for share in _BEND_SHARES)
+    return next((bent for bent in tried if not _is_blocked(bent, request)), way)
+
+
+def _find_bend_length(aside: float) -> float:
+    """Return over how many metres of arc a way bends before and after a reach that is so far aside."""
+    return _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
+
+
+def _find_lacking_aside(way: Way, arc: Tensor, rest: Motion, name: str, place: Sequence[float]) -> float:
+    """Find how far to the left of the way one would have to be for a limb to reach a place, metres; 0 where it does."""
+    limb, positions = LIMBS[name], rest.joint_positions()[0]
+    bones = float(rest.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+    target = way.curve.points.new_tensor(place)
+    ground = target[::2] - way.curve.point(arc)[:: way.curve.dims - 1]
+    left, ahead = float(ground @ way.curve.left(arc)), float(ground @ way.curve.tangent(arc)[:: way.curve.dims - 1])
+    beside = left - float(positions[limb.upper, 0])
+    room = (_EASY_SHARE * bones) ** 2 - ahead**2 - float(target[1] - positions[limb.upper, 1]) ** 2
+    lacking = max(0.0, abs(beside) - math.sqrt(max(0.0, room)))
+    return math.copysign(min(lacking, _MOST_BEND), beside)
+
+
+def list_crouches(reaches: Sequence[Reach], motion: Motion, poses: Sequence[PoseKey]) -> tuple[PoseKey, ...]:
+    """List how far the hips go down, and when, for what is too low to reach for upright; not beside a wished pose."""
+    positions, found = motion.joint_positions(), []
+    for reach in sorted(reaches, key=lambda reach: reach.seconds):
+        frame = min(round(reach.seconds * PRIOR_FPS), motion.num_frames - 1)
+        drop = 0.0
+        for name, place in reach.places.items():
+            limb = LIMBS[name]
+            bones = float(motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+            away = positions[frame, limb.upper] - positions.new_tensor(place)
+            beside = min(float(away[::2].norm()), _EASY_SHARE * bones)
+            down = math.sqrt((_EASY_SHARE * bones) ** 2 - beside**2) if beside < _STRAIGHT_AHEAD * bones else 0.0
+            down = max(down, _STRAIGHT_AHEAD * bones)
+            drop = max(drop, float(away[1]) - down) if name.endswith("Hand") else drop
+        times = [key.seconds for key in (*poses, *found)]
+        if drop > _LEAST_CROUCH and all(abs(time - reach.seconds) > _CROUCH_SECONDS for time in times):
+            height = float(motion.root_position[frame, 1]) - min(drop, _MOST_CROUCH)
+            found.append(PoseKey(reach.seconds, height=height, hold_seconds=reach.hold_seconds))
+    return tuple(found)
+
+
+def _is_blocked(way: Way, request: ShotRequest) -> bool:
+    """Return whether a way leads through an obstacle."""
+    places = way.curve.point(way.arcs)[:, :: way.curve.dims - 1]
+    return bool(request.obstacles) and float(measure_clearance(request.obstacles, places).amin()) < _BODY
 
 
 def _lead_about(

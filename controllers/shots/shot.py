@@ -22,7 +22,7 @@ from controllers.shots.looking import turn_heads
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.posing import as_reaches, meet_poses, pose_frames
 from controllers.shots.prices import Price
-from controllers.shots.reaching import ReachTargets, check_reaches, settle_reaches
+from controllers.shots.reaching import ReachTargets, check_reaches, lean_way, list_crouches, settle_reaches
 from controllers.shots.request import ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.timeline import Span, lay_timeline
@@ -84,13 +84,14 @@ def solve_shot(
     settings, generator = settings or ShotSettings(), generator or torch.Generator().manual_seed(0)
     character = Character(skeleton, settings.follow.footing.rest_height)
     way = plan_way(request)
-    frames = len(way.speeds)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
     told = as_reaches(request.poses, way, rest)
     poses = tuple(key for key in request.poses if not key.joints)
     request = replace(request, reaches=(*request.reaches, *told), poses=poses)
-    walked_way = way.walked_on(OVERLAP) if request.loop else way
     check_reaches(request.reaches, way, rest)
+    way = lean_way(way, request, rest)
+    frames = len(way.speeds)
+    walked_way = way.walked_on(OVERLAP) if request.loop else way
     pieces, walked = walk_pieces(
         prior, request, walked_way, rest, character=character, settings=settings, generator=generator, progress=progress
     )
@@ -104,6 +105,7 @@ def solve_shot(
         motion = arrive(motion, arrival, inbetweener)
     motion, met = meet_poses(motion, request.poses, way, inbetweener)
     reaches = settle_reaches(request.reaches, motion)
+    motion, _ = meet_poses(motion, list_crouches(reaches, motion, request.poses), way, inbetweener)
     if reaches:
         reach = ReachTargets.of(reaches, frames).relaxed(motion).within_reach(motion)
         free = reach.free_limbs(motion.num_joints, pose_frames(met, frames))

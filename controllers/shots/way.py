@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,6 +24,8 @@ from mapctl.numerics import vectors
 _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far
 _APART_MARGIN = 0.15  # metres beyond the distance to others: hips sway, and are early or late
 _TURN_SECONDS = 0.6  # of standing where a curve reverses
+_FINE_STEP = 0.02  # metres of arc
+_MADE_UP = 3.0  # metres of arc over which one makes up for a longer way
 _MOST_FRAMES = 108_000
 _MEETING_FRAMES = 6  # frames by which either may be early or late
 
@@ -32,18 +35,29 @@ class Way:
     """Where a character is to be at each frame."""
 
     curve: Curve
-    """Curve that is clear of obstacles and others."""
+    """Curve that is clear of obstacles and others, and near enough to what is reached for."""
     speeds: Float[Tensor, " frames"]
     """Speed along it, m/s."""
     arcs: Float[Tensor, " frames"]
     """Arc along it, metres."""
+    wished: Curve
+    """Curve before it was bent toward what is reached for."""
+    wished_arcs: Float[Tensor, " frames"]
+    """Arc along that, metres."""
+    aside: Float[Tensor, " frames"]
+    """How far aside of that the way leads, metres."""
     note: str | None = None
     """What was changed about the request, or why it cannot hold."""
 
     def walked_on(self, frames: int) -> "Way":
         """Return the way of a loop, walked on for some more frames."""
-        arcs = torch.cat([self.arcs, self.curve.length + self.arcs[:frames]])
-        return replace(self, speeds=torch.cat([self.speeds, self.speeds[:frames]]), arcs=arcs)
+        return replace(
+            self,
+            speeds=torch.cat([self.speeds, self.speeds[:frames]]),
+            arcs=torch.cat([self.arcs, self.curve.length + self.arcs[:frames]]),
+            wished_arcs=torch.cat([self.wished_arcs, self.wished.length + self.wished_arcs[:frames]]),
+            aside=torch.cat([self.aside, self.aside[:frames]]),
+        )
 
 
 def plan_way(request: ShotRequest) -> Way:
@@ -52,7 +66,7 @@ def plan_way(request: ShotRequest) -> Way:
     speeds = _plan_speeds(request, request.curve)
     arcs = integrate_speeds(speeds, PRIOR_FPS)
     if not request.obstacles and request.others is None:
-        return Way(request.curve, speeds, arcs)
+        return _plain(request.curve, speeds)
 
     at_start = float(measure_clearance(request.obstacles, request.curve.start[None, :: request.curve.dims - 1]))
 
@@ -68,10 +82,43 @@ def plan_way(request: ShotRequest) -> Way:
 
     offsets = find_detour(request.curve, clearance)
     if offsets is None:
-        return Way(request.curve, speeds, arcs, "no way leads around the obstacles and past the others")
+        note = "no way leads around the obstacles and past the others"
+        return replace(_plain(request.curve, speeds), note=note)
     curve = apply_detour(request.curve, offsets)
     speeds = _plan_speeds(request, curve)
-    return Way(curve, speeds, integrate_speeds(speeds, PRIOR_FPS))
+    return _plain(curve, speeds)
+
+
+def _plain(curve: Curve, speeds: Float[Tensor, " frames"]) -> Way:
+    arcs = integrate_speeds(speeds, PRIOR_FPS)
+    return Way(curve, speeds, arcs, curve, arcs, torch.zeros_like(arcs))
+
+
+def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) -> Way:
+    """Return a way moved sideways by offsets, metres to the left, at evenly spaced arcs. Whenever one would have been
+    at one of the arcs `met`, metres, one is beside it: what a bend is longer by is made up for gradually before."""
+    curve = apply_detour(way.curve, offsets)
+    if curve is way.curve:
+        return way
+    length = way.curve.length
+    before = torch.linspace(0, length, max(2, round(length / _FINE_STEP) + 1), dtype=torch.float64)
+    at = torch.linspace(0, length, len(offsets), dtype=torch.float64)
+    aside = torch.from_numpy(np.interp(before.numpy(), at.numpy(), offsets.numpy()))
+    ground = way.curve.point(before)[:, :: way.curve.dims - 1] + aside[:, None] * way.curve.left(before)
+    along = torch.cat([ground.new_zeros(1), vectors.length(torch.diff(ground, dim=0)).cumsum(0)])
+    longer = np.interp([*sorted(met), length], before.numpy(), (along - before).numpy())
+    knots, gained = [0.0], [0.0]
+    for arc, extra in zip([*sorted(met), length], longer, strict=True):
+        if arc - _MADE_UP > knots[-1]:
+            knots.append(arc - _MADE_UP)
+            gained.append(gained[-1])
+        if arc > knots[-1]:
+            knots.append(arc)
+            gained.append(float(extra))
+    arcs = way.arcs + torch.from_numpy(np.interp(way.arcs.numpy(), knots, gained))
+    speeds = torch.diff(arcs, append=2 * arcs[-1:] - arcs[-2:-1]) * PRIOR_FPS
+    moved = torch.from_numpy(np.interp(way.arcs.numpy(), at.numpy(), offsets.abs().numpy()))
+    return replace(way, curve=curve, speeds=speeds, arcs=arcs, wished_arcs=way.arcs, aside=moved)
 
 
 def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]:

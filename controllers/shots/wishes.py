@@ -25,6 +25,7 @@ _POSE_TOLERANCE, _FACING_TOLERANCE_DEG = 0.001, 0.1  # metres
 _LOOK_TOLERANCE_DEG = 15.0
 _STILL_TOLERANCE = 0.06  # m/s
 _NEAR_REACH_SECONDS = 1.0
+_ASIDE = 0.05  # metres beside the curve, from which on a way is bent toward a reach
 _STILL_AT_START, _STILL_AT_END = 12, 24  # frames at PRIOR_FPS in which one is to stand, beginning and ending
 _FIGHT_FRAMES = 20  # before and after a wish, in which others are against it
 
@@ -182,7 +183,7 @@ def _find_remedy(reach: Reach, motion: Motion) -> str:
 
 def _check_path(request: ShotRequest, way: Way, hips: Tensor) -> Wish:
     """Measure the mean distance to the way, away from reaches."""
-    away = torch.ones(len(hips), dtype=torch.bool)
+    away = way.aside < _ASIDE
     for reach in request.reaches:
         first = (reach.seconds - _NEAR_REACH_SECONDS) * PRIOR_FPS
         last = (reach.seconds + reach.hold_seconds + _NEAR_REACH_SECONDS) * PRIOR_FPS
@@ -195,5 +196,5 @@ def _check_path(request: ShotRequest, way: Way, hips: Tensor) -> Wish:
 
 def _measure_offsets(way: Way, hips: Tensor) -> Tensor:
     """Measure the distance of the hips to the way by frame, metres."""
-    near = way.curve.nearest(hips, way.arcs)
-    return vectors.length(hips - way.curve.point(near)[:, :: way.curve.dims - 1])
+    near = way.wished.nearest(hips, way.wished_arcs)
+    return vectors.length(hips - way.wished.point(near)[:, :: way.wished.dims - 1])

@@ -79,12 +79,15 @@ class WithinReach:
     """Distance that the limb reaches without strain, metres."""
     sigma: float = 0.02
     """Standard deviation of the distance that it would have to be longer, metres."""
+    robust: float = 0.1
+    """Such distance beyond which the energy rises linearly, metres: nobody lunges for what is out of reach."""
     name: str = "within reach"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats."""
-        return 0.5 * (self.residual(trial) / self.sigma).square()
+        lacking = self.residual(trial) / self.robust
+        return (self.robust / self.sigma) ** 2 * ((1 + lacking.square()).sqrt() - 1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Distance beyond reach, metres; 0 where the limb reaches."""

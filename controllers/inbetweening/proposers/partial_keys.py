@@ -89,13 +89,13 @@ def _reach_exactly(
     far = wanted & _find_out_of_reach(answer.motion, targets)
     if not bool(far.any()):
         return answer, targets
-    targets, wanted = EffectorTargets(targets.places, targets.wanted & far[:, None]), far
+    told, targets, wanted = targets, EffectorTargets(targets.places, targets.wanted & far[:, None]), far
     turning, moving = query.missing.joints, query.missing.root
     stray = torch.full(wanted.shape, _MIN_ROOT_UNCERTAINTY)
     posed = reach_targets(answer.motion, targets, turning=turning, moving=moving, stray=stray)[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
     there = replace(answer, motion=_blend_key_poses(answer.motion, posed, wanted, query))
-    return there, EffectorTargets(reached, query.effector_targets.wanted)
+    return there, EffectorTargets(reached, told.wanted)
 
 
 def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor, " frames"]:
