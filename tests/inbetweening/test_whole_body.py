@@ -63,7 +63,7 @@ def test_what_an_arm_reaches_alone_hardly_moves_the_rest_and_what_is_low_bends_t
     near, _ = reach(motion, asked(motion, 1, HAND, beside(motion, 1, ahead=0.3)))
     low, _ = reach(motion, asked(motion, 1, HAND, beside(motion, 1, up=-1.1, ahead=0.35)))
     assert (near.root_position - motion.root_position)[1].norm() < 0.01
-    assert (motion.root_position - low.root_position)[1, 1] > 0.1
+    assert (motion.root_position - low.root_position)[1, 1] > 0.08  # with a nearly straight arm
     for side in ("left", "right"):
         joints = [CANONICAL.index(side + name) for name in ("UpperLeg", "LowerLeg", "Foot")]
         assert forward(low, joints) > forward(motion, joints) - 0.02

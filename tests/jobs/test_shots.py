@@ -300,12 +300,29 @@ def test_a_shot_that_is_interrupted_is_not_half_a_shot(monkeypatch):
         solve_shot(prior, priors.load_inbetweener(), ShotRequest(LINE, seconds=3.0))
 
 
+def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
+    prior = priors.load("locomotion")
+    reach = Reach(2.0, {"leftHand": (1.3, 0.9, 2.4)})
+    done = solve_shot(
+        prior, priors.load_inbetweener(), ShotRequest(curves.line(length=6), seconds=4.0, reaches=(reach,))
+    )
+    by_name = {wish.name.split(" at")[0]: wish for wish in done.wishes}
+    assert by_name["leftHand"].holds
+    assert by_name["path"].holds, "away from the reach"
+    hips = done.motion.root_position[:, 0]
+    assert 0.3 < float(hips[60]) < 1.0
+    assert float(hips[[0, -1]].abs().max()) < 0.1
+    ends = done.motion.joint_positions()[:, list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))]
+    assert worst_frame.measure_peaks(ends, done.motion.root_position, 30.0).step * 30 < 5.5
+
+
 def test_a_reach_that_is_far_off_is_told_with_its_distance():
     prior = priors.load("locomotion")
-    request = ShotRequest(curves.line(length=2.5), seconds=2.0, reaches=(Reach(1.0, {"leftHand": (1.5, 1.2, 1.2)}),))
+    wide = Reach(1.0, {"leftHand": (1.2, 1.2, 1.2), "rightHand": (-1.2, 1.2, 1.2)})
+    request = ShotRequest(curves.line(length=2.5), seconds=2.0, reaches=(wide,))
     done = solve_shot(prior, priors.load_inbetweener(), request)
     assert not done.status.ok
-    assert "leftHand at 1 s" in done.status.text
+    assert "leftHand, rightHand at 1 s" in done.status.text
     missed = next(wish for wish in done.wishes if wish.name.startswith("leftHand"))
     assert missed.residual > 20
     assert missed.remedy.endswith("cm nearer")
