@@ -11,11 +11,11 @@ from controllers.benchmarks.shots import draw_shot
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.joining import JoinSettings, Piece, join_pieces
-from controllers.shots.reaching import check_reaches
+from controllers.shots.keys.reaching import check_reaches
+from controllers.shots.planning.way import plan_way
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import ShotSettings, walk_pieces
 from controllers.shots.transitions import judge
-from controllers.shots.way import plan_way
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask

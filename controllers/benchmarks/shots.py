@@ -8,9 +8,9 @@ import torch
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.following.follow import follow
+from controllers.shots.planning.way import plan_way
 from controllers.shots.request import Look, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
-from controllers.shots.way import plan_way
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from controllers.shots.timeline import Span
+from controllers.shots.planning.timeline import Span
 from controllers.shots.transitions import Transition, join_across, measure_transition_cost
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener

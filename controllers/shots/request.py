@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.shots.arrival import Arrival
-from controllers.shots.lead import Lead
+from controllers.shots.clips.arrival import Arrival
+from controllers.shots.clips.lead import Lead
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError

@@ -16,17 +16,18 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.arrival import arrive
+from controllers.shots.clips.arrival import arrive
 from controllers.shots.joining import TAIL, JoinSettings, Piece, join_pieces, spread_over
-from controllers.shots.looking import turn_heads
+from controllers.shots.keys.looking import turn_heads
+from controllers.shots.keys.posing import as_reaches, meet_poses, pose_frames
+from controllers.shots.keys.reaching import ReachTargets, check_reaches, lean_way, list_crouches, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
-from controllers.shots.posing import as_reaches, meet_poses, pose_frames
+from controllers.shots.planning.timeline import Span, lay_timeline
+from controllers.shots.planning.way import Way, cut_curve, plan_way
 from controllers.shots.prices import Price
-from controllers.shots.reaching import ReachTargets, check_reaches, lean_way, list_crouches, settle_reaches
+from controllers.shots.repair import repair_jumps
 from controllers.shots.request import ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
-from controllers.shots.timeline import Span, lay_timeline
-from controllers.shots.way import Way, cut_curve, plan_way
 from controllers.shots.wishes import Wish, check_wishes, describe_fights
 from mapctl.errors import MapctlError
 from mapctl.inbetweening.missing import MissingMask
@@ -37,6 +38,8 @@ from mapctl.problem.solution import Outcome, Solution, Status, WindowRecord
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import KeepApart, KeepClear, Term
+
+_SPARE = 4  # frames that a walk which ends the shot goes on for, to be cut off
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ def solve_shot(
     motion, missing = join_pieces(pieces, inbetweener, settings.join)
     if bool(missing.any()):
         motion = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    motion = repair_jumps(motion, inbetweener)
     if request.loop:
         motion = close_loop(motion, frames, inbetweener)
     if request.arrival is not None:
@@ -168,7 +172,8 @@ def _walk(
     generator: torch.Generator,
 ) -> tuple[Motion, Ledger, tuple[WindowRecord, ...]]:
     """Walk the frames of a span and some more, which go on at its last speed."""
-    tail = TAIL if span.stop < len(way.speeds) else 0
+    # A horizon's last frame has nothing behind it that it would have to lead to.
+    tail = TAIL if span.stop < len(way.speeds) else _SPARE
     frames = span.stop - span.start + tail
     arcs = _extend(way.arcs[span.start : span.stop], tail + settings.follow.window.frames)
     curve = way.curve

@@ -8,13 +8,13 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.shots.arrival import Arrival, arrive
+from controllers.shots.clips.arrival import Arrival, arrive
+from controllers.shots.keys.posing import as_reaches, measure_pose_error, meet_poses
+from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
-from controllers.shots.posing import as_reaches, measure_pose_error, meet_poses
+from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.prices import measure_prices
-from controllers.shots.reaching import ReachTargets, settle_reaches
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
-from controllers.shots.way import Way, plan_way
 from controllers.shots.wishes import Wish, describe_fights
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError

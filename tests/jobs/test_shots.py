@@ -11,14 +11,14 @@ from helpers import walk
 import priors
 from controllers.common.character import Character
 from controllers.shots import shot as shot_module
-from controllers.shots.lead import Lead
-from controllers.shots.looking import measure_look_errors, turn_heads
-from controllers.shots.reaching import ReachTargets
+from controllers.shots.clips.lead import Lead
+from controllers.shots.keys.looking import measure_look_errors, turn_heads
+from controllers.shots.keys.reaching import ReachTargets
+from controllers.shots.planning.timeline import Span, StandingEnds, lay_timeline, limit_timed_speeds, plan_speeds
+from controllers.shots.planning.way import cut_curve, plan_way
 from controllers.shots.request import Look, Others, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import solve_shot
-from controllers.shots.timeline import Span, StandingEnds, lay_timeline, limit_timed_speeds, plan_speeds
-from controllers.shots.way import cut_curve, plan_way
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError

@@ -6,8 +6,8 @@ from fractions import Fraction
 from pathlib import Path
 
 from controllers.common.character import Character
-from controllers.shots.arrival import Arrival
-from controllers.shots.lead import Lead
+from controllers.shots.clips.arrival import Arrival
+from controllers.shots.clips.lead import Lead
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from mapctl import formats

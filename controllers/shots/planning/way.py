@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.shots.planning.timeline import StandingEnds, limit_timed_speeds, plan_speeds
 from controllers.shots.request import Others, ShotRequest
-from controllers.shots.timeline import StandingEnds, limit_timed_speeds, plan_speeds
 from mapctl.curves import Curve
 from mapctl.curves.detour import apply_detour, find_detour
 from mapctl.curves.obstacles import measure_clearance

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.lead import STANDING_SPEED, TRAVEL_FRAMES
+from controllers.shots.clips.lead import STANDING_SPEED, TRAVEL_FRAMES
 from controllers.shots.transitions import Filling, choose_filling
 from mapctl import kinematics
 from mapctl.curves import Curve

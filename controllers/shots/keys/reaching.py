@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controllers.shots.planning.way import Way, bend_way
 from controllers.shots.request import PoseKey, Reach, ShotRequest
-from controllers.shots.way import Way, bend_way
 from mapctl import rotations
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
