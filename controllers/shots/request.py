@@ -119,6 +119,8 @@ class Others:
     """Their hips on the ground from this shot's first frame on, at PRIOR_FPS, x and z, metres; the last frame holds."""
     distance: float
     """Least distance of hips, metres."""
+    courtesy: bool = False
+    """Whether they are only given room: they come later, and keep the distance themselves."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,7 +103,7 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
     if request.obstacles:
         clear = 100 * float(measure_clearance(request.obstacles, positions[..., ::2]).amin())
         found.append(Wish("obstacles", "no joint within", clear, 0.0, "cm", at_least=True))
-    if request.others is not None:
+    if request.others is not None and not request.others.courtesy:
         last = request.others.hips.shape[1] - 1
         there = request.others.hips[:, torch.arange(len(hips)).clamp(max=last)]
         apart = 100 * float(vectors.length(hips[None] - there).amin())

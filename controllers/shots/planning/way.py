@@ -22,7 +22,8 @@ from mapctl.intent.timed_speed import TimedSpeed, integrate_speeds
 from mapctl.numerics import vectors
 
 _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far
-_APART_MARGIN = 0.15  # metres beyond the distance to others: hips sway, and are early or late
+APART_MARGIN = 0.15
+"""Metres beyond the distance to others by which ways keep apart: hips sway, and are early or late."""
 _TURN_SECONDS = 0.6  # of standing where a curve reverses
 _FINE_STEP = 0.02  # metres of arc
 _MADE_UP = 3.0  # metres of arc over which one makes up for a longer way
@@ -177,7 +178,7 @@ def _clear_of_others(
         there = others.hips[:, (frame + late).clamp(0, last)].to(points)
         away = vectors.length(points[None] - there[:, :, None])
         clear = torch.minimum(clear, away.amin(dim=0))
-    return clear - others.distance - _APART_MARGIN
+    return clear - others.distance - APART_MARGIN
 
 
 def cut_curve(curve: Curve, start: float, stop: float) -> Curve:

@@ -15,7 +15,7 @@ from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
-from mapctl.commands.shared.shots.play import PlayedShot, list_props, play_shot
+from mapctl.commands.shared.shots.play import PlayedShot, let_others_pass, list_props, play_shot
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.cornering import turns_sharply
@@ -73,6 +73,8 @@ def _solve(
     """Solve for the first actors, for all unless Ctrl-C came, and return whether it did."""
     done: list[Walk | PlayedShot] = []
     shots = any(isinstance(plan, ShotPlan) for plan in plans)
+    if scene.keep_apart is not None:
+        plans = let_others_pass([plan for plan in plans if isinstance(plan, ShotPlan)], scene.keep_apart)
     inbetweener = priors.load_inbetweener() if shots else None
     for actor, plan in zip(scene.actors, plans, strict=True):
         try:

@@ -7,8 +7,11 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from controllers.following.follow import FollowSettings
+from controllers.shots.planning.way import APART_MARGIN, Way, plan_way
 from controllers.shots.prices import measure_prices
 from controllers.shots.request import Others, ShotRequest
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
@@ -91,7 +94,8 @@ def play_shot(
     wish."""
     plan.prior.warm_up()
     if keep_apart is not None and earlier:
-        plan = replace(plan, request=replace(plan.request, others=_find_others(plan, earlier, keep_apart)))
+        tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
+        plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
     footing = FootContact(rest_height=plan.character.toe_rest_height)
 
     def solve(request: ShotRequest, shown: Progress | None = None) -> ShotSolution:
@@ -112,16 +116,38 @@ def play_shot(
     return PlayedShot(plan, solution)
 
 
-def _find_others(plan: ShotPlan, earlier: Sequence[PlayedShot], distance: float) -> Others:
+def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPlan]:
+    """Return plans in which who is solved first leaves room for later ones that would find no way past: each gives way
+    by half. Somebody who has to keep apart from earlier ones does not make room for later ones too."""
+    given, tracks = list(plans), list[tuple[ShotPlan, Float[Tensor, "frames 2"]]]()
+    for plan in plans:
+        others = _find_others(plan, tracks, keep_apart) if tracks else None
+        way = plan_way(replace(plan.request, others=others))
+        if way.note is not None and others is not None:
+            alone = plan_way(plan.request)
+            if alone.note is None:
+                room = _find_others(given[0], [(plan, _walk_along(alone))], (keep_apart - APART_MARGIN) / 2)
+                given[0] = replace(given[0], request=replace(given[0].request, others=replace(room, courtesy=True)))
+                way = alone
+        tracks.append((plan, _walk_along(way)))
+    return given
+
+
+def _walk_along(way: Way) -> Float[Tensor, "frames 2"]:
+    return way.curve.point(way.arcs)[:, :: way.curve.dims - 1]
+
+
+def _find_others(
+    plan: ShotPlan, tracks: Sequence[tuple[ShotPlan, Float[Tensor, "frames 2"]]], distance: float
+) -> Others:
     """Collect the others' hips from the actor's first frame on; who has not begun stands in the first pose, who has
     ended in the last."""
     hips = []
-    longest = max(one.solution.motion.num_frames for one in earlier)
-    for one in earlier:
-        late = round((plan.actor.start_seconds - one.plan.actor.start_seconds) * PRIOR_FPS)
-        motion = one.solution.motion
-        frames = torch.arange(late, late + longest + abs(late)).clamp(0, motion.num_frames - 1)
-        hips.append(motion.root_position[frames, ::2])
+    longest = max(len(track) for _, track in tracks)
+    for one, track in tracks:
+        late = round((plan.actor.start_seconds - one.actor.start_seconds) * PRIOR_FPS)
+        frames = torch.arange(late, late + longest + abs(late)).clamp(0, len(track) - 1)
+        hips.append(track[frames])
     count = min(len(each) for each in hips)
     return Others(torch.stack([each[:count] for each in hips]), distance)
 
