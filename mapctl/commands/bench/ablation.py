@@ -2,7 +2,7 @@
 
 import priors
 from controllers.benchmarks.ablation import benchmark_ablation
-from controllers.benchmarks.shot_choices import benchmark_shot_choices
+from controllers.benchmarks.shots.choices import benchmark_shot_choices
 from mapctl.commands.bench import Ablation
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress

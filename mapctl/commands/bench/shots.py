@@ -1,7 +1,7 @@
 """`mapctl bench shots`: random wishes that are to hold at once."""
 
 import priors
-from controllers.benchmarks.shots import benchmark_shots
+from controllers.benchmarks.shots.fulfilment import benchmark_shots
 from mapctl.commands.bench import Shots
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress

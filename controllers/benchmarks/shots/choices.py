@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 
 from controllers.benchmarks.shared.tables import Row, average_rows
-from controllers.benchmarks.shots import draw_shot
+from controllers.benchmarks.shots.fulfilment import draw_shot
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.joining import JoinSettings, Piece, join_pieces
