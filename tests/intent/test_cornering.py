@@ -27,7 +27,7 @@ def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
     curve = polygon((0, 0), (0, 4), (4 * np.sin(turn), 4 + 4 * np.cos(turn)))
     profile = slow_for_corners(curve, USUAL)
     assert turns_sharply(curve)
-    assert 0.7 < profile.at(4.0) <= 0.81
+    assert 0.69 < profile.at(4.0) < 0.72
     assert profile.at(1.0) == profile.at(7.0) == 1.2
     arcs = np.arange(0.0, 8.0, 0.05)
     squares = np.array([profile.at(arc) for arc in arcs]) ** 2
@@ -35,7 +35,7 @@ def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
 
 
 def test_who_is_slow_already_does_not_slow_down():
-    slow = SpeedProfile.constant(0.7)
+    slow = SpeedProfile.constant(0.65)
     assert slow_for_corners(polygon((0, 0), (0, 4), (4, 4)), slow) is slow
 
 
@@ -43,7 +43,7 @@ def test_a_loop_slows_down_for_the_corner_at_its_beginning():
     square = polygon((0, 0), (0, 4), (4, 4), (4, 0), (0, 0), closed=True)
     profile = slow_for_corners(square, USUAL)
     assert profile.at(0.0) == pytest.approx(profile.at(square.length), abs=1e-9)
-    assert profile.at(0.0) < 0.9
+    assert profile.at(0.0) < 0.8
     assert profile.at(square.length - 0.3) < 1.15
 
 
