@@ -76,7 +76,7 @@ def judge(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int
     """Judge a filled gap as a viewer would, m/s: sliding, skating, detours, time on no foot (see
     `compute_artefact_cost`), and the worst acceleration."""
     cost = compute_artefact_cost(motion, contacts.to_logits(planted), gap, ChoiceSettings())
-    shown = motion.slice(max(0, gap[0] - 2), gap[1] + 2)
+    shown = motion.slice(max(0, gap[0] - 2), min(motion.num_frames, gap[1] + 2))
     peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
     return cost + _ACCELERATION_WEIGHT * peaks.acceleration
 

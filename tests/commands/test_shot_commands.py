@@ -76,6 +76,9 @@ REFUSED = {
     "start clip": (["--start", "gone.bvh:3"], "gone.bvh"),
     "style": (["--style", "sad"], "knows no style 'sad', only"),
     "gait": (["--gait", "swim"], "knows no gait 'swim', only"),
+    "end": (["--end", "lying"], "--end: expected walk, stand or CLIP:FRAME"),
+    "end clip": (["--end", "gone.bvh:3"], "gone.bvh"),
+    "open loop": (["--loop"], "a loop needs a closed curve"),
     "fps": (["--fps", "0"], "--fps must be 1 to 1000"),
     "keys": (["--keys", "gone.toml"], "gone.toml"),
 }
@@ -91,6 +94,33 @@ def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(case, tmp_
     assert not (tmp_path / "a.bvh").exists()
 
 
+def test_a_key_within_an_obstacle_is_refused(tmp_path, capsys):
+    (tmp_path / "keys.toml").write_text("[[key]]\nseconds = 1\nreach = { leftHand = [0.9, 1, 1] }")
+    words = ["--keys", tmp_path / "keys.toml", "--avoid", "1,1,0.3"]
+    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", *words) == 2
+    assert "within the obstacle at 1, 1" in capsys.readouterr().err
+
+
+def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip_and_its_wishes_have_prices(tmp_path, capsys):
+    on_rig("bandai", 70).save(tmp_path / "clip.bvh")
+    on_rig("cmu", 40).save(tmp_path / "pose.bvh")
+    (tmp_path / "keys.toml").write_text(
+        f"[[key]]\nseconds = 0.9\npose = '{tmp_path / 'pose.bvh'}'\npose_frame = 20\nwithin_frames = 3\n"
+    )
+    words = ["--end", f"{tmp_path / 'clip.bvh'}:40", "--keys", tmp_path / "keys.toml", "--prices"]
+    out, report = tmp_path / "a.bvh", tmp_path / "a.json"
+    assert run("follow", "line:2.4", "-o", out, "--report", report, *words) == 0
+    made, clip = mapctl.load(out), mapctl.load(tmp_path / "clip.bvh")
+    assert made.skeleton.names == clip.skeleton.names
+    assert float((made.joint_positions()[-1] - clip.joint_positions()[40]).norm(dim=-1).max()) < 0.01
+    found = json.loads(report.read_text())
+    pose = next(wish for wish in found["wishes"] if wish["wish"].startswith("pose at"))
+    assert pose["holds"]
+    assert pose["got"] < 0.1
+    assert [price["wish"] for price in found["prices"]] == ["pose at 0.9 s"]
+    assert "price     for pose at 0.9 s" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -99,6 +129,12 @@ def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(case, tmp_
         ("[[key]]\nseconds = 1\nreach = { tail = [0, 1, 2] }", "key[0].reach.tail: hands and feet are"),
         ("[[key]]\nseconds = 1\nlook = [0, 1, 2]", "key[0].look: there is no such key; allowed: seconds"),
         ("key = []", "key: "),
+        ("[[key]]\nseconds = 1\nlook_at = [0, 1, 2]\npose_frame = 3", "key[0].pose_frame: this is of a pose"),
+        ("[[key]]\nseconds = 1\npose = 'gone.bvh'", "gone.bvh"),
+        ("[[key]]\nseconds = 1\npose = 'a.bvh'\njoints = ['tail']", "key[0].joints.tail: hands and feet are"),
+        ("[[key]]\nseconds = 1\nreach = { leftHand = [0, 1, 2] }\ntolerance = { rightHand = 0.1 }", "tells no place"),
+        ("[[key]]\nseconds = 1\nfacing_deg = 1\nwithin_frames = -1", "key[0].within_frames: "),
+        ("[[key]]\nseconds = 1\nplace = [0, 1]\n[[key]]\nseconds = 1.05\nfacing_deg = 9", "within two frames"),
         ("[[key]]\nseconds = 50\nlook_at = [0, 1, 2]", "not within"),
         ("[[key]]\nseconds = 1\nreach = { leftHand = [5, 1, 2] }", "leftHand at 1 s is to be"),
     ],
