@@ -20,7 +20,7 @@ from controllers.shots.clips.arrival import arrive
 from controllers.shots.joining import TAIL, JoinSettings, Piece, join_pieces, spread_over
 from controllers.shots.keys.looking import turn_heads
 from controllers.shots.keys.posing import as_reaches, meet_poses, pose_frames
-from controllers.shots.keys.reaching import ReachTargets, check_reaches, lean_way, list_crouches, settle_reaches
+from controllers.shots.keys.reaching import ReachTargets, check_reaches, go_down, lean_way, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.timeline import Span, lay_timeline
 from controllers.shots.planning.way import Way, cut_curve, plan_way
@@ -109,10 +109,11 @@ def solve_shot(
         motion = arrive(motion, arrival, inbetweener)
     motion, met = meet_poses(motion, request.poses, way, inbetweener)
     reaches = settle_reaches(request.reaches, motion)
-    motion, _ = meet_poses(motion, list_crouches(reaches, motion, request.poses), way, inbetweener)
+    posed = pose_frames(met, frames)
+    motion = go_down(motion, reaches, posed)
     if reaches:
         reach = ReachTargets.of(reaches, frames).relaxed(motion).within_reach(motion)
-        free = reach.free_limbs(motion.num_joints, pose_frames(met, frames))
+        free = reach.free_limbs(motion.num_joints, posed)
         motion = fill(motion, free, inbetweener, targets=reach.led_there(motion).targets).motion
     motion = turn_heads(motion, request.looks)
     wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)

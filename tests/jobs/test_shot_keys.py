@@ -10,7 +10,7 @@ from helpers import walk
 import priors
 from controllers.shots.clips.arrival import Arrival, arrive
 from controllers.shots.keys.posing import as_reaches, measure_pose_error, meet_poses
-from controllers.shots.keys.reaching import ReachTargets, settle_reaches
+from controllers.shots.keys.reaching import ReachTargets, go_down, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.prices import measure_prices
@@ -163,6 +163,23 @@ def test_a_rough_reach_asks_for_less(walked):
     torch.testing.assert_close(relaxed({"leftHand": 0.1}), relaxed(0.1))
     torch.testing.assert_close(relaxed({"rightHand": 0.1}), place)
     torch.testing.assert_close(relaxed(0.5), hand, atol=1e-6, rtol=0)
+
+
+def test_hips_go_down_for_what_is_low_and_feet_stay_where_they_were(walked):
+    feet = list(CANONICAL.indices(("leftFoot", "rightFoot", *TOES)))
+    shoulder = walked.joint_positions()[60, CANONICAL.index("leftUpperArm")]
+    low = shoulder + torch.tensor([0.15, -0.65, 0.1])
+    reach, nobody = Reach(2.0, {"leftHand": tuple(low.tolist())}, 0.2), torch.zeros(walked.num_frames, dtype=torch.bool)
+    made = go_down(walked, (reach,), nobody)
+    dropped = (walked.root_position - made.root_position)[:, 1]
+    assert 0.1 < float(dropped[60]) < 0.31
+    assert float(dropped[[20, -15]].abs().max()) == 0
+    torch.testing.assert_close(made.joint_positions()[:, feet], walked.joint_positions()[:, feet], atol=1e-3, rtol=0)
+    posed = nobody.clone()
+    posed[70] = True
+    assert torch.equal(go_down(walked, (reach,), posed).root_position, walked.root_position)
+    high = Reach(2.0, {"leftHand": tuple((shoulder + torch.tensor([0.2, 0.1, 0.2])).tolist())})
+    assert go_down(walked, (high,), nobody) is walked
 
 
 # Ends in a clip, loops

@@ -9,13 +9,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.shots.planning.way import Way, bend_way
-from controllers.shots.request import PoseKey, Reach, ShotRequest
+from controllers.shots.request import Reach, ShotRequest
 from mapctl import rotations
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
@@ -35,7 +36,7 @@ _LEAST_BEND, _USUAL_BEND, _MOST_BEND = 0.1, 0.5, 0.9
 """Metres aside: less the walk makes up for, more takes longer, more still is another way."""
 _BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle is in the way of all of it
 _STRAIGHT_AHEAD = 0.6  # of a limb's length that it reaches down beside whatever it reaches aside
-_LEAST_CROUCH, _MOST_CROUCH, _CROUCH_SECONDS = 0.03, 0.35, 0.7  # metres down; seconds between two crouches
+_LEAST_CROUCH, _MOST_CROUCH, _POSED_FRAMES = 0.03, 0.3, 15  # metres down; frames beside a pose that is kept
 _BODY = 0.25  # metres from the hips to an obstacle's edge
 _TRUNK = list(CANONICAL.indices(("spine", "chest", "neck", "head")))
 
@@ -225,25 +226,54 @@ def _find_lacking_aside(way: Way, arc: Tensor, rest: Motion, name: str, place: S
     return math.copysign(min(lacking, _MOST_BEND), beside)
 
 
-def list_crouches(reaches: Sequence[Reach], motion: Motion, poses: Sequence[PoseKey]) -> tuple[PoseKey, ...]:
-    """List how far the hips go down, and when, for what is too low to reach for upright; not beside a wished pose."""
-    positions, found = motion.joint_positions(), []
-    for reach in sorted(reaches, key=lambda reach: reach.seconds):
-        frame = min(round(reach.seconds * PRIOR_FPS), motion.num_frames - 1)
-        drop = 0.0
-        for name, place in reach.places.items():
-            limb = LIMBS[name]
-            bones = float(motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
-            away = positions[frame, limb.upper] - positions.new_tensor(place)
-            beside = min(float(away[::2].norm()), _EASY_SHARE * bones)
-            down = math.sqrt((_EASY_SHARE * bones) ** 2 - beside**2) if beside < _STRAIGHT_AHEAD * bones else 0.0
-            down = max(down, _STRAIGHT_AHEAD * bones)
-            drop = max(drop, float(away[1]) - down) if name.endswith("Hand") else drop
-        times = [key.seconds for key in (*poses, *found)]
-        if drop > _LEAST_CROUCH and all(abs(time - reach.seconds) > _CROUCH_SECONDS for time in times):
-            height = float(motion.root_position[frame, 1]) - min(drop, _MOST_CROUCH)
-            found.append(PoseKey(reach.seconds, height=height, hold_seconds=reach.hold_seconds))
-    return tuple(found)
+def go_down(motion: Motion, reaches: Sequence[Reach], posed: Bool[Tensor, " frames"]) -> Motion:
+    """Let the hips go down, and come up again, for what is too low to reach for upright; feet stay where they go.
+    Nobody goes down within half a second of a frame that is `posed`."""
+    down = torch.zeros(motion.num_frames, dtype=torch.float64)
+    frame, near = torch.arange(motion.num_frames), _widen(posed, _POSED_FRAMES)
+    for reach in reaches:
+        first = min(round(reach.seconds * PRIOR_FPS), motion.num_frames - 1)
+        last = first + round(reach.hold_seconds * PRIOR_FPS)
+        drop = min(_MOST_CROUCH, _find_lacking_below(motion, reach, first))
+        if drop > _LEAST_CROUCH and not bool(near[first : last + 1].any()):
+            away = (first - frame).clamp_min(0) + (frame - last).clamp_min(0)
+            down = torch.maximum(down, drop * smootherstep(1 - away.double() / (_AROUND_FRAMES + 1)))
+    down = torch.where(near, 0.0, down)
+    if not bool((down > 0).any()):
+        return motion
+    lowered = replace(motion, root_position=motion.root_position - down[:, None] * down.new_tensor([0.0, 1.0, 0.0]))
+    return _keep_feet(lowered, motion)
+
+
+def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
+    """Find how much lower the shoulders would have to be for hands to reach their places, metres."""
+    positions, lacking = motion.joint_positions(), 0.0
+    for name, place in reach.places.items():
+        if not name.endswith("Hand"):
+            continue
+        limb = LIMBS[name]
+        bones = float(motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+        away = positions[frame, limb.upper] - positions.new_tensor(place)
+        room = (_EASY_SHARE * bones) ** 2 - float(away[::2].square().sum())
+        lacking = max(lacking, float(away[1]) - math.sqrt(max(room, (_STRAIGHT_AHEAD * bones) ** 2)))
+    return lacking
+
+
+def _keep_feet(motion: Motion, before: Motion) -> Motion:
+    """Bend legs so that feet are where they were before, and turned as they were."""
+    quats = motion.local_quat_xyzw.clone()
+    places, world, feet = motion.joint_positions(), motion.joint_rotations(), before.joint_positions()
+    for name, limb in LIMBS.items():
+        if name.endswith("Foot"):
+            aim = feet[:, limb.end] - places[:, limb.upper]
+            offsets = motion.skeleton.offsets.to(aim)
+            turned, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
+            above = world[:, CANONICAL.parents[limb.upper]]
+            quats[:, limb.upper] = rotations.multiply(rotations.inverse(above), turned)
+            quats[:, limb.lower] = bent
+            shin = rotations.multiply(turned, bent)
+            quats[:, limb.end] = rotations.multiply(rotations.inverse(shin), world[:, limb.end])
+    return replace(motion, local_quat_xyzw=quats)
 
 
 def _is_blocked(way: Way, request: ShotRequest) -> bool:
