@@ -77,7 +77,7 @@ def shorten(line: str) -> list[str]:
     name, tiny = words[0], dict(_TINY.get(words[0], {}))
     if name == "train":
         words = [*words, *_TRAINING[words[1]].split()]
-    elif name == "follow" and "--seconds" not in words:
+    elif name == "follow" and not {"--seconds", "--loop"} & {*words}:
         words += ["--seconds", "1"]
     if name == "render" or (name == "follow" and "--video" in words):
         words += ["--size", "96x64"]
