@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import torch
 from captures import on_rig
 from helpers import run
 
@@ -119,6 +120,14 @@ def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip_and_its_wishes_ha
     assert pose["got"] < 0.1
     assert [price["wish"] for price in found["prices"]] == ["pose at 0.9 s"]
     assert "price     for pose at 0.9 s" in capsys.readouterr().out
+
+
+def test_a_loop_leads_into_its_first_frame_at_any_rate(tmp_path):
+    out = tmp_path / "a.bvh"
+    assert run("follow", "circle:0.8", "-o", out, "--loop", "--fps", 100) == 0
+    places = mapctl.load(out).joint_positions()
+    steps = torch.diff(torch.cat([places, places[:1]]), dim=0).norm(dim=-1).amax(dim=1)
+    assert float(steps[-1]) < 1.2 * float(steps[:-1].max())
 
 
 @pytest.mark.parametrize(

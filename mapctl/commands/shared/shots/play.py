@@ -28,6 +28,9 @@ from mapctl.terms import FootContact
 from scenes.props import build_obstacle, build_target
 
 
+_WRAPPED = 6  # frames of a loop's beginning that are resampled after its end
+
+
 @dataclass(frozen=True, eq=False)
 class PlayedShot:
     """A solved shot of one actor."""
@@ -45,7 +48,12 @@ class PlayedShot:
     @property
     def on_rig(self) -> Motion:
         """Motion on the actor's rig, at its rate."""
-        return self.plan.character.on_rig(_resample_smoothly(self.solution.motion, self.plan.fps))
+        motion, fps = self.solution.motion, self.plan.fps
+        if not self.request.loop:
+            return self.plan.character.on_rig(_resample_smoothly(motion, fps))
+        # The first frames again, so that there are frames between the last and the first too.
+        resampled = _resample_smoothly(motion.join(motion.slice(0, _WRAPPED)), fps)
+        return self.plan.character.on_rig(resampled.slice(0, round(motion.num_frames * fps / PRIOR_FPS)))
 
     @property
     def interrupted(self) -> bool:
