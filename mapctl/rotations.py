@@ -5,12 +5,13 @@ is here: the split of a rotation into heading and tilt, rotations about the vert
 """
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl.numerics.light_roma import roma
@@ -87,6 +88,64 @@ def between_vectors(start: Float[Tensor, "*batch 3"], stop: Float[Tensor, "*batc
     still = (start.norm(dim=-1, keepdim=True) < 0.5) | (stop.norm(dim=-1, keepdim=True) < 0.5)
     none = quat.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(quat)
     return torch.nn.functional.normalize(torch.where(still, none, quat), dim=-1)
+
+
+def to_six(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
+    """Return the first two columns of rotation matrices: six numbers that are continuous over all rotations (Zhou et
+    al. 2019)."""
+    return matrix[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def from_six(six: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation matrices whose first two columns are nearest, by Gram and Schmidt (Zhou et al. 2019)."""
+    first = torch.nn.functional.normalize(six[..., :3], dim=-1)
+    second = six[..., 3:] - (first * six[..., 3:]).sum(dim=-1, keepdim=True) * first
+    second = torch.nn.functional.normalize(second, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
+
+
+def euler_axes(orders: Sequence[str]) -> Int[Tensor, "joints 3"]:
+    """Return the axes (0, 1, 2 for X, Y, Z) of orders of Euler angles such as `XYZ`, for `from_euler`; ValueError unless
+    each names the three axes once."""
+    if wrong := [order for order in orders if sorted(order) != ["X", "Y", "Z"]]:
+        raise ValueError(f"an order of Tait-Bryan angles names X, Y and Z once, got {wrong[0]!r}")
+    return torch.tensor([["XYZ".index(letter) for letter in order] for order in orders])
+
+
+def from_euler(angles: Float[Tensor, "*#batch 3"], axes: Int[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation matrices of intrinsic Tait-Bryan angles, radians: the product of the turns about the axes in
+    their order. Each joint of a batch may have axes of its own."""
+    first, middle, last = _about_axes(angles, axes).unbind(dim=-3)
+    return first @ middle @ last
+
+
+def to_euler(matrix: Float[Tensor, "*#batch 3 3"], axes: Int[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return the intrinsic Tait-Bryan angles of rotation matrices, radians: the middle one from -pi/2 to pi/2, the
+    others from -pi to pi. Differentiable but for the middle one's ends, where the others are undefined."""
+    i, j, k = axes.unbind(dim=-1)
+    sign = _handedness(i, j)
+
+    def pick(row: Tensor, column: Tensor) -> Tensor:
+        flat, at = torch.broadcast_tensors(matrix.flatten(-2), (3 * row + column)[..., None])
+        return flat.gather(-1, at)[..., 0]
+
+    sine, first_y, first_x = sign * pick(i, k), -sign * pick(j, k), pick(k, k)
+    last_y, last_x = -sign * pick(i, j), pick(i, i)
+    middle = torch.atan2(sine, torch.hypot(first_y, first_x))
+    return torch.stack([torch.atan2(first_y, first_x), middle, torch.atan2(last_y, last_x)], dim=-1)
+
+
+def _handedness(first: Int[Tensor, "*batch"], second: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
+    """Return 1 where the third axis is the first times the second, else -1."""
+    return torch.where((second - first) % 3 == 1, 1, -1)
+
+
+def _about_axes(angles: Float[Tensor, "*#batch"], axes: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the matrices of turns about coordinate axes (Rodrigues' formula)."""
+    unit = torch.eye(3, dtype=angles.dtype, device=angles.device)
+    cross = torch.linalg.cross(unit[:, None, :].expand(3, 3, 3), unit[None].expand(3, 3, 3)).transpose(-1, -2)[axes]
+    angles = angles[..., None, None]
+    return unit + torch.sin(angles) * cross + (1 - torch.cos(angles)) * (cross @ cross)
 
 
 def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[Tensor, "frames *joints 4"]:

@@ -17,13 +17,7 @@ from mapctl.numerics.intervals import true_intervals
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.pose_transformer.network import (
-    PoseTransformerConfig,
-    PoseTransformerNetwork,
-    ProposedPoses,
-    from_six,
-    to_six,
-)
+from priors.pose_transformer.network import PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 
 SOURCE = "transformer"
 """Name of the in-betweener in notes."""
@@ -188,14 +182,21 @@ def _rows_of(motion: PartialMotion) -> Float[Tensor, "batch frames rows"]:
 
 
 def _pack(poses: ProposedPoses) -> Float[Tensor, "batch frames rows"]:
-    parts = (poses.root_position, to_six(poses.local_matrix).flatten(-2), poses.contacts, poses.log_spread.flatten(-2))
+    parts = (
+        poses.root_position,
+        rotations.to_six(poses.local_matrix).flatten(-2),
+        poses.contacts,
+        poses.log_spread.flatten(-2),
+    )
     return torch.cat(parts, dim=-1)
 
 
 def _unpack(rows: Float[Tensor, "batch frames rows"]) -> ProposedPoses:
     joints = CANONICAL.num_joints
     root, six, logits, spread = rows.split([3, 6 * joints, 2, 2 * joints], dim=-1)
-    return ProposedPoses(root, from_six(six.unflatten(-1, (joints, 6))), logits, spread.unflatten(-1, (joints, 2)))
+    return ProposedPoses(
+        root, rotations.from_six(six.unflatten(-1, (joints, 6))), logits, spread.unflatten(-1, (joints, 2))
+    )
 
 
 def _average_mirrored(poses: ProposedPoses) -> ProposedPoses:
@@ -205,7 +206,7 @@ def _average_mirrored(poses: ProposedPoses) -> ProposedPoses:
     back = local[1:, ..., _PARTNERS, :, :] * flip[:, None] * flip
     return ProposedPoses(
         (root[:1] + root[1:] * flip) / 2,
-        from_six((to_six(local[:1]) + to_six(back)) / 2),
+        rotations.from_six((rotations.to_six(local[:1]) + rotations.to_six(back)) / 2),
         (logits[:1] + logits[1:].flip(-1)) / 2,
         (spread[:1] + spread[1:, ..., _PARTNERS, :]) / 2,
     )

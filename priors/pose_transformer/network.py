@@ -131,7 +131,7 @@ class PoseTransformerNetwork(nn.Module):
     def _encode(self, motion: PartialMotion, shown: Float[Tensor, "batch frames joints 3 3"]) -> Tensor:
         """Encode what is shown and what is known, in about unit size."""
         known = motion.known
-        six = (to_six(shown) - self.mean_rotation) / self.std_rotation
+        six = (rotations.to_six(shown) - self.mean_rotation) / self.std_rotation
         local, _ = kinematics.chain_matrices(motion.offsets[:, None], CANONICAL.parents, shown)
         local = local + motion.root_position[..., None, :] * local.new_tensor([0.0, 1.0, 0.0])
         ground = rotations.lift_ground(motion.root_position[..., ::2])[..., None, :]
@@ -161,8 +161,8 @@ class PoseTransformerNetwork(nn.Module):
         motion: PartialMotion,
     ) -> Float[Tensor, "batch frames joints 3 3"]:
         """Return local rotations with corrections where they are not known; the hips' in the world."""
-        six = to_six(shown) + out.unflatten(-1, (_JOINTS, 6)) * self.std_rotation
-        made = from_six(six)
+        six = rotations.to_six(shown) + out.unflatten(-1, (_JOINTS, 6)) * self.std_rotation
+        made = rotations.from_six(six)
         known = motion.known.rotations
         others = torch.where(known[..., 1:, None, None], shown[..., 1:, :, :], made[..., 1:, :, :])
         tilt, free, faced = made[..., 0, :, :], ~known[..., 0], motion.known.heading
@@ -213,19 +213,6 @@ def _rotary_phases(frames: int, width: int, device: torch.device) -> tuple[Tenso
 def _rotate_pairs(vectors: Float[Tensor, "batch heads frames width"], phases: tuple[Tensor, Tensor]) -> Tensor:
     (cosine, sine), (one, other) = phases, vectors.chunk(2, dim=-1)
     return torch.cat([one * cosine - other * sine, one * sine + other * cosine], dim=-1)
-
-
-def to_six(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
-    """Return the first two columns of rotation matrices (Zhou et al. 2019)."""
-    return matrix[..., :2].transpose(-1, -2).flatten(-2)
-
-
-def from_six(six: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation matrices whose first two columns are nearest, by Gram and Schmidt (Zhou et al. 2019)."""
-    first = functional.normalize(six[..., :3], dim=-1)
-    second = six[..., 3:] - (first * six[..., 3:]).sum(dim=-1, keepdim=True) * first
-    second = functional.normalize(second, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
 
 
 def _heading_of(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:

@@ -1,6 +1,7 @@
 """Rotation maths against scipy, and its gradients where formulas usually break."""
 
 import math
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -134,3 +135,50 @@ def test_gradients_are_exact_at_rest_and_near_a_half_turn(size):
     if size:  # beyond a half turn the vector flips, so the difference must stay on one side
         back = lambda v: rotations.to_rotation_vector(rotations.from_rotation_vector(v))  # noqa: E731
         assert torch.autograd.gradcheck(back, vector.clone().requires_grad_(True), eps=1e-8, atol=1e-4)
+
+
+ORDERS = ["".join(order) for order in permutations("XYZ")]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_euler_angles_are_scipys_intrinsic_ones(order):
+    angles = torch.rand(200, 3, generator=generator(), dtype=torch.float64) * 6 - 3
+    angles[:, 1] /= 2
+    axes, theirs = rotations.euler_axes([order]), Rotation.from_euler(order, angles.numpy())
+    np.testing.assert_allclose(rotations.from_euler(angles, axes), theirs.as_matrix(), atol=1e-12)
+    matrices = rotations.to_matrix(random_quats(200))
+    found = rotations.to_euler(matrices, axes)
+    np.testing.assert_allclose(found, Rotation.from_matrix(matrices.numpy()).as_euler(order), atol=1e-9)
+    assert float(found[:, 1].abs().max()) <= math.pi / 2
+    assert torch.autograd.gradcheck(
+        lambda free: rotations.from_euler(free, axes), angles[:5].clone().requires_grad_(True)
+    )
+    assert torch.autograd.gradcheck(
+        lambda vector: rotations.to_euler(rotations.rotation_vector_to_matrix(vector), axes),
+        torch.randn(5, 3, generator=generator(1), dtype=torch.float64, requires_grad=True),
+    )
+
+
+def test_every_joint_may_have_axes_of_its_own():
+    axes = rotations.euler_axes(ORDERS)
+    angles = torch.rand(4, 6, 3, generator=generator(), dtype=torch.float64) - 0.5
+    made = rotations.from_euler(angles, axes)
+    for joint in range(6):
+        np.testing.assert_allclose(made[:, joint], rotations.from_euler(angles[:, joint], axes[joint]), atol=1e-15)
+    torch.testing.assert_close(rotations.to_euler(made, axes), angles, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("order", ["XYX", "XY", "xyz", ""])
+def test_an_order_that_does_not_name_each_axis_is_refused(order):
+    with pytest.raises(ValueError, match=f"got {order!r}"):
+        rotations.euler_axes(["XYZ", order])
+
+
+def test_six_numbers_are_a_rotation_whatever_they_are():
+    matrices = rotations.to_matrix(random_quats(50))
+    torch.testing.assert_close(rotations.from_six(rotations.to_six(matrices)), matrices, atol=1e-12, rtol=0)
+    six = torch.randn(20, 6, generator=generator(), dtype=torch.float64)
+    made = rotations.from_six(six)
+    torch.testing.assert_close(made.mT @ made, torch.eye(3).double().expand(20, 3, 3), atol=1e-12, rtol=0)
+    assert float((torch.linalg.det(made) - 1).abs().max()) < 1e-12
+    assert torch.autograd.gradcheck(rotations.from_six, six.requires_grad_(True))

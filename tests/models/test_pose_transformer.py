@@ -21,7 +21,7 @@ from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 from priors.pose_transformer import inbetweener as module
-from priors.pose_transformer.network import PoseTransformerConfig, from_six, to_six
+from priors.pose_transformer.network import PoseTransformerConfig
 
 FRAMES = 50
 DRAWN = tiny_transformer(drawn=0.05)
@@ -169,9 +169,11 @@ def test_hips_keep_the_heading_or_the_tilt_that_is_known(faced, tilted):
 
 def test_six_numbers_are_a_rotation_and_back():
     turn = rotations.rotation_vector_to_matrix(torch.randn(40, 3, generator=torch.Generator().manual_seed(0)))
-    torch.testing.assert_close(from_six(to_six(turn)), turn, atol=1e-6, rtol=0)
-    scaled = torch.cat([2 * to_six(turn)[:, :3], to_six(turn)[:, 3:] + 0.3 * to_six(turn)[:, :3]], dim=-1)
-    torch.testing.assert_close(from_six(scaled), turn, atol=1e-6, rtol=0)
+    torch.testing.assert_close(rotations.from_six(rotations.to_six(turn)), turn, atol=1e-6, rtol=0)
+    scaled = torch.cat(
+        [2 * rotations.to_six(turn)[:, :3], rotations.to_six(turn)[:, 3:] + 0.3 * rotations.to_six(turn)[:, :3]], dim=-1
+    )
+    torch.testing.assert_close(rotations.from_six(scaled), turn, atol=1e-6, rtol=0)
 
 
 def test_weights_load_by_file_and_others_are_refused(tmp_path):

@@ -1,0 +1,163 @@
+"""How far each joint of the canonical skeleton turns: Euler angles about a mid pose, in an order that keeps them away
+from gimbal lock, and their bounds (Zhou et al. 2020, section 3.3 and table 6).
+
+The bounds are measured over mocap, and widened to the anatomy of the paper's table where that is wider; `measured.json`
+beside this file holds them with the command that wrote it.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.errors import MapctlError
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, mirror_name
+
+TABLE = "measured.json"
+"""File of the bundled ranges, beside this one."""
+TOLERANCE_DEG = 0.5
+"""Degrees beyond a bound that are no remark: less than readers of different rigs differ by."""
+_MIRRORED_SIGN = {"X": 1.0, "Y": -1.0, "Z": -1.0}  # of a turn about an axis, seen in a mirror across the body
+
+
+@dataclass(frozen=True)
+class JointRange:
+    """Range of one joint."""
+
+    order: str
+    """Order of its intrinsic Euler angles, as in `XZY`."""
+    mid_quat_xyzw: tuple[float, float, float, float]
+    """Rotation from which the angles are measured."""
+    low_deg: tuple[float, float, float]
+    """Least angles in their order, degrees."""
+    high_deg: tuple[float, float, float]
+    """Greatest angles in their order, degrees."""
+
+    def mirrored(self) -> "JointRange":
+        """Return the range of the same joint on the other side of the body."""
+        x, y, z, w = self.mid_quat_xyzw
+        low, high = [], []
+        for letter, least, most in zip(self.order, self.low_deg, self.high_deg, strict=True):
+            ends = sorted(_MIRRORED_SIGN[letter] * end for end in (least, most))
+            low.append(ends[0])
+            high.append(ends[1])
+        return JointRange(self.order, (x, -y, -z, w), tuple(low), tuple(high))
+
+
+@dataclass(frozen=True, eq=False)
+class JointRanges:
+    """Ranges of all joints but the hips, which turn freely."""
+
+    axes: Int[Tensor, "others 3"]
+    """Axes of each joint's angles, as in `rotations.euler_axes`."""
+    mid_matrix: Float[Tensor, "others 3 3"]
+    """Rotations from which angles are measured: R = mid E(angles)."""
+    low: Float[Tensor, "others 3"]
+    """Least angles, radians."""
+    high: Float[Tensor, "others 3"]
+    """Greatest angles, radians."""
+
+    @staticmethod
+    def of_joints(ranges: dict[str, JointRange]) -> "JointRanges":
+        """Collect the ranges of joints by name; a joint on one side has that of its mirror image if it has none of its
+        own. MapctlError for a joint of the canonical skeleton that has neither."""
+        found = []
+        for name in CANONICAL.names[1:]:
+            if name not in ranges and mirror_name(name) not in ranges:
+                raise MapctlError(f"no range for the joint {name!r}")
+            found.append(ranges[name] if name in ranges else ranges[mirror_name(name)].mirrored())
+        mid = torch.tensor([one.mid_quat_xyzw for one in found], dtype=torch.float64)
+        low, high = (
+            torch.deg2rad(torch.tensor([getattr(one, name) for one in found], dtype=torch.float64))
+            for name in ("low_deg", "high_deg")
+        )
+        return JointRanges(
+            rotations.euler_axes([one.order for one in found]),
+            rotations.to_matrix(torch.nn.functional.normalize(mid, dim=-1)),
+            low,
+            high,
+        )
+
+    def to_angles(self, local_matrix: Float[Tensor, "*batch others 3 3"]) -> Float[Tensor, "*batch others 3"]:
+        """Return the angles of local rotations, radians."""
+        return rotations.to_euler(self.mid_matrix.to(local_matrix).mT @ local_matrix, self.axes)
+
+    def to_matrices(self, angles: Float[Tensor, "*batch others 3"]) -> Float[Tensor, "*batch others 3 3"]:
+        """Invert `to_angles`."""
+        return self.mid_matrix.to(angles) @ rotations.from_euler(angles, self.axes)
+
+    def constrain(self, free: Float[Tensor, "*batch others 3"]) -> Float[Tensor, "*batch others 3"]:
+        """Map any numbers to angles within the ranges, radians: (b - a)/2 tanh(v) + (a + b)/2.
+
+        Zhou et al. 2020, Eq. 3, print (a - b) for both, which does not lead to [a, b].
+        """
+        low, high = self.low.to(free), self.high.to(free)
+        return (high - low) / 2 * torch.tanh(free) + (low + high) / 2
+
+    def find_excess(self, angles: Float[Tensor, "*batch others 3"]) -> Float[Tensor, "*batch others 3"]:
+        """Return by how much angles are beyond their ranges, radians; 0 within."""
+        low, high = self.low.to(angles), self.high.to(angles)
+        return (low - angles).clamp_min(0) + (angles - high).clamp_min(0)
+
+
+@dataclass(frozen=True)
+class OutOfRange:
+    """A joint that turns beyond its range."""
+
+    joint: str
+    """Canonical name."""
+    frame: int
+    """Frame in which it is farthest beyond."""
+    degrees: float
+    """By how much it is beyond there."""
+    frames: int
+    """Number of frames in which it is beyond."""
+
+
+def outside(motion: Motion, ranges: JointRanges | None = None) -> list[OutOfRange]:
+    """List the joints of a canonical motion that turn beyond their ranges by more than TOLERANCE_DEG, the farthest
+    first. MapctlError for other skeletons."""
+    if motion.skeleton.names != CANONICAL.names:
+        raise MapctlError("joint ranges are those of canonical joints; use retarget.to_canonical first")
+    ranges = load() if ranges is None else ranges
+    angles = ranges.to_angles(rotations.to_matrix(motion.local_quat_xyzw[:, 1:]))
+    excess = torch.rad2deg(ranges.find_excess(angles)).amax(dim=-1)
+    beyond = excess > TOLERANCE_DEG
+    found = [
+        OutOfRange(name, int(excess[:, joint].argmax()), float(excess[:, joint].max()), int(beyond[:, joint].sum()))
+        for joint, name in enumerate(CANONICAL.names[1:])
+        if bool(beyond[:, joint].any())
+    ]
+    return sorted(found, key=lambda one: -one.degrees)
+
+
+def read_table(text: str) -> dict[str, JointRange]:
+    """Parse the joints of a table of ranges as JSON; MapctlError for one that is not such a table."""
+    try:
+        rows = json.loads(text)["joints"]
+        ranges = {
+            name: JointRange(
+                row["order"], *(tuple(map(float, row[key])) for key in ("mid_quat_xyzw", "low_deg", "high_deg"))
+            )
+            for name, row in rows.items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise MapctlError(f"no table of joint ranges ({type(error).__name__}: {error})") from error
+    for name, one in ranges.items():
+        ends = [*one.low_deg, *one.high_deg]
+        if not all(map(math.isfinite, ends)) or any(a >= b for a, b in zip(one.low_deg, one.high_deg, strict=True)):
+            raise MapctlError(f"the range of {name} must lead from a lower to a higher angle, got {ends}")
+    return ranges
+
+
+@cache
+def load() -> JointRanges:
+    """Return the bundled ranges."""
+    return JointRanges.of_joints(read_table(files(__name__).joinpath(TABLE).read_text("utf-8")))

@@ -1,0 +1,124 @@
+"""Ranges of joints: what their table says, that angles and rotations are one, and who is beyond."""
+
+import json
+import math
+from dataclasses import replace
+from importlib.resources import files
+
+import pytest
+import torch
+from helpers import generator, walk_through
+
+from mapctl import joint_ranges, rotations
+from mapctl.errors import MapctlError
+from mapctl.joint_ranges import JointRange, JointRanges
+from mapctl.skeleton import CANONICAL, LIMBS
+
+OTHERS = CANONICAL.num_joints - 1
+TABLE = json.loads(files("mapctl.joint_ranges").joinpath(joint_ranges.TABLE).read_text("utf-8"))
+
+
+def free_numbers(*shape, spread=2.0):
+    return spread * torch.randn(*shape, OTHERS, 3, generator=generator(), dtype=torch.float64)
+
+
+def test_any_numbers_become_angles_within_the_ranges_and_come_near_both_ends():
+    ranges = joint_ranges.load()
+    angles = ranges.constrain(free_numbers(500, spread=1e3))
+    assert float(ranges.find_excess(angles).max()) < 1e-12
+    torch.testing.assert_close(angles.amin(dim=0), ranges.low)
+    torch.testing.assert_close(angles.amax(dim=0), ranges.high)
+    torch.testing.assert_close(ranges.constrain(torch.zeros(OTHERS, 3).double()), (ranges.low + ranges.high) / 2)
+
+
+def test_angles_and_rotations_lead_to_each_other_all_over_the_ranges():
+    ranges = joint_ranges.load()
+    angles = ranges.constrain(free_numbers(300))
+    torch.testing.assert_close(ranges.to_angles(ranges.to_matrices(angles)), angles, atol=1e-9, rtol=0)
+
+
+def test_no_pose_within_the_ranges_comes_near_gimbal_lock():
+    ranges = joint_ranges.load()
+    assert math.degrees(float(torch.stack([ranges.low, ranges.high])[..., 1].abs().max())) <= 85
+
+
+def test_right_is_the_mirror_image_of_left():
+    ranges, partners = joint_ranges.load(), CANONICAL.mirror_partners()
+    angles = ranges.constrain(free_numbers(50))
+    hips = torch.eye(3).double().expand(50, 1, 3, 3)
+    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    mirrored = (torch.cat([hips, ranges.to_matrices(angles)], dim=1)[:, partners] * flip[:, None] * flip)[:, 1:]
+    assert float(ranges.find_excess(ranges.to_angles(mirrored)).max()) < 0.02
+
+
+def test_the_table_was_measured_to_what_is_asked_of_it():
+    measured = TABLE["measured"]
+    assert measured["largest_middle_deg"] < 75
+    assert measured["outside_percent"] <= 0.2
+    assert measured["nearest_pose_cm"] < 0.5
+    assert "priors.tweening.measure_ranges" in TABLE["command"]
+
+
+def test_knees_and_elbows_stay_hinges():
+    ranges = joint_ranges.read_table(json.dumps(TABLE))
+    knee, elbow = ranges["leftLowerLeg"], ranges["leftLowerArm"]
+    bends = knee.order.index("X")
+    for at in {0, 1, 2} - {bends}:
+        assert knee.high_deg[at] - knee.low_deg[at] < 12
+    assert knee.low_deg[bends] >= -10
+    assert knee.high_deg[bends] >= 160
+    assert elbow.high_deg[elbow.order.index("Y")] <= 10
+    assert set(ranges) == {name for name in CANONICAL.names[1:] if not name.startswith("right")}
+
+
+def calm():
+    """Legs that swing, and nothing else."""
+    return walk_through(torch.zeros(30, 2), swing=0.3)
+
+
+def test_a_clip_within_its_ranges_has_nobody_outside():
+    assert joint_ranges.outside(calm()) == []
+
+
+def test_who_is_beyond_is_named_with_frame_and_degrees():
+    motion = calm()
+    quats = motion.local_quat_xyzw.clone()
+    knee = LIMBS["leftFoot"].lower
+    for frame, degrees in ((4, -25.0), (9, -40.0)):
+        quats[frame, knee] = rotations.from_rotation_vector(
+            torch.tensor([math.radians(degrees), 0, 0], dtype=torch.float64)
+        )
+    (found,) = joint_ranges.outside(replace(motion, local_quat_xyzw=quats))
+    assert (found.joint, found.frame, found.frames) == ("leftLowerLeg", 9, 2)
+    assert found.degrees == pytest.approx(40 - 10, abs=0.01)
+
+
+def test_other_skeletons_are_refused():
+    motion = calm()
+    other = replace(motion, skeleton=replace(CANONICAL, names=("body", *CANONICAL.names[1:])))
+    with pytest.raises(MapctlError, match="to_canonical"):
+        joint_ranges.outside(other)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "no table of joint ranges"),
+        ("[]", "no table of joint ranges"),
+        ('{"joints": {"head": {"order": "XYZ"}}}', "KeyError"),
+        (
+            '{"joints": {"head": {"order": "XYZ", "mid_quat_xyzw": [0, 0, 0, 1], "low_deg": [0, 5, 0],'
+            ' "high_deg": [1, 5, 1]}}}',
+            "the range of head must lead from a lower",
+        ),
+    ],
+)
+def test_damaged_tables_are_refused(text, message):
+    with pytest.raises(MapctlError, match=message):
+        joint_ranges.read_table(text)
+
+
+def test_a_joint_without_a_range_is_refused():
+    one = JointRange("XYZ", (0.0, 0.0, 0.0, 1.0), (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    with pytest.raises(MapctlError, match="no range for the joint 'chest'"):
+        JointRanges.of_joints({"spine": one})
