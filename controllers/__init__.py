@@ -6,7 +6,7 @@ from controllers.following.follow import FollowSettings, follow
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.blend import blend
 from controllers.inbetweening.chain import chain
-from controllers.inbetweening.infill import InfillSettings, infill
+from controllers.inbetweening.infill import InfillSettings, infill, retraced
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from controllers.inbetweening.tween import tween
 from controllers.steering import steer
@@ -28,6 +28,7 @@ __all__ = [
     "follow",
     "generate",
     "infill",
+    "retraced",
     "steer",
     "tween",
 ]

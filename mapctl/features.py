@@ -127,8 +127,16 @@ def integrate_root(
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames"]]:
     """Integrate root positions on the ground (metres) and headings (radians, not wrapped): Wang et al. 2019, Eq. 4."""
     turns = LAYOUT.pick(features, "heading_change")[..., 0]
+    return integrate_steps(LAYOUT.pick(features, "root_displacement_heading"), turns, start)
+
+
+def integrate_steps(
+    steps_heading: Float[Tensor, "*batch frames 2"], turns: Float[Tensor, "*batch frames"], start: GroundPose
+) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames"]]:
+    """Integrate displacements (x, z, metres, each in the heading frame before it) and heading changes (radians) to
+    positions on the ground and headings, not wrapped: Wang et al. 2019, Eq. 4."""
     heading = start.heading.unsqueeze(-1) + torch.cumsum(turns, dim=-1)
-    steps = rotations.rotate_ground(LAYOUT.pick(features, "root_displacement_heading"), heading - turns)
+    steps = rotations.rotate_ground(steps_heading, heading - turns)
     return start.position_xz.unsqueeze(-2) + torch.cumsum(steps, dim=-2), heading
 
 

@@ -21,6 +21,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
 from mapctl.inbetweening.position_proposal import propose_from_positions
+from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.recording import Capture, CaptureProposal
 
 AnyState = TypeVar("AnyState", bound="DensityState")
@@ -278,6 +279,18 @@ class PositionInfiller(Inbetweener, Protocol):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a motion of rigid bones near the positions of `complete`."""
         return propose_from_positions(query, self.complete, "infiller")
+
+
+@runtime_checkable
+class PathPredictor(Protocol):
+    """Tells where the hips go from how the body moves about them (Zhou et al. 2020, section 3.4)."""
+
+    @abstractmethod
+    def predict(self, motion: LocalMotion) -> RootTrajectory:
+        """Predict steps, heights and contacts of every frame, of motions of any length; frames that are not present
+        are ignored, and their values may be anything finite.
+        """
+        ...
 
 
 @runtime_checkable

@@ -105,8 +105,8 @@ def from_six(six: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def euler_axes(orders: Sequence[str]) -> Int[Tensor, "joints 3"]:
-    """Return the axes (0, 1, 2 for X, Y, Z) of orders of Euler angles such as `XYZ`, for `from_euler`; ValueError unless
-    each names the three axes once."""
+    """Return the axes (0, 1, 2 for X, Y, Z) of orders of Euler angles such as `XYZ`, for `from_euler`; ValueError
+    unless each names the three axes once."""
     if wrong := [order for order in orders if sorted(order) != ["X", "Y", "Z"]]:
         raise ValueError(f"an order of Tait-Bryan angles names X, Y and Z once, got {wrong[0]!r}")
     return torch.tensor([["XYZ".index(letter) for letter in order] for order in orders])

@@ -14,6 +14,8 @@ from priors.pose_transformer import inbetweener as pose_transformer
 from priors.pose_transformer.inbetweener import PoseTransformer
 from priors.refiner import network as refiner_network
 from priors.refiner.network import LstmRefiner
+from priors.tweening import path as path_network
+from priors.tweening.path import ConvPathPredictor
 
 AUTO = ("locomotion", "general")
 """Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection)."""
@@ -59,6 +61,11 @@ def load_inbetweener(name: str = "transformer") -> ConvInfiller | PoseTransforme
 def load_transformer(name: str = "transformer") -> PoseTransformer:
     """The bundled pose transformer, or a trained one by its file or run folder."""
     return pose_transformer.load(name)
+
+
+def load_path(name: str = "path") -> ConvPathPredictor:
+    """The bundled path predictor, or a trained one by its file or run folder."""
+    return path_network.load(name)
 
 
 def load_keyframe_timing(name: str = "keyframe-timing") -> KeyframeTiming:

@@ -26,10 +26,10 @@ class MissingMask:
     """Whether the body's position is missing."""
 
     @staticmethod
-    def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap) -> "MissingMask":
+    def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap, *, keep_position: bool = True) -> "MissingMask":
         """Build the mask from masks by joint. Where a joint is missing so is its parent's rotation, unless the parent
         has other children that show it. RequestError for joints and frames that the motion has not, and where nothing
-        of it is left."""
+        of it is left: no joint, or no position of the body unless that may be so."""
         for mask in masks:
             if mask.stop > motion.num_frames:
                 raise RequestError(
@@ -41,7 +41,7 @@ class MissingMask:
             own, above = rigmap.joint_of[child], rigmap.joint_of[parent] if parent >= 0 else None
             if own is not None and above is not None and len(CANONICAL.children(parent)) == 1:
                 joints[:, above] |= joints[:, own]
-        if root.all() or bool(joints.all()):
+        if (keep_position and root.all()) or bool(joints.all()):
             raise RequestError(f"the gaps leave nothing of the motion's {motion.num_frames} frames to go by")
         return MissingMask(joints, root)
 

@@ -23,12 +23,14 @@ from priors.infiller.network import InfillerConfig
 from priors.pose_transformer.network import PoseTransformerConfig
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings, DenoiserTrainer
 from priors.training.recipes.infiller import InfillerRecipe, InfillerSettings, InfillerTrainer
+from priors.training.recipes.path import PathRecipe, PathSettings, PathTrainer
 from priors.training.recipes.pose_transformer import (
     PoseTransformerRecipe,
     PoseTransformerSettings,
     PoseTransformerTrainer,
 )
 from priors.training.run import train
+from priors.tweening.path import PathConfig
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,15 @@ MODELS = (
         replace(tiny_transformer.CONFIG, kernel=5),
         PoseTransformerSettings(),
         (("--layers", "2"), PoseTransformerConfig(layers=2)),
+    ),
+    Model(
+        PathRecipe,
+        PathTrainer,
+        priors.load_path,
+        PathConfig(width=4),
+        PathConfig(width=5),
+        PathSettings(),
+        (("--width", "12"), PathConfig(width=12)),
     ),
 )
 
@@ -147,8 +158,8 @@ def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_pa
     killed_in(model, request_in(out), 2)
     with pytest.raises(RequestError, match="already holds a run; pass --resume"):
         train(request_in(out))
-    with pytest.raises(CheckpointError, match=r"other settings \(feet: .* then, 3\.0 now\)"):
-        train(request_in(out, resume=True, settings={"feet": 3.0}))
+    with pytest.raises(CheckpointError, match=r"other settings \(contacts: .* then, 3\.0 now\)"):
+        train(request_in(out, resume=True, settings={"contacts": 3.0}))
     with pytest.raises(CheckpointError, match=r"other network \((width|kernel): \d then, \d now\)"):
         train(request_in(out, resume=True, config=model.other))
     with pytest.raises(CheckpointError, match="other data"):

@@ -139,6 +139,20 @@ class Tween(MocapTable):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tweener(Table):
+    """The tables of Zhou et al. 2020 over clips that training did not see: how well the hips' trajectory is told."""
+
+    work = "mapctl.commands.bench.tweener.run"
+
+    data: options.DataFolder
+    """The folder that was trained on, for the clips that were held out."""
+    count: options.Count = 300
+    """Clips, spread over the kinds."""
+    path: options.Name = "path"
+    """The bundled path predictor, or the file or run folder of a trained one."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Gaps(Tween):
     """Such clips without frames in their middle: how far the answers are from the truth, by who gave them."""
 
@@ -203,6 +217,7 @@ TABLES: dict[str, type[Table]] = {
     "denoise": Denoise,
     "infill": Infill,
     "tween": Tween,
+    "tweener": Tweener,
     "gaps": Gaps,
     "transitions": Transitions,
     "timing": Timing,

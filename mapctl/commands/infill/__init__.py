@@ -21,6 +21,10 @@ class Infill(Command):
     """Frames from A up to B (exclusive), or seconds as in 2s:4s; may be given several times. Their values are ignored.
     What is nan in IN is missing as well; where nothing is, and there are no gaps and joints, frozen and leaping frames
     are detected."""
+    way: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
+    """Frames from A up to B (exclusive), or seconds, in which the place of the hips is lost and told by how the body
+    moves: treadmills, drifting sensors, poses from video. May be given several times, alone or with gaps, whose poses
+    are filled first; all frames may be lost so."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: options.Method = "auto"
@@ -36,6 +40,8 @@ class Infill(Command):
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     inbetweener: options.MaybeName = None
     """The file or run folder of a trained transformer or infiller; the bundled one if not given."""
+    path: options.MaybeName = None
+    """For --way: the file or run folder of a trained path predictor; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier. It extrapolates a gap at the end (`auto` if none is

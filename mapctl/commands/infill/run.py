@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 import priors
-from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill
+from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill, retraced
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import formats, report
 from mapctl.commands.infill import Infill
@@ -13,8 +13,9 @@ from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.frame_syntax import parse_ranges
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
 from mapctl.recording.gap_detection import find_gaps
-from mapctl.recording.masks import ALL, Mask
+from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.retarget.rigs import Rig
 
 
@@ -23,8 +24,9 @@ def run(command: Infill) -> int:
     _check(command)
     rig = inputs.read_rig(command.rig)
     motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig)
-    masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps else find_gaps(motion))
-    done = _run_infilling(command, motion, masks, rig)
+    ways = _parse_ways(command, motion)
+    masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps or ways else find_gaps(motion))
+    done = _run_infilling(command, motion, masks, ways, rig)
     formats.save(done.motion, command.out)
     if command.report is not None:
         report.write_report(results.build_report("infill", command, done), command.report)
@@ -36,6 +38,10 @@ def run(command: Infill) -> int:
 
 def _check(command: Infill) -> None:
     options.check_seed(command.seed)
+    if command.way and command.curve is not None:
+        raise RequestError("--way and --curve both say where the hips go; choose one")
+    if command.path is not None and not command.way:
+        raise RequestError("--path predicts the hips' place where --way says that it is lost; leave it out")
     if command.curve is not None and command.method in ("slerp", "rollouts"):
         raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
     finish, prior = not command.no_finish, command.prior
@@ -52,17 +58,43 @@ def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
     return [Mask(name, start, stop) for start, stop in gaps for name in names]
 
 
-def _run_infilling(command: Infill, motion: Motion, masks: Sequence[Mask], rig: Rig | None) -> InbetweenSolution:
+def _parse_ways(command: Infill, motion: Motion) -> Sequence[Mask]:
+    """Parse the frames in which the hips' place is lost; RequestError for impossible ones."""
+    ways = parse_ranges(command.way, fps=float(motion.fps), frames=motion.num_frames, what="way")
+    return [Mask(ROOT, start, stop) for start, stop in ways]
+
+
+def _run_infilling(
+    command: Infill, motion: Motion, masks: Sequence[Mask], ways: Sequence[Mask], rig: Rig | None
+) -> InbetweenSolution:
+    settings, densities = InfillSettings(finish=not command.no_finish), priors.load_choice(command.prior)
+    generator = torch.Generator().manual_seed(command.seed)
+    if ways:
+        return retraced(
+            motion,
+            priors.load_path(command.path or "path"),
+            (*masks, *ways),
+            # Where no pose is missing the network that would propose them need not be there.
+            inbetweener=_build_inbetweener(command) if any(mask.joint != ROOT for mask in masks) else None,
+            settings=settings,
+            densities=densities,
+            rig=rig,
+            generator=generator,
+        )
     return infill(
         motion,
-        build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior)),
+        _build_inbetweener(command),
         masks,
-        settings=InfillSettings(finish=not command.no_finish),
-        densities=priors.load_choice(command.prior),
+        settings=settings,
+        densities=densities,
         rig=rig,
         curve=None if command.curve is None else inputs.read_curve(command.curve, None),
-        generator=torch.Generator().manual_seed(command.seed),
+        generator=generator,
     )
+
+
+def _build_inbetweener(command: Infill) -> Inbetweener:
+    return build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior))
 
 
 def _tell(command: Infill, done: InbetweenSolution) -> None:

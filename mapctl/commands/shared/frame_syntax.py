@@ -28,10 +28,10 @@ def parse_range(text: str, *, fps: float, frames: int, what: str = "gap") -> tup
     return first, last
 
 
-def parse_ranges(texts: Sequence[str], *, fps: float, frames: int) -> list[tuple[int, int]]:
+def parse_ranges(texts: Sequence[str], *, fps: float, frames: int, what: str = "gap") -> list[tuple[int, int]]:
     """Parse several ranges, sorted by time; RequestError for two that overlap."""
-    ranges = sorted(parse_range(text, fps=fps, frames=frames) for text in texts)
+    ranges = sorted(parse_range(text, fps=fps, frames=frames, what=what) for text in texts)
     for (start, stop), (after, end) in pairwise(ranges):
         if after < stop:
-            raise RequestError(f"the gaps {start}:{stop} and {after}:{end} overlap; make them one")
+            raise RequestError(f"the {what}s {start}:{stop} and {after}:{end} overlap; make them one")
     return ranges

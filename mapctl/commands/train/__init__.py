@@ -12,6 +12,7 @@ from mapctl.commands.train.infiller import TrainInfiller
 from mapctl.commands.train.keyframe_timing import TrainKeyframeTiming
 from mapctl.commands.train.lstm_gmm import TrainDensity
 from mapctl.commands.train.options import TrainOptions
+from mapctl.commands.train.path import TrainPath
 from mapctl.commands.train.pose_transformer import TrainPoseTransformer
 from mapctl.commands.train.refiner import TrainRefiner
 
@@ -22,6 +23,7 @@ MODELS: tuple[type[TrainOptions], ...] = (
     TrainPoseTransformer,
     TrainInfiller,
     TrainKeyframeTiming,
+    TrainPath,
 )
 """Whatever can be trained: the options of each recipe in `priors.training.recipes`."""
 

@@ -52,7 +52,7 @@ class PoseWindows:
         self.contacts = LAYOUT.pick(corpus.features, "contacts")
         poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
         self.quats = torch.cat([rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses])
-        kind = torch.tensor([_find_kind(name, kinds) for name in corpus.names])
+        kind = torch.tensor([find_kind(name, kinds) for name in corpus.names])
         share = torch.zeros(len(kinds) + 1).index_add(0, kind, self.lengths.float())
         self.weights = share[kind] ** -evenness
 
@@ -107,7 +107,8 @@ class PoseWindows:
         return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
 
 
-def _find_kind(name: str, kinds: Sequence[str]) -> int:
+def find_kind(name: str, kinds: Sequence[str]) -> int:
+    """Number of the first of these patterns that is in a clip's name; that of none is one more than the last."""
     return next((number for number, kind in enumerate(kinds) if re.search(kind, name)), len(kinds))
 
 

@@ -16,13 +16,7 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
 from priors.config import require_at_least
 from priors.pose_transformer.growing import can_grow, grow
-from priors.pose_transformer.network import (
-    QUANTILES,
-    PoseTransformerConfig,
-    PoseTransformerNetwork,
-    ProposedPoses,
-    to_six,
-)
+from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
 from priors.training.corpus import Corpus, Split
@@ -322,7 +316,7 @@ def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
     batch = windows.draw(4000, 4, torch.Generator().manual_seed(0))
     both = [batch, batch.mirrored()]
     quats = torch.cat([each.quats for each in both]).flatten(0, 1)
-    six = to_six(rotations.to_matrix(quats))
+    six = rotations.to_six(rotations.to_matrix(quats))
     mean = windows.mean_quats()
     network.mean_quats.copy_(mean)
     network.mean_rotation.copy_(six.mean(dim=0))

@@ -1,0 +1,161 @@
+"""Training of the path predictor: windows of motion, and how far from its own the predicted trajectory of the hips
+ends (Zhou et al. 2020, section 3.4).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
+
+from mapctl.inbetweening.partial_motion import PartialMotion
+from mapctl.inbetweening.root_trajectory import LocalMotion
+from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, compute_displacement_errors
+from priors.config import require_at_least
+from priors.training.augmentation.pose_windows import PoseWindows, Variation, find_kind
+from priors.training.corpus import Corpus, Split
+from priors.training.recipe import NetworkRecipe
+from priors.training.trainer import GradientTrainer
+from priors.tweening.path import PathConfig, PathNetwork
+
+_VALIDATED = ("V1", "V8", "V32", "V64", "Y")
+_SHORTEST_WINDOW = 32  # frames
+_MIN_STD = 0.05  # metres: of a place that hardly moves, as the thighs' from the hips
+
+
+@dataclass(frozen=True)
+class PathSettings:
+    """How a path predictor is trained."""
+
+    steps: int = 12_000
+    """Updates."""
+    batch: int = 4096
+    """Frames an update; windows of one update are equally long."""
+    window: int = 192
+    """Frames of the longest window; the shortest have 32."""
+    learning_rate: float = 2e-3
+    """At its highest; it falls to nothing along a cosine."""
+    height: float = 1.0
+    """Weight of the error of the hips' height, cm; that of the displacements, cm, is 1."""
+    contacts: float = 0.5
+    """Weight of the contacts' cross entropy, nats."""
+    evenness: float = 1.0
+    """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
+    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
+    """Kinds, as patterns of names; clips of none of these are another kind."""
+    variation: Variation = field(default_factory=Variation)
+    """How bodies and tempos vary."""
+    bfloat16: bool = False
+    """The network computes in bfloat16; weights and loss stay in float32."""
+    seed: int = 1
+    """Seed of weights and windows."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps", "batch")
+        require_at_least(self, _SHORTEST_WINDOW, "window")
+
+
+class PathTrainer(GradientTrainer[PathNetwork]):
+    """Draws windows, and brings the trajectory that the network predicts of them nearer to their own."""
+
+    def __init__(self, config: PathConfig, settings: PathSettings, corpus: Corpus):
+        self.settings = settings
+        self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
+        # A window at the fastest tempo must fit into the longest clip.
+        self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + settings.variation.tempo)) - 1)
+        super().__init__(
+            lambda: PathNetwork(config, bfloat16=settings.bfloat16),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
+        _set_moments(self.network, self.windows)
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch."""
+        spare = max(0, self.longest - _SHORTEST_WINDOW)
+        frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.generator)))
+        batch = max(1, self.settings.batch // frames)
+        motion = self.windows.draw(batch, frames, self.generator, variation=self.settings.variation)
+        return compute_path_losses(self.network, motion, self.settings)
+
+    @torch.no_grad()
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Mean error of displacements and heights over unseen clips, cm, by kind and of all clips alike."""
+        windows = PoseWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
+        kinds = [*self.settings.kinds, "other"]
+        rows: dict[str, list[Mapping[str, float]]] = {}
+        for number, name in enumerate(corpus.names):
+            found = measure_clip(self.network, windows, number)
+            for group in ("all", kinds[find_kind(name, self.settings.kinds)]):
+                rows.setdefault(group, []).append(found)
+        return {
+            f"{group}_{name}_cm": sum(row[name] for row in found if name in row) / sum(name in row for row in found)
+            for group, found in rows.items()
+            for name in _VALIDATED
+            if any(name in row for row in found)
+        }
+
+
+@dataclass(frozen=True)
+class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
+    """What to train a path predictor on, and how."""
+
+    kind = "path"
+    config: PathConfig = field(default_factory=PathConfig)
+    """The network."""
+    settings: PathSettings = field(default_factory=PathSettings)
+    """How it is trained."""
+
+    def make_untaught(self, parts: Split) -> PathTrainer:
+        """The trainer, its weights drawn."""
+        return PathTrainer(self.config, self.settings, parts.train)
+
+    def format_shape(self) -> list[str]:
+        """The width, if it is another than usual."""
+        return [] if self.config.width == PathConfig.width else [f"--width {self.config.width}"]
+
+
+def compute_path_losses(network: PathNetwork, motion: PartialMotion, settings: PathSettings) -> dict[str, Tensor]:
+    """The loss, and in plain units the errors it is made of.
+
+    Displacements over 1, 2, 4 to 64 frames count alike (Zhou et al. 2020, Eq. 5), but by their distance instead of its
+    square, which a few runs would fill. A step's error is then penalised by what it sums up to.
+    """
+    hips = motion.root_position
+    predicted = network(LocalMotion.of_world(motion.world_poses()[0], motion.heading))
+    ground = predicted.integrate(motion.heading)[..., ::2]
+    path = torch.stack(
+        [
+            100 * compute_displacement_errors(ground, hips[..., ::2], span).mean()
+            for span in SPANS
+            if span < hips.shape[1]
+        ]
+    )
+    height = 100 * (predicted.height - hips[..., 1]).abs().mean()
+    contacts = cross_entropy(predicted.contacts, motion.contacts)
+    loss = path.mean() + settings.height * height + settings.contacts * contacts
+    parts = {"path_cm": path.mean(), "V1_cm": path[0], "height_cm": height, "contacts_nats": contacts}
+    return {"loss": loss, **parts}
+
+
+@torch.no_grad()
+def measure_clip(network: PathNetwork, windows: PoseWindows, number: int) -> dict[str, float]:
+    """Mean errors over a clip, cm: of displacements by their span, and of the height as `Y`."""
+    clip, first = torch.tensor([number]), torch.zeros(1, dtype=torch.long)
+    motion = windows.at(clip, first, int(windows.lengths[number]), torch.ones(1))
+    predicted = network(LocalMotion.of_world(motion.world_poses()[0], motion.heading))
+    trajectory, hips = predicted.integrate(motion.heading)[0], motion.root_position[0]
+    height = 100 * float((trajectory[:, 1] - hips[:, 1]).abs().mean())
+    return average_displacement_errors(trajectory[:, ::2], hips[:, ::2]) | {"Y": height}
+
+
+def _set_moments(network: PathNetwork, windows: PoseWindows) -> None:
+    """Tell the network means and spreads of the places that it sees, of motion and its mirror image."""
+    batch = windows.draw(4000, 4, torch.Generator().manual_seed(0))
+    seen = LocalMotion.of_world(batch.world_poses()[0], batch.heading)
+    places = torch.cat([seen.places, seen.mirrored().places])[..., 1:, :].flatten(0, 1)
+    network.mean.copy_(places.mean(dim=0))
+    network.std.copy_(places.std(dim=0).clamp_min(_MIN_STD))

@@ -1,0 +1,140 @@
+"""The path predictor: a convolutional network that tells the hips' trajectory from the body's motion (Zhou et al. 2020,
+section 3.4 and table 5).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from mapctl.errors import RequestError
+from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
+from mapctl.protocols import PathPredictor
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
+from priors import checkpoints
+from priors.config import NetworkConfig
+from priors.tweening.residual import ResidualConv
+
+_JOINTS = CANONICAL.num_joints - 1  # all but the hips, from which the others are seen
+_PLACE_ROWS = 3 * _JOINTS
+_ROWS = 2 * _PLACE_ROWS + 2
+_ANCHORS = tuple(CANONICAL.index(side + part) for side in ("left", "right") for part in ("Foot", "Toes"))
+_OUT_ROWS = 2 + 1 + 2 + len(_ANCHORS) + 1
+_STEP_UNIT, _TURN_UNIT, _VELOCITY_UNIT = 0.01, 0.05, 0.03  # metres, radians and metres a frame
+_HEIGHT_UNIT = 0.03  # metres
+_CONTACT_UNIT = 4.0  # of a logit
+_STRIDE = 16  # frames of the input to one of the innermost layers
+
+
+@dataclass(frozen=True)
+class PathConfig(NetworkConfig):
+    """Shape of the network."""
+
+    width: int = 64
+    """Channels of the outer layers, 128 in the paper; the inner ones have twice as many."""
+
+    def __post_init__(self):
+        if self.width < 1:
+            raise RequestError(f"a path predictor needs a positive width, got {self.width}")
+
+
+class PathNetwork(nn.Module):
+    """A body seen from its hips in, steps, height and contacts out; it normalises inside."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: PathConfig, *, bfloat16: bool = False):
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
+        super().__init__()
+        self.config, self.reduced_precision = config, bfloat16
+        self.register_buffer("mean", torch.zeros(_JOINTS, 3))
+        self.register_buffer("std", torch.ones(_JOINTS, 3))
+        outer, inner = config.width, 2 * config.width
+        down = ((_ROWS, outer), (outer, outer), (outer, inner), (inner, inner))
+        up = ((inner, inner), (inner, inner), (inner, outer), (outer, outer))
+        self.layers = nn.Sequential(
+            *(
+                ResidualConv(channels, kernel=12, stride=2, padding=5, ratio=ratio)
+                for ratio, channels in enumerate(down, start=1)
+            ),
+            *(
+                ResidualConv(channels, kernel=8, stride=2, padding=3, ratio=ratio, transposed=True)
+                for ratio, channels in enumerate(up, start=5)
+            ),
+        )
+        # The paper's last layer is residual as the others; its PReLU would treat steps back otherwise than ahead.
+        self.last = nn.Conv1d(outer, _OUT_ROWS, 5, padding=2)
+
+    def forward(self, motion: LocalMotion) -> RootTrajectory:
+        """Predict the trajectory; 123 to 138 frames on either side are seen."""
+        frames = motion.turns.shape[1]
+        rows = pad(self._rows(motion).transpose(1, 2), (0, -frames % _STRIDE))
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            out = self.last(self.layers(rows))
+        out = out[..., :frames].transpose(1, 2).to(rows.dtype)
+        steps, height, contacts, shares = out.split([2, 1, 2, len(_ANCHORS) + 1], dim=-1)
+        return RootTrajectory(
+            _mix_anchored_steps(motion, shares) + _STEP_UNIT * steps,
+            _stand_on_floor(motion) + _HEIGHT_UNIT * height[..., 0],
+            _CONTACT_UNIT * contacts,
+        )
+
+    def _rows(self, motion: LocalMotion) -> Float[Tensor, "batch frames rows"]:
+        """Encode the body in about unit size: places and how they change, heading change, and where frames are.
+
+        The change is a difference of two places that a convolution can take, but in the places' own unit it would be
+        lost: millimetres beside decimetres.
+        """
+        scaled = ((motion.places[..., 1:, :] - self.mean) / self.std).flatten(-2)
+        steps = motion.anchored_steps()[..., 1:, :].flatten(-2) / _VELOCITY_UNIT
+        turns = motion.turns[..., None] / _TURN_UNIT
+        present = motion.present[..., None].to(scaled)
+        return torch.cat([scaled, steps, turns, torch.ones_like(turns)], dim=-1) * present
+
+
+def _mix_anchored_steps(motion: LocalMotion, shares: Float[Tensor, "batch frames shares"]) -> Tensor:
+    """Mix the steps that would keep each foot and toe in its place, and none, by logits.
+
+    Who stands is still to the millimetre so, without any weight having learnt it.
+    """
+    steps = motion.anchored_steps()[..., list(_ANCHORS), ::2]
+    return (torch.softmax(shares, dim=-1)[..., :-1, None] * steps).sum(dim=-2)
+
+
+def _stand_on_floor(motion: LocalMotion) -> Float[Tensor, "batch frames"]:
+    """Return the height of the hips whose lower toe stands, metres."""
+    return TOE_REST_HEIGHT - motion.places[..., list(TOE_JOINTS), 1].amin(dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ConvPathPredictor(PathPredictor):
+    """A trained path predictor."""
+
+    name: str
+    """Name under which it was loaded."""
+    network: PathNetwork
+    """Network in evaluation mode."""
+    card: checkpoints.Card
+    """Card of the weights."""
+
+    @torch.no_grad()
+    def predict(self, motion: LocalMotion) -> RootTrajectory:
+        """Predict the trajectory of motions of any length: the mean of the outputs for them and their mirror images."""
+        one, other = self.network(motion), self.network(motion.mirrored()).mirrored()
+        return RootTrajectory(
+            (one.steps_heading + other.steps_heading) / 2,
+            (one.height + other.height) / 2,
+            (one.contacts + other.contacts) / 2,
+        )
+
+
+def load(name: str = "path") -> ConvPathPredictor:
+    """Load the bundled path predictor, or a trained one by its file or run folder; CheckpointError for anything
+    else."""
+    with checkpoints.open_checkpoint(name, "path") as (tensors, card):
+        network = PathNetwork(PathConfig.of_card(card.config))
+        network.load_state_dict(tensors)
+    return ConvPathPredictor(name, network.eval().requires_grad_(False), card)

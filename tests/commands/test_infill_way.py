@@ -1,0 +1,87 @@
+"""`mapctl infill --way`: the hips' way told by the body, as a user asks for it, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from captures import on_rig
+from helpers import run
+from tiny_infiller import save_tiny_infiller
+from tiny_path import save_tiny_path
+
+import mapctl
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return save_tiny_path(tmp_path_factory.mktemp("path") / "tiny.safetensors")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """A walk of 60 frames on a rig with a root on the ground."""
+    out = tmp_path_factory.mktemp("clip") / "walk.bvh"
+    on_rig("bandai", 60).save(out)
+    return out
+
+
+def channels(file):
+    rows = file.read_text().split("Frame Time")[1].splitlines()[1:]
+    return np.array([row.split() for row in rows], dtype=float)
+
+
+@pytest.mark.parametrize("finish", [[], ["--no-finish"]], ids=["map", "raw"])
+def test_only_the_hips_place_changes_and_only_there(clip, path, tmp_path, finish):
+    out = tmp_path / "out.bvh"
+    words = ["--way", "10:20", "--way", "1s:1.5s", "--path", path, "--quiet", *finish]
+    assert run("infill", clip, "-o", out, *words) == 0
+    before, after = channels(clip), channels(out)
+    changed = before != after
+    assert set(np.flatnonzero(changed.any(axis=1))) <= {*range(10, 20), *range(30, 45)}
+    assert changed[10:20].any(axis=1).sum() >= 8
+    assert 1 <= changed.any(axis=0).sum() <= 3
+
+
+def test_ways_and_gaps_go_together_and_are_told(clip, path, tmp_path, capsys):
+    infiller = save_tiny_infiller(tmp_path / "infiller.safetensors", drawn=0.2)
+    report, out = tmp_path / "r.json", tmp_path / "out.bvh"
+    words = ["--way", "10:40", "--gap", "20:25", "--path", path, "--method", "infiller", "--inbetweener", infiller]
+    assert run("infill", clip, "-o", out, *words, "--report", report, "--no-finish") == 0
+    assert "10:40" in capsys.readouterr().out
+    (gap,) = json.loads(report.read_text())["gaps"]
+    assert (gap["start"], gap["stop"], gap["root"]) == (10, 40, True)
+    turned = (channels(clip) != channels(out)).sum(axis=1)
+    assert turned[20:25].min() > 10
+    assert turned[10:20].max() <= 3
+
+
+def test_a_whole_clip_may_be_walked_in_place(clip, path, tmp_path):
+    out = tmp_path / "out.npz"
+    assert run("infill", clip, "-o", out, "--way", "0:60", "--path", path, "--quiet") == 0
+    assert mapctl.load(out).num_frames == 60
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--way", "10:61"], "the way 10:61 must begin before it ends, within the motion's frames 0:60"),
+        (["--way", "20:10"], "the way 20:10 must begin before it ends"),
+        (["--way", "10"], "a way is A:B"),
+        (["--way", "5:20", "--way", "10:30"], "the ways 5:20 and 10:30 overlap"),
+        (["--way", "0:60", "--gap", "10:20"], "lost over all frames of a motion whose joints are lost as well"),
+        (["--way", "0:60", "--joints", "leftHand"], "lost over all frames of a motion whose joints are lost as well"),
+        (["--way", "5:20", "--curve", "line:3"], "--way and --curve both say where the hips go"),
+        (["--gap", "5:20"], "--path predicts the hips' place where --way says that it is lost"),
+        (["--way", "5:20", "--path", "nobody"], "no prior 'nobody'"),
+        (["--way", "5:20", "--path", "denoiser"], "a denoiser is no path"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_makes_no_sense_is_one_line_and_nothing_is_written(clip, path, tmp_path, capsys, words, message):
+    out = tmp_path / "out.bvh"
+    given = [] if "--path" in words else ["--path", path]
+    assert run("infill", clip, "-o", out, *words, *given, "--method", "slerp") == 2
+    told = capsys.readouterr()
+    assert message in told.err
+    assert told.err.count("\n") == 1
+    assert not out.exists()

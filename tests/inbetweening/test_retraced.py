@@ -1,0 +1,164 @@
+"""The hips' way where it is lost: told by the body, led to the next known place, all else to the bit."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import on_rig
+from helpers import generator, walk
+from methods import UNFINISHED
+from tiny_path import ToldPath, tiny_path
+
+from controllers import retraced
+from controllers.inbetweening.geometry.path_closing import close_path
+from controllers.inbetweening.proposers import SlerpInbetweener
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.motion import Motion
+from mapctl.recording.masks import ALL, ROOT, Mask
+from mapctl.skeleton import CANONICAL, leg_length
+
+FRAMES = 80
+CASES = [("canonical", 30), ("bandai", 30), ("daz", 30), ("daz", 120)]
+
+
+def told_by(motion, stretch=1.0):
+    """The motion's own trajectory at the prior's rate and of unit size."""
+    canonical = retarget.to_canonical(motion)[0].resample(30)
+    scale = leg_length(canonical.skeleton) / leg_length(CANONICAL)
+    small = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
+    return ToldPath(small, stretch)
+
+
+def hips_of(motion):
+    return retarget.to_canonical(motion)[0].root_position
+
+
+def elsewhere(motion, start, stop):
+    """The motion with the hips strewn about in these frames."""
+    spread = 3 * torch.randn(stop - start, 3, generator=generator(), dtype=torch.float64)
+    if motion.moving_offsets:
+        moving = {joint: values.clone() for joint, values in motion.moving_offsets.items()}
+        moving[min(moving)][start:stop] += spread
+        return replace(motion, moving_offsets=moving)
+    root = motion.root_position.clone()
+    root[start:stop] += spread
+    return replace(motion, root_position=root)
+
+
+@pytest.mark.parametrize(("rig", "fps"), CASES)
+def test_a_true_prediction_gives_back_the_way_and_what_is_known_stays_to_the_bit(rig, fps):
+    motion = on_rig(rig, FRAMES * fps // 30, fps=fps)
+    start, stop = fps // 2, 2 * fps
+    masks = [Mask(ROOT, start, stop)]
+    done = retraced(elsewhere(motion, start, stop), told_by(motion), masks, settings=UNFINISHED)
+    assert float((hips_of(done.motion) - hips_of(motion)).norm(dim=-1).max()) < (0.005 if fps == 30 else 0.01)
+    lost = MissingMask.of_masks(motion, masks, retarget.to_canonical(motion)[1])
+    assert torch.equal(done.motion.local_quat_xyzw, motion.local_quat_xyzw)
+    assert torch.equal(done.motion.root_position[~lost.root], motion.root_position[~lost.root])
+    for joint, values in motion.moving_offsets.items():
+        assert torch.equal(done.motion.moving_offsets[joint][~lost.root], values[~lost.root])
+
+
+@pytest.mark.parametrize("edges", [(20, 60), (0, 50), (30, FRAMES), (0, FRAMES)])
+def test_where_the_hips_were_while_they_are_lost_does_not_matter(edges):
+    motion, masks = walk(FRAMES), [Mask(ROOT, *edges)]
+    found = [
+        retraced(each, tiny_path(), masks, settings=UNFINISHED).motion for each in (motion, elsewhere(motion, *edges))
+    ]
+    assert torch.equal(found[0].root_position, found[1].root_position)
+    assert bool(found[0].root_position.isfinite().all())
+
+
+@pytest.mark.parametrize("edges", [(0, 50), (30, FRAMES)])
+def test_a_way_lost_at_an_end_goes_on_from_what_is_known(edges):
+    motion = walk(FRAMES, turn_rate=0.4)
+    done = retraced(motion, told_by(motion), [Mask(ROOT, *edges)], settings=UNFINISHED)
+    assert float((done.motion.root_position - motion.root_position).norm(dim=-1).max()) < 0.002
+
+
+def test_a_way_lost_throughout_begins_over_the_origin():
+    motion = walk(FRAMES)
+    motion = replace(motion, root_position=motion.root_position + torch.tensor([5.0, 0.0, 2.0]).double())
+    done = retraced(motion, told_by(motion), [Mask(ROOT, 0, FRAMES)], settings=UNFINISHED).motion.root_position
+    torch.testing.assert_close(done[0, ::2], torch.zeros(2).double(), atol=1e-6, rtol=0)
+    wanted = motion.root_position - motion.root_position[0] * torch.tensor([1.0, 0.0, 1.0])
+    torch.testing.assert_close(done, wanted, atol=2e-3, rtol=0)
+
+
+def test_what_a_prediction_misses_the_next_place_by_is_spread():
+    motion = walk(FRAMES)
+    done = retraced(motion, told_by(motion, stretch=1.2), [Mask(ROOT, 20, 60)], settings=UNFINISHED).motion
+    steps = torch.diff(done.root_position[:, ::2], dim=0).norm(dim=-1)
+    usual = float(torch.diff(motion.root_position[:, ::2], dim=0).norm(dim=-1).mean())
+    assert float((steps - usual).abs().max()) < 0.15 * usual
+    assert torch.equal(done.root_position[60:], motion.root_position[60:])
+
+
+def test_who_stands_is_not_moved_by_what_the_walk_after_it_misses():
+    """20 frames of standing, then 20 of walking, which end 10 cm beside the place that is known."""
+    steps = torch.zeros(42, 3)
+    steps[21:, 2] = 0.04
+    predicted = torch.cumsum(steps, dim=0)
+    known = predicted.clone()
+    known[41:, 0] = 0.1
+    lost = torch.zeros(42, dtype=torch.bool)
+    lost[1:41] = True
+    found = close_path(predicted, known, lost)
+    assert float((found[:21] - predicted[:21]).abs().max()) < 0.001
+    assert float(torch.diff(found[:, 0]).max()) < 0.006
+    assert float((found[40] - known[41]).norm()) < 0.05
+
+
+def test_heights_that_are_off_fade_from_one_known_frame_to_the_next():
+    predicted, known = torch.zeros(12, 3), torch.zeros(12, 3)
+    known[0, 1], known[11, 1] = 0.11, 0.0
+    lost = torch.ones(12, dtype=torch.bool)
+    lost[0] = lost[11] = False
+    torch.testing.assert_close(close_path(predicted, known, lost)[:, 1], torch.linspace(0.11, 0, 12))
+
+
+def test_gaps_are_filled_first_and_the_way_goes_by_their_poses():
+    motion, masks = walk(FRAMES), [Mask(ROOT, 20, 60), Mask(ALL, 35, 42)]
+    done = retraced(motion, told_by(motion), masks, inbetweener=SlerpInbetweener(), settings=UNFINISHED)
+    assert float((done.motion.root_position - motion.root_position).norm(dim=-1).max()) < 0.005
+    same = (done.motion.local_quat_xyzw == motion.local_quat_xyzw).all(dim=-1).all(dim=-1)
+    assert same.tolist() == [not 35 <= frame < 42 for frame in range(FRAMES)]
+
+
+def test_a_gap_of_its_own_keeps_the_trajectory_that_is_proposed_with_it():
+    motion, masks = walk(FRAMES, turn_rate=1.0), [Mask(ROOT, 50, 70), Mask(ALL, 10, 40)]
+    given = told_by(motion, stretch=1.5)
+    done = retraced(motion, given, masks, inbetweener=SlerpInbetweener(), settings=UNFINISHED).motion
+    straight = torch.lerp(motion.root_position[9], motion.root_position[40], 16 / 31)
+    torch.testing.assert_close(done.root_position[25, ::2], straight[::2], atol=0.02, rtol=0)
+
+
+def test_map_plants_the_feet_and_leaves_what_is_known():
+    motion = walk(40)
+    done = retraced(motion, told_by(motion), [Mask(ROOT, 10, 30)])
+    assert torch.equal(done.motion.local_quat_xyzw, motion.local_quat_xyzw)
+    assert torch.equal(done.motion.root_position[:10], motion.root_position[:10])
+    assert "footing" in done.ledger.summary()
+    assert float((done.motion.root_position - motion.root_position).norm(dim=-1).max()) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        ([Mask(ROOT, 10, 90)], "ends after the motion's 80 frames"),
+        ([Mask(ROOT, 0, FRAMES), Mask("leftHand", 5, 9)], "over all frames of a motion whose joints are lost as well"),
+        ([Mask("leftHand", 5, 9)], "there is nothing to predict"),
+        ([Mask("leftElbow7", 5, 9)], "no joint"),
+        ([], "nothing to predict"),
+    ],
+)
+def test_masks_that_do_not_fit_are_refused(masks, message):
+    with pytest.raises(RequestError, match=message):
+        retraced(walk(FRAMES), tiny_path(), masks, inbetweener=SlerpInbetweener(), settings=UNFINISHED)
+
+
+def test_gaps_need_somebody_who_fills_them():
+    with pytest.raises(RequestError, match="an in-betweener must propose them"):
+        retraced(walk(FRAMES), tiny_path(), [Mask(ROOT, 5, 50), Mask(ALL, 5, 9)], settings=UNFINISHED)

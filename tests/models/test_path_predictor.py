@@ -1,0 +1,183 @@
+"""The path predictor: its layers, what it sees, and what it does not."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import tiny_path
+import torch
+from helpers import generator, walk
+
+from mapctl import rotations
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.features import LAYOUT, encode
+from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
+from mapctl.kinematics import heading
+from mapctl.protocols import PathPredictor
+from priors import checkpoints
+from priors.tweening import path
+from priors.tweening.path import PathConfig, PathNetwork
+from priors.tweening.residual import ResidualConv
+
+
+def local_motion(frames=90, **options):
+    motion = walk(frames, **options)
+    return LocalMotion.of_world(
+        motion.joint_positions().float()[None], heading(motion.local_quat_xyzw[:, 0]).float()[None]
+    )
+
+
+def outputs(trajectory: RootTrajectory):
+    return torch.cat([trajectory.steps_heading, trajectory.height[..., None], trajectory.contacts], dim=-1)
+
+
+def test_weights_are_as_many_as_planned_and_as_the_paper_s_table():
+    """Three quarters of a million, and what steps beside places and feet to stand on add; in the paper 2.9 million."""
+    counts = [sum(each.numel() for each in PathNetwork(PathConfig(width=width)).parameters()) for width in (64, 128)]
+    assert counts[0] == pytest.approx(0.8e6, rel=0.05)
+    assert counts[1] == pytest.approx(3.0e6, rel=0.05)
+
+
+def test_a_frame_sees_123_to_138_frames_on_either_side():
+    """By its place within a stride; the frame before the first seen one is that from which its step is taken."""
+    network = tiny_path.network()
+    places = torch.randn(1, 400, 21, 3, generator=generator()) * 0.2
+    places.requires_grad_(True)
+    seen = LocalMotion(places, torch.zeros(1, 400), torch.ones(1, 400, dtype=torch.bool))
+    spans = []
+    for frame in range(192, 208):  # of one stride
+        (gradient,) = torch.autograd.grad(outputs(network(seen))[0, frame].sum(), places)
+        touched = gradient.abs().sum(dim=(0, 2, 3)).nonzero()[:, 0]
+        spans.append((frame - int(touched.min()), int(touched.max()) - frame))
+    assert min(min(span) for span in spans) >= 122
+    assert max(max(span) for span in spans) == 138
+
+
+def test_a_motion_s_length_does_not_change_what_is_far_from_its_end():
+    network, whole = tiny_path.network(), local_motion(330)
+    part = LocalMotion(whole.places[:, :303], whole.turns[:, :303], whole.present[:, :303])
+    one, other = outputs(network(whole))[:, :160], outputs(network(part))[:, :160]
+    torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
+    assert network(part).height.shape == (1, 303)
+
+
+@pytest.mark.parametrize("frames", [2, 15, 16, 17, 40])
+def test_motions_of_any_length_are_told(frames):
+    found = tiny_path.tiny_path().predict(local_motion(frames))
+    assert found.steps_heading.shape == (1, frames, 2)
+    assert bool(outputs(found).isfinite().all())
+
+
+def test_where_a_walk_is_and_whither_it_goes_changes_nothing():
+    motion, predictor = walk(60, turn_rate=0.5), tiny_path.tiny_path()
+    turn = rotations.about_y(torch.tensor(2.0, dtype=torch.float64)).expand(60, 4)
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
+    root = rotations.rotate(turn, motion.root_position) + torch.tensor([40.0, 0.0, -7.0], dtype=torch.float64)
+    moved = replace(motion, root_position=root, local_quat_xyzw=quats)
+    found = [
+        predictor.predict(
+            LocalMotion.of_world(
+                each.joint_positions().float()[None], heading(each.local_quat_xyzw[:, 0]).float()[None]
+            )
+        )
+        for each in (motion, moved)
+    ]
+    torch.testing.assert_close(outputs(found[0]), outputs(found[1]), atol=1e-4, rtol=0)
+
+
+def test_a_mirrored_walk_goes_the_mirrored_way():
+    seen, predictor = local_motion(60, turn_rate=0.4), tiny_path.tiny_path(seed=3)
+    torch.testing.assert_close(
+        outputs(predictor.predict(seen.mirrored()).mirrored()), outputs(predictor.predict(seen)), atol=1e-5, rtol=0
+    )
+    assert float(
+        (outputs(predictor.network(seen.mirrored()).mirrored()) - outputs(predictor.network(seen))).abs().max()
+    )
+
+
+def test_who_stands_is_told_no_steps_but_what_the_network_corrects():
+    """Of a body that does not move every anchored step is nil."""
+    motion = walk(40)
+    still = LocalMotion.of_world(motion.joint_positions().float()[None, :1].expand(1, 40, 21, 3), torch.zeros(1, 40))
+    network = tiny_path.network()
+    network.last.weight.zero_()
+    network.last.bias.zero_()
+    found = network(still)
+    assert float(found.steps_heading.abs().max()) < 1e-7
+    toe = motion.joint_positions()[0, [15, 20], 1].min()
+    assert float(found.height[0, 0]) == pytest.approx(float(motion.root_position[0, 1] - toe) + 0.0425, abs=0.2)
+
+
+def test_absent_frames_are_as_if_there_were_nothing():
+    seen = local_motion(60)
+    wild = seen.places.clone()
+    wild[:, 40:] = 9.0
+    present = seen.present.clone()
+    present[:, 40:] = False
+    network = tiny_path.network()
+    one, other = (outputs(network(LocalMotion(places, seen.turns, present)))[:, :40] for places in (seen.places, wild))
+    torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
+
+
+def test_steps_that_are_summed_up_lead_along_the_way_walked():
+    motion = walk(80, turn_rate=0.7)
+    features = encode(motion)[0][None]
+    steps, height = LAYOUT.pick(features, "root_displacement_heading"), LAYOUT.pick(features, "root_height")[..., 0]
+    told = RootTrajectory(steps, height, LAYOUT.pick(features, "contacts"))
+    found = told.integrate(heading(motion.local_quat_xyzw[:, 0])[None])[0]
+    wanted = motion.root_position.clone()
+    wanted[:, ::2] -= wanted[0, ::2].clone()
+    torch.testing.assert_close(found, wanted, atol=1e-9, rtol=0)
+
+
+def test_an_anchored_step_keeps_a_joint_in_its_place():
+    motion = walk(30, turn_rate=0.9)
+    facing = heading(motion.local_quat_xyzw[:, 0])[None]
+    seen = LocalMotion.of_world(motion.joint_positions()[None], facing)
+    for joint in (15, 20, 4):
+        steps = seen.anchored_steps()[..., joint, ::2]
+        hips = RootTrajectory(steps, torch.zeros_like(facing), steps).integrate(facing)[0]
+        held = rotations.rotate_about_y(seen.places[0, :, joint], facing[0]) + hips
+        assert float(held[:, ::2].std(dim=0).max()) < 1e-9
+
+
+@pytest.mark.parametrize(("transposed", "kernel", "padding"), [(False, 12, 5), (True, 8, 3)])
+@pytest.mark.parametrize("ratio", [1.0, 3.0, 9.0])
+def test_a_residual_layer_keeps_the_variance_and_halves_or_doubles_the_length(transposed, kernel, padding, ratio):
+    torch.manual_seed(0)
+    layer = ResidualConv((64, 96), kernel=kernel, stride=2, padding=padding, ratio=ratio, transposed=transposed)
+    with torch.no_grad():
+        layer.activation.weight.fill_(1.0)  # without its bend what goes in and comes out is comparable
+        made = layer(torch.randn(8, 64, 64, generator=generator()))
+    assert made.shape == (8, 96, 128 if transposed else 32)
+    # Averaged pairs of white noise have half of its variance.
+    share = 1 / ratio
+    wanted = share + (1 - share) * (1.0 if transposed else 0.5)
+    assert float(made.var()) == pytest.approx(wanted, rel=0.2)
+
+
+def test_a_residual_layer_adds_its_shortcut_once():
+    layer = ResidualConv((3, 3), kernel=3, padding=1, ratio=4.0)
+    torch.nn.init.zeros_(layer.conv.weight)
+    given = torch.randn(1, 3, 5, generator=generator())
+    torch.testing.assert_close(layer(given), math.sqrt(0.75) * given)
+    assert ResidualConv((3, 3), kernel=3, padding=1, ratio=1.0).across is None
+
+
+def test_it_is_saved_and_loaded_and_no_other_kind_is(tmp_path):
+    file = tiny_path.save_tiny_path(tmp_path / "path.safetensors")
+    found = path.load(str(file))
+    assert isinstance(found, PathPredictor)
+    seen = local_motion(40)
+    torch.testing.assert_close(
+        outputs(found.predict(seen)), outputs(tiny_path.tiny_path().predict(seen)), atol=0.02, rtol=0.05
+    )
+    with pytest.raises(CheckpointError, match="a denoiser is no path"):
+        path.load("denoiser")
+    card = replace(tiny_path.card(), config={"width": 5})
+    checkpoints.save(tiny_path.network().state_dict(), card, tmp_path / "other.safetensors")
+    with pytest.raises(CheckpointError, match="do not fit"):
+        path.load(str(tmp_path / "other.safetensors"))
+    with pytest.raises(RequestError, match="positive width"):
+        PathConfig(width=0)

@@ -1,0 +1,67 @@
+"""Path predictors for tests: one of a few kilobytes with drawn weights, and one that is told the answer."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from mapctl import contacts
+from mapctl.features import LAYOUT, encode
+from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
+from mapctl.motion import Motion
+from mapctl.protocols import PathPredictor
+from priors import checkpoints
+from priors.tweening.path import ConvPathPredictor, PathConfig, PathNetwork
+
+CONFIG = PathConfig(width=4)
+
+
+def network(config: PathConfig = CONFIG, *, seed: int = 0) -> PathNetwork:
+    """With weights of this seed."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return PathNetwork(config).eval().requires_grad_(False)
+
+
+def card(held_out: dict[str, list[str]] | None = None) -> checkpoints.Card:
+    """Of the tiny path predictor."""
+    return checkpoints.Card(
+        "path",
+        CONFIG.as_card(),
+        licence="none, it is made up",
+        data={"held_out": held_out or {}},
+        **checkpoints.Card.layout_fields(),
+    )
+
+
+def tiny_path(*, seed: int = 0) -> ConvPathPredictor:
+    """As the controllers take it."""
+    return ConvPathPredictor("tiny", network(seed=seed), card())
+
+
+def save_tiny_path(path: Path, held_out: dict[str, list[str]] | None = None) -> Path:
+    """Write the weights and the card; returns the path for --path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    checkpoints.save(network().state_dict(), card(held_out), path)
+    return path
+
+
+@dataclass(frozen=True, eq=False)
+class ToldPath(PathPredictor):
+    """Answers with the steps of a canonical motion at the prior's rate, as it is or longer."""
+
+    truth: Motion
+    """Motion whose trajectory it tells."""
+    stretch: float = 1.0
+    """Ratio of its steps to the true ones."""
+
+    def predict(self, motion: LocalMotion) -> RootTrajectory:
+        """Ignore the body."""
+        features = encode(self.truth)[0].float()[None]
+        # A query may have one frame more than the motion at the prior's rate.
+        features = features[:, torch.arange(motion.turns.shape[1]).clamp(max=features.shape[1] - 1)]
+        return RootTrajectory(
+            self.stretch * LAYOUT.pick(features, "root_displacement_heading"),
+            LAYOUT.pick(features, "root_height")[..., 0],
+            contacts.to_logits(LAYOUT.pick(features, "contacts") > 0.5),
+        )
