@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.skeleton import CANONICAL
 
 _PARTNERS = CANONICAL.mirror_partners()
@@ -26,8 +27,8 @@ class PositionImage:
     """Positions relative to the reference, metres; unknown ones are interpolated by slerp of the joints' rotations."""
     contacts: Float[Tensor, "batch frames 2"]
     """Left and right toe planted, 0 or 1; 0.5 where the toe is not known."""
-    known: Bool[Tensor, "batch frames joints"]
-    """Whether a joint's position is known."""
+    known_axes: Bool[Tensor, "batch frames joints 3"]
+    """Which coordinates of a joint's position are known, in the reference's axes; drawings tell two of them."""
     present: Bool[Tensor, "batch frames"]
     """Whether there is such a frame; others fill up a batch."""
     ground: Float[Tensor, "batch frames 2"]
@@ -44,13 +45,18 @@ class PositionImage:
         known: Bool[Tensor, "batch frames joints"],
         present: Bool[Tensor, "batch frames"],
         toes: tuple[int, int],
+        known_axes: Bool[Tensor, "batch frames joints 3"] | None = None,
     ) -> "PositionImage":
         """Build an image from world positions (metres) and the hips' heading (radians), interpolated where they are not
-        known; the reference is their root. Contacts of toes that are not known may be anything finite."""
+        known; the reference is their root. Contacts of toes that are not known may be anything finite. Where single
+        coordinates are known they are told by `known_axes`, beside the joints that are `known` whole."""
         known = known & present[..., None]
+        axes = known[..., None].expand(*known.shape, 3)
+        if known_axes is not None:
+            axes = axes | (known_axes & present[..., None, None])
         bits = torch.where(known[..., list(toes)], contacts, 0.5)
         ground, facing = positions_world[..., 0, ::2], rotations.unwrap_angle(heading)
-        image = PositionImage(positions_world, bits, known, present, ground, facing)
+        image = PositionImage(positions_world, bits, axes, present, ground, facing)
         return replace(image, places=image.from_world(positions_world))
 
     def from_world(self, positions_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
@@ -69,11 +75,32 @@ class PositionImage:
         return PositionImage(
             mirror_positions(self.places),
             self.contacts.flip(-1),
-            self.known[..., _PARTNERS],
+            self.known_axes[..., _PARTNERS, :],
             self.present,
             self.ground * flip,
             -self.heading,
         )
+
+    @property
+    def known(self) -> Bool[Tensor, "batch frames joints"]:
+        """Whether a joint's position is known, all of it."""
+        return self.known_axes.all(dim=-1)
+
+    def copy_nearest(self) -> tuple[Float[Tensor, "batch frames joints 3"], Float[Tensor, "batch frames joints 3"]]:
+        """Copy every coordinate from the nearest frame in which it is known, and return how many frames away that is:
+        the dense input of Zhou et al. 2020, section 3.5. Coordinates that are never known are 0, infinitely far.
+        """
+        known = self.known_axes.flatten(2).transpose(1, 2).flatten(0, 1)  # one row for each coordinate of each motion
+        values = self.places.flatten(2).transpose(1, 2).flatten(0, 1)
+        frame = torch.arange(values.shape[1], device=values.device)
+        before, after = last_observed(known), next_observed(known)
+        nearest = torch.where((frame - before).abs() <= (after - frame).abs(), before, after)
+        never = ~known.any(dim=1, keepdim=True)
+        copied = torch.where(never, 0.0, values.gather(1, nearest))
+        away = torch.where(never, torch.inf, (frame - nearest).abs().to(values))
+        batch, _, *shape = self.places.shape
+        copied, away = (each.unflatten(0, (batch, -1)).transpose(1, 2).unflatten(2, shape) for each in (copied, away))
+        return copied, away
 
     @property
     def ever_known(self) -> Bool[Tensor, "batch joints"]:

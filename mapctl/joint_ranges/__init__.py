@@ -160,4 +160,7 @@ def read_table(text: str) -> dict[str, JointRange]:
 @cache
 def load() -> JointRanges:
     """Return the bundled ranges."""
-    return JointRanges.of_joints(read_table(files(__name__).joinpath(TABLE).read_text("utf-8")))
+    text = files(__name__).joinpath(TABLE).read_text("utf-8")
+    # They are kept for all who ask: whoever asks first may build a network on another device.
+    with torch.device("cpu"):
+        return JointRanges.of_joints(read_table(text))

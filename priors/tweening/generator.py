@@ -1,0 +1,202 @@
+"""The generator of local motion: poses of every frame from sparse keys (Zhou et al. 2020, section 3.5, table 5)."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.inbetweening import PositionImage
+from mapctl.numerics.intervals import last_observed, next_observed
+from mapctl.skeleton import CANONICAL
+from priors.config import NetworkConfig
+from priors.tweening.range_constrained import POSE_ROWS, ConstrainedPose, RangeConstrainedKinematics
+from priors.tweening.residual import ResidualConv
+
+_PLACE_ROWS = 3 * CANONICAL.num_joints
+_STYLE_ROWS = 3 * (CANONICAL.num_joints - 1)
+_TRAVEL_ROWS, _TIME_ROWS, _CONTACT_ROWS = 3, 2, 2
+INPUT_ROWS = 2 * _PLACE_ROWS + _TRAVEL_ROWS + _TIME_ROWS + _CONTACT_ROWS
+"""Rows of the dense input: nearest known coordinates and how far they are, the reference's velocities, time since and
+until anything is known, contacts."""
+MAX_KEY_FRAMES = 480
+"""Frames at the prior's rate beyond which it is all one how far a key is: 16 s, about what a frame of the output
+sees."""
+_VELOCITY_UNIT, _HEADING_UNIT = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
+_STAGES = 6
+_STRIDE = 2**_STAGES
+_DOWN_RATIOS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+_UP_RATIOS = ((1.4, 1.6), (2.2, 2.8), (3.6, 4.6), (5.8, 7.2), (8.8, 10.6), (12.6, 14.8))
+
+
+@dataclass(frozen=True)
+class GeneratorConfig(NetworkConfig):
+    """Shape of the network."""
+
+    widths: tuple[int, ...] = (96, 128, 192, 256, 288, 320)
+    """Channels of the encoder's layers, each of which halves the frames."""
+    up_widths: tuple[int, ...] = (320, 288, 256, 192, 128, 96)
+    """Channels of the decoder's stages, each of which doubles them."""
+    style: int = 128
+    """Numbers of the vector that a motion's style becomes."""
+
+    def __post_init__(self):
+        if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES or min(*self.widths, *self.up_widths) < 1:
+            raise RequestError(f"a generator needs {_STAGES} positive widths down and as many up, got {self}")
+        if self.style < 1:
+            raise RequestError(f"a generator needs a style of at least one number, got {self.style}")
+
+
+PAPER = GeneratorConfig((384, 384, 512, 512, 768, 1024), (1024, 768, 768, 512, 512, 512), style=1024)
+"""Sizes of Zhou et al. 2020, table 5."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeneratedPoses:
+    """Poses that the generator proposes."""
+
+    pose: ConstrainedPose
+    """Rotations and places from the hips, seen along the reference's heading."""
+    responses: tuple[Tensor, ...]
+    """What its convolutions gave, for batch regularisation."""
+
+    def turn_to_world(self, image: PositionImage) -> ConstrainedPose:
+        """Turn the poses from along the reference of the image that they were made for to the world's axes."""
+        quats = rotations.about_y(image.heading)
+        hips = rotations.to_matrix(quats) @ self.pose.local_matrix[..., 0, :, :]
+        local = torch.cat([hips[..., None, :, :], self.pose.local_matrix[..., 1:, :, :]], dim=-3)
+        return ConstrainedPose(local, rotations.rotate_about_y(self.pose.places, image.heading[..., None]))
+
+
+class StyleEncoder(nn.Module):
+    """Poses of a motion in, in any number and order; one vector out: the motion DNA (Zhou et al. 2020, section
+    3.5.1)."""
+
+    def __init__(self, style: int):
+        super().__init__()
+        # The text has a linear layer behind the mean, which the last of these is as well.
+        self.layers = nn.Sequential(
+            nn.Conv1d(_STYLE_ROWS, style, 1),
+            _Affine(style),
+            nn.PReLU(style),
+            nn.Conv1d(style, style, 1),
+            _Affine(style),
+        )
+
+    def forward(self, places: Float[Tensor, "batch poses joints 3"]) -> Float[Tensor, "batch style"]:
+        """Encode joint positions from the hips, metres, without the hips' rotation."""
+        return self.layers(places[..., 1:, :].flatten(-2).transpose(1, 2)).mean(dim=-1)
+
+
+class GeneratorNetwork(nn.Module):
+    """Keys and a style in, poses of all frames out; it normalises inside."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: GeneratorConfig | None = None, *, bfloat16: bool = False):
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
+        super().__init__()
+        self.config, self.reduced_precision = config or GeneratorConfig(), bfloat16
+        self.register_buffer("mean", torch.zeros(CANONICAL.num_joints, 3))
+        self.register_buffer("std", torch.ones(CANONICAL.num_joints, 3))
+        widths, style = self.config.widths, self.config.style
+        self.style = StyleEncoder(style)
+        self.encoder = nn.ModuleList(
+            ResidualConv(channels, kernel=4, stride=2, padding=1, ratio=ratio)
+            for channels, ratio in zip(zip((INPUT_ROWS, *widths[:-1]), widths, strict=True), _DOWN_RATIOS, strict=True)
+        )
+        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths))
+        # Without a PReLU, which would halve the angles on one side.
+        self.last = nn.Conv1d(self.config.up_widths[-1], POSE_ROWS, 3, padding=1)
+        self.kinematics = RangeConstrainedKinematics()
+        with torch.no_grad():  # hips upright and joints in the middle of their ranges, until training
+            self.last.weight.mul_(0.1)
+            self.last.bias.zero_()
+            self.last.bias[:6] = rotations.to_six(torch.eye(3))
+
+    def forward(self, image: PositionImage, style: Float[Tensor, "batch style"]) -> GeneratedPoses:
+        """Generate poses of every frame of an image, of any length; `style` is what the style encoder gives, or 0."""
+        rows = self.encode_rows(image).transpose(1, 2)
+        made, responses = self.generate(rows, style)
+        return GeneratedPoses(self.kinematics(made.transpose(1, 2)), responses)
+
+    def generate(
+        self, rows: Float[Tensor, "batch rows frames"], style: Float[Tensor, "batch style"]
+    ) -> tuple[Float[Tensor, "batch out_rows frames"], tuple[Tensor, ...]]:
+        """Run the convolutions alone; also returns what each of the residual ones gave."""
+        frames, hidden, responses = rows.shape[-1], pad(rows, (0, -rows.shape[-1] % _STRIDE)), []
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            for layer in self.encoder:
+                hidden, response = layer.respond(hidden)
+                responses.append(response)
+            hidden = torch.cat([hidden, style[..., None].expand(-1, -1, hidden.shape[-1]).to(hidden)], dim=1)
+            for layer in self.decoder:
+                hidden, response = layer.respond(hidden)
+                responses.append(response)
+            made = self.last(hidden)[..., :frames]
+        return made.to(rows.dtype), tuple(responses)
+
+    def encode_rows(self, image: PositionImage) -> Float[Tensor, "batch frames rows"]:
+        """Encode the dense input of section 3.5, seen from the reference, in about unit size."""
+        copied, away = image.copy_nearest()
+        told = torch.isfinite(away)
+        places = torch.where(told, (copied - self.mean) / self.std, 0.0)
+        step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
+        step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
+        turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
+        parts = [places.flatten(-2), _scale_frames(away).flatten(-2), step, turn, _encode_times(image)]
+        rows = torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
+        return rows * image.present[..., None].to(rows)
+
+
+class _Affine(nn.Module):
+    """A scale and a shift for each channel."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.scale, self.shift = nn.Parameter(torch.ones(channels, 1)), nn.Parameter(torch.zeros(channels, 1))
+
+    def forward(self, frames: Float[Tensor, "batch channels frames"]) -> Float[Tensor, "batch channels frames"]:
+        return self.scale * frames + self.shift
+
+
+def regularise_batch(responses: tuple[Tensor, ...]) -> Float[Tensor, ""]:
+    """Sum over layers the squares of means and of log deviations of their channels over batch and frames, averaged over
+    channels: instead of batch normalisation (Zhou et al. 2020, Eq. 9)."""
+    total = torch.zeros(())
+    for response in responses:
+        channels = response.float().transpose(0, 1).flatten(1)
+        deviation = channels.var(dim=1, unbiased=False).add(1e-8).sqrt()
+        total = total + channels.mean(dim=1).square().mean() + deviation.log().square().mean()
+    return total
+
+
+def _make_decoder(inputs: int, widths: tuple[int, ...]) -> list[ResidualConv]:
+    layers = [ResidualConv((inputs, widths[0]), kernel=1, padding=0, ratio=1.0)]
+    before = widths[0]
+    for width, (plain, doubling) in zip(widths, _UP_RATIOS, strict=True):
+        layers.append(ResidualConv((before, width), kernel=3, padding=1, ratio=plain))
+        layers.append(ResidualConv((width, width), kernel=4, stride=2, padding=1, ratio=doubling, transposed=True))
+        before = width
+    return layers
+
+
+def _scale_frames(away: Tensor) -> Tensor:
+    """Scale numbers of frames to 0..1, by their logarithm: near a key every frame counts."""
+    return torch.log1p(away.clamp(max=MAX_KEY_FRAMES)) / math.log1p(MAX_KEY_FRAMES)
+
+
+def _encode_times(image: PositionImage) -> Float[Tensor, "batch frames times"]:
+    """Encode how many frames ago and ahead anything is known."""
+    some = image.known_axes.flatten(2).any(dim=-1)
+    frame = torch.arange(some.shape[1], device=some.device)
+    never = ~some.any(dim=1, keepdim=True)
+    ago, ahead = frame - last_observed(some), next_observed(some) - frame
+    # Before the first known frame the last one is none, and the other way round.
+    times = [torch.where(never | (each < 0), MAX_KEY_FRAMES, each).to(image.places) for each in (ago, ahead)]
+    return _scale_frames(torch.stack(times, dim=-1))
