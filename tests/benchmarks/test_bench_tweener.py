@@ -15,6 +15,7 @@ from controllers.benchmarks.tweener.root_prediction import (
     benchmark_root_prediction,
     measure_root_prediction,
 )
+from controllers.benchmarks.tweener.walked_in_place import benchmark_walked_in_place, measure_walked_in_place
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
 
@@ -62,6 +63,16 @@ def test_rows_by_kind_and_over_all_clips_alike():
     assert math.isnan(rows[3]["V32_cm"])
     assert rows[6]["V1_cm"] == pytest.approx((2 * rows[0]["V1_cm"] + rows[3]["V1_cm"]) / 3)
     assert rows[6]["V64_cm"] == rows[0]["V64_cm"]
+
+
+def test_a_clip_walked_in_place_gets_its_way_back_from_who_knows_it():
+    motion = walk(80, turn_rate=0.3)
+    found = measure_walked_in_place(motion, ToldPath(motion))
+    assert found["V64_cm"] < 3
+    assert found["planted_cm_s"] < found["mocap_cm_s"]  # the made-up walk slides, and its feet are put down
+    still = measure_walked_in_place(motion, StillPath())
+    assert still["V64_cm"] > 50
+    assert [row["clips"] for row in benchmark_walked_in_place({"walks": [motion, walk(20)]}, tiny_path())] == [1]
 
 
 def test_the_command_measures_the_clips_that_the_card_holds_out(tmp_path, capsys):

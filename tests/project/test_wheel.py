@@ -14,7 +14,13 @@ from mapctl import __version__
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
-DATA = ("mapctl/retarget/presets/*.toml", "priors/weights/*", "scenes/*.toml", "scenes/data/*")
+DATA = (
+    "mapctl/joint_ranges/*.json",
+    "mapctl/retarget/presets/*.toml",
+    "priors/weights/*",
+    "scenes/*.toml",
+    "scenes/data/*",
+)
 LOCAL = shutil.ignore_patterns("__pycache__", ".*")
 # No path of the checkout may leak into the clean environment.
 ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
