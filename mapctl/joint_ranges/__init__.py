@@ -33,12 +33,12 @@ class JointRange:
 
     order: str
     """Order of its intrinsic Euler angles, as in `XZY`."""
-    mid_quat_xyzw: tuple[float, float, float, float]
-    """Rotation from which the angles are measured."""
-    low_deg: tuple[float, float, float]
-    """Least angles in their order, degrees."""
-    high_deg: tuple[float, float, float]
-    """Greatest angles in their order, degrees."""
+    mid_quat_xyzw: tuple[float, ...]
+    """Four numbers: the rotation from which the angles are measured."""
+    low_deg: tuple[float, ...]
+    """Three least angles in their order, degrees."""
+    high_deg: tuple[float, ...]
+    """Three greatest angles in their order, degrees."""
 
     def mirrored(self) -> "JointRange":
         """Return the range of the same joint on the other side of the body."""
@@ -151,6 +151,8 @@ def read_table(text: str) -> dict[str, JointRange]:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise MapctlError(f"no table of joint ranges ({type(error).__name__}: {error})") from error
     for name, one in ranges.items():
+        if (len(one.mid_quat_xyzw), len(one.low_deg), len(one.high_deg)) != (4, 3, 3):
+            raise MapctlError(f"the range of {name} must have a quaternion and three angles at either end")
         ends = [*one.low_deg, *one.high_deg]
         if not all(map(math.isfinite, ends)) or any(a >= b for a, b in zip(one.low_deg, one.high_deg, strict=True)):
             raise MapctlError(f"the range of {name} must lead from a lower to a higher angle, got {ends}")

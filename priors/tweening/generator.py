@@ -114,10 +114,11 @@ class GeneratorNetwork(nn.Module):
         # Without a PReLU, which would halve the angles on one side.
         self.last = nn.Conv1d(self.config.up_widths[-1], POSE_ROWS, 3, padding=1)
         self.kinematics = RangeConstrainedKinematics()
-        with torch.no_grad():  # hips upright and joints in the middle of their ranges, until training
-            self.last.weight.mul_(0.1)
-            self.last.bias.zero_()
-            self.last.bias[:6] = rotations.to_six(torch.eye(3))
+        # Hips upright and joints about the middle of their ranges, until training.
+        nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * self.config.up_widths[-1]))
+        middle = torch.zeros(POSE_ROWS)
+        middle[:6] = rotations.to_six(torch.eye(3))
+        self.last.bias = nn.Parameter(middle)
 
     def forward(self, image: PositionImage, style: Float[Tensor, "batch style"]) -> GeneratedPoses:
         """Generate poses of every frame of an image, of any length; `style` is what the style encoder gives, or 0."""
@@ -129,15 +130,14 @@ class GeneratorNetwork(nn.Module):
         self, rows: Float[Tensor, "batch rows frames"], style: Float[Tensor, "batch style"]
     ) -> tuple[Float[Tensor, "batch out_rows frames"], tuple[Tensor, ...]]:
         """Run the convolutions alone; also returns what each of the residual ones gave."""
-        frames, hidden, responses = rows.shape[-1], pad(rows, (0, -rows.shape[-1] % _STRIDE)), []
+        frames, hidden = rows.shape[-1], pad(rows, (0, -rows.shape[-1] % _STRIDE))
+        responses: list[Tensor] = []
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
             for layer in self.encoder:
-                hidden, response = layer.respond(hidden)
-                responses.append(response)
+                hidden = layer(hidden, responses)
             hidden = torch.cat([hidden, style[..., None].expand(-1, -1, hidden.shape[-1]).to(hidden)], dim=1)
             for layer in self.decoder:
-                hidden, response = layer.respond(hidden)
-                responses.append(response)
+                hidden = layer(hidden, responses)
             made = self.last(hidden)[..., :frames]
         return made.to(rows.dtype), tuple(responses)
 

@@ -42,18 +42,19 @@ class ResidualConv(nn.Module):
         if isinstance(self.across, nn.Conv1d):
             _initialise(self.across, ins)
 
-    def forward(self, frames: Float[Tensor, "batch channels frames"]) -> Float[Tensor, "batch outs out_frames"]:
-        """Return the mix of residual and shortcut."""
-        return self.respond(frames)[0]
-
-    def respond(self, frames: Float[Tensor, "batch channels frames"]) -> tuple[Tensor, Tensor]:
-        """Return the mix, and what the convolution alone gives, which batch regularisation looks at (Eq. 9)."""
+    def forward(
+        self, frames: Float[Tensor, "batch channels frames"], responses: list[Tensor] | None = None
+    ) -> Float[Tensor, "batch outs out_frames"]:
+        """Return the mix of residual and shortcut; what the convolution alone gives, which batch regularisation looks
+        at (Eq. 9), is added to `responses`."""
         response = self.conv(frames)
+        if responses is not None:
+            responses.append(response)
         residual = self.activation(self.scale * response + self.shift)
         if self.across is None:
-            return residual, response
+            return residual
         shortcut = self.across(self._resample(frames))
-        return math.sqrt(self.share) * residual + math.sqrt(1 - self.share) * shortcut, response
+        return math.sqrt(self.share) * residual + math.sqrt(1 - self.share) * shortcut
 
     def _resample(self, frames: Float[Tensor, "batch channels frames"]) -> Tensor:
         if self.stride == 1:

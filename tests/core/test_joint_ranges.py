@@ -107,6 +107,10 @@ def test_other_skeletons_are_refused():
         ("[]", "no table of joint ranges"),
         ('{"joints": {"head": {"order": "XYZ"}}}', "KeyError"),
         (
+            '{"joints": {"head": {"order": "XYZ", "mid_quat_xyzw": [0, 0, 0, 1], "low_deg": [0, 5], "high_deg": [1]}}}',
+            "the range of head must have",
+        ),
+        (
             '{"joints": {"head": {"order": "XYZ", "mid_quat_xyzw": [0, 0, 0, 1], "low_deg": [0, 5, 0],'
             ' "high_deg": [1, 5, 1]}}}',
             "the range of head must lead from a lower",
