@@ -98,7 +98,12 @@ def _build_inbetweener(command: Infill) -> Inbetweener:
 
 
 def _tell(command: Infill, done: InbetweenSolution) -> None:
-    gaps = ", ".join(f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)" for gap in done.list_gaps())
+    gaps = ", ".join(
+        f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)"
+        if gap["joints"]
+        else f"{gap['start']}:{gap['stop']} (the hips' place)"
+        for gap in done.list_gaps()
+    )
     print(
         f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
         f" {done.frame_ms:.1f} ms a filled frame"
