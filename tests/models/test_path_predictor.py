@@ -181,3 +181,16 @@ def test_it_is_saved_and_loaded_and_no_other_kind_is(tmp_path):
         path.load(str(tmp_path / "other.safetensors"))
     with pytest.raises(RequestError, match="positive width"):
         PathConfig(width=0)
+
+
+def test_the_bundled_one_knows_who_stands_and_how_far_a_walk_goes():
+    predictor, motion = path.load(), walk(90)
+    assert "Bandai" in predictor.card.licence or "NC" in predictor.card.licence
+    stands = LocalMotion.of_world(motion.joint_positions().float()[None, :1].expand(1, 90, 21, 3), torch.zeros(1, 90))
+    assert float(predictor.predict(stands).steps_heading.abs().max()) < 0.002
+    facing = heading(motion.local_quat_xyzw[:, 0]).float()[None]
+    walked = predictor.predict(LocalMotion.of_world(motion.joint_positions().float()[None], facing)).integrate(facing)
+    # The toes of the made-up walk slide; a body that goes so walks ahead, at the pace of a stroll.
+    assert 1.0 < float(walked[0, -1, 2]) < 4.0
+    assert abs(float(walked[0, -1, 0])) < 0.2
+    assert float((walked[0, :, 1] - motion.root_position[:, 1]).abs().max()) < 0.1
