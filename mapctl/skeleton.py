@@ -142,6 +142,10 @@ class Limb:
     shown: bool = True
     """Whether the initial motion shows how the limb bends; if not, only the proposed elbow or knee does."""
 
+    def length(self, skeleton: Skeleton) -> float:
+        """Return the length of a stretched limb of canonical joints, from its first joint to its effector, metres."""
+        return float(skeleton.offsets[[self.lower, self.end]].norm(dim=-1).sum())
+
 
 _KNEE, _ELBOW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 LIMBS = {
@@ -154,8 +158,7 @@ LIMBS = {
 
 def leg_length(skeleton: Skeleton) -> float:
     """Return the length of the bones from the left hip to the ankle of canonical joints, metres."""
-    bones = [skeleton.index(name) for name in ("leftLowerLeg", "leftFoot")]
-    return float(skeleton.offsets[bones].norm(dim=-1).sum())
+    return LIMBS["leftFoot"].length(skeleton)
 
 
 def mirror_name(name: str) -> str:

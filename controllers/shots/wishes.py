@@ -10,11 +10,12 @@ from torch import Tensor
 
 from controllers.shots.keys.looking import measure_look_errors
 from controllers.shots.keys.posing import MetPose, measure_pose_error
-from controllers.shots.keys.reaching import ReachTargets, measure_misses
+from controllers.shots.keys.reaching import STRETCHED_SHARE, ReachTargets
 from controllers.shots.planning.way import Way
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.effector_targets import compute_target_errors
 from mapctl.motion import Motion
 from mapctl.numerics import vectors
 from mapctl.skeleton import LIMBS
@@ -88,7 +89,7 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
     found = [_check_path(request, way, hips)]
     for reach in request.reaches:
         targets = ReachTargets.of((reach,), motion.num_frames).targets
-        miss = 100 * float(measure_misses(positions, targets).max())
+        miss = 100 * float(compute_target_errors(positions, targets).max())
         name = f"{', '.join(reach.places)} at {reach.seconds:g} s"
         asked = f"held {reach.hold_seconds:g} s" if reach.hold_seconds else "there"
         limit = 100 * max(_REACH_TOLERANCE, max(map(reach.tolerance_of, reach.places)))
@@ -170,9 +171,8 @@ def _find_remedy(reach: Reach, motion: Motion) -> str:
     lacking = torch.zeros(motion.num_frames, dtype=torch.float64)
     for name, place in reach.places.items():
         limb = LIMBS[name]
-        bones = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
         away = motion.joint_positions()[:, limb.upper] - motion.root_position.new_tensor(place)
-        lacking = torch.maximum(lacking, vectors.length(away) - 0.97 * bones)
+        lacking = torch.maximum(lacking, vectors.length(away) - STRETCHED_SHARE * limb.length(motion.skeleton))
     wanted = reach.seconds * PRIOR_FPS
     within = (lacking <= 0).nonzero()[:, 0]
     if len(within):

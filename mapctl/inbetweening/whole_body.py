@@ -132,8 +132,8 @@ class _ReachResidual:
 
     @staticmethod
     def of(part: Motion, goals: Tensor, wanted: Tensor) -> "_ReachResidual":
-        lengths = [part.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum() for limb in LIMBS.values()]
-        return _ReachResidual(part, part.joint_positions(), goals, wanted.to(goals), torch.stack(lengths))
+        lengths = part.skeleton.offsets.new_tensor([limb.length(part.skeleton) for limb in LIMBS.values()])
+        return _ReachResidual(part, part.joint_positions(), goals, wanted.to(goals), lengths)
 
     def jacobian(
         self, x: Float[Tensor, "poses offsets"], now: Float[Tensor, "poses residuals"]

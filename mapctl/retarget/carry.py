@@ -215,7 +215,7 @@ def _leg_extension(own: Motion) -> Float[Tensor, "frames 2"]:
 
 
 def _leg_bone_lengths(skeleton: Skeleton) -> Float[Tensor, "2"]:
-    return sum((skeleton.offsets[joints].norm(dim=-1) for joints in (_SHINS, _FEET)), torch.zeros(2).double())
+    return torch.tensor([LIMBS[side + "Foot"].length(skeleton) for side in SIDES], dtype=torch.float64)
 
 
 def _lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:

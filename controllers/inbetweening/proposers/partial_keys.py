@@ -102,9 +102,8 @@ def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor,
     """Find the frames in which a target is farther away than its limb is long."""
     positions, far = motion.joint_positions(), torch.zeros(motion.num_frames, dtype=torch.bool)
     for limb in LIMBS.values():
-        length = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
         away = (targets.places[:, limb.end] - positions[:, limb.upper]).norm(dim=-1)
-        far |= targets.wanted[:, limb.end] & (away > _STRETCH_SHARE * length)
+        far |= targets.wanted[:, limb.end] & (away > _STRETCH_SHARE * limb.length(motion.skeleton))
     return far
 
 

@@ -24,8 +24,10 @@ from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
 from mapctl.terms.keep_clear import WithinReach
 
 _AROUND_FRAMES = 27  # at PRIOR_FPS, before and after a reach, in which trunk and limb are free
-_EASY_SHARE = 0.9  # of a stretched limb's length that it reaches without strain
-_STRETCHED_SHARE = 0.97  # of its length, that a limb is stretched toward what it cannot reach
+EASY_SHARE = 0.9
+"""Share of a stretched limb's length that it reaches without strain."""
+STRETCHED_SHARE = 0.97
+"""Share of its length that a limb is stretched toward what it cannot reach."""
 _BENT_SHARE = 0.85  # of its length, from which on the way to a place is shortened
 _LEAN = 0.05  # metres that leaning adds to what a limb reaches
 _TIPTOE, _CROUCH = 0.15, 1.0  # metres by which a body rises or goes down for a reach
@@ -81,10 +83,9 @@ class ReachTargets:
             if not bool(wanted.any()):
                 continue
             missing = frames - len(wanted)  # look-ahead beyond the shot's end
-            bones = skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
             place = torch.cat([self.targets.places[window, limb.end], torch.zeros(missing, 3, dtype=torch.float64)])
             wished = torch.cat([wanted, wanted.new_zeros(missing)])
-            term = WithinReach(limb.upper, place, wished, _EASY_SHARE * float(bones))
+            term = WithinReach(limb.upper, place, wished, EASY_SHARE * limb.length(skeleton))
             found.append(replace(term, name=f"{name} within reach"))
         return found
 
@@ -94,8 +95,7 @@ class ReachTargets:
         places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
         for limb in LIMBS.values():
             away = places[:, limb.end] - positions[:, limb.upper]
-            bones = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
-            most = _STRETCHED_SHARE * bones + _LEAN
+            most = STRETCHED_SHARE * limb.length(motion.skeleton) + _LEAN
             far = away.norm(dim=-1)
             for _, first, last in true_intervals(wanted[:, limb.end : limb.end + 1].clone()):
                 reached = far[first:last] <= most
@@ -117,7 +117,7 @@ class ReachTargets:
         for limb in LIMBS.values():
             reached = self.targets.wanted[:, limb.end]
             shoulder = positions[:, limb.upper]
-            bones = motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+            bones = limb.length(motion.skeleton)
             way = positions[:, limb.end] - shoulder
             for _, first, last in true_intervals(reached[:, None].clone()):
                 away = (first - frame).clamp_min(0) + (frame - last + 1).clamp_min(0)
@@ -174,7 +174,7 @@ def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:
         on_way = way.curve.point(way.arcs[frame])[:: way.curve.dims - 1]
         for name, place in reach.places.items():
             limb = LIMBS[name]
-            bones = float(rest.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+            bones = limb.length(rest.skeleton)
             target = positions.new_tensor(place)
             up = float((target[1] - positions[limb.upper, 1]).abs())
             aside = float((target[::2] - on_way).norm())
@@ -216,12 +216,12 @@ def _find_bend_length(aside: float) -> float:
 def _find_lacking_aside(way: Way, arc: Tensor, rest: Motion, name: str, place: Sequence[float]) -> float:
     """Find how far to the left of the way one would have to be for a limb to reach a place, metres; 0 where it does."""
     limb, positions = LIMBS[name], rest.joint_positions()[0]
-    bones = float(rest.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+    bones = limb.length(rest.skeleton)
     target = way.curve.points.new_tensor(place)
     ground = target[::2] - way.curve.point(arc)[:: way.curve.dims - 1]
     left, ahead = float(ground @ way.curve.left(arc)), float(ground @ way.curve.tangent(arc)[:: way.curve.dims - 1])
     beside = left - float(positions[limb.upper, 0])
-    room = (_EASY_SHARE * bones) ** 2 - ahead**2 - float(target[1] - positions[limb.upper, 1]) ** 2
+    room = (EASY_SHARE * bones) ** 2 - ahead**2 - float(target[1] - positions[limb.upper, 1]) ** 2
     lacking = max(0.0, abs(beside) - math.sqrt(max(0.0, room)))
     return math.copysign(min(lacking, _MOST_BEND), beside)
 
@@ -252,9 +252,9 @@ def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
         if not name.endswith("Hand"):
             continue
         limb = LIMBS[name]
-        bones = float(motion.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+        bones = limb.length(motion.skeleton)
         away = positions[frame, limb.upper] - positions.new_tensor(place)
-        room = (_EASY_SHARE * bones) ** 2 - float(away[::2].square().sum())
+        room = (EASY_SHARE * bones) ** 2 - float(away[::2].square().sum())
         lacking = max(lacking, float(away[1]) - math.sqrt(max(room, (_STRAIGHT_AHEAD * bones) ** 2)))
     return lacking
 
@@ -292,10 +292,10 @@ def _lead_about(
     return turned * torch.lerp(lengths[0], lengths[1], share[:, None])
 
 
-def _bend_within(away: Float[Tensor, "frames 3"], bones: Float[Tensor, ""]) -> Float[Tensor, "frames 3"]:
+def _bend_within(away: Float[Tensor, "frames 3"], bones: float) -> Float[Tensor, "frames 3"]:
     """Bring vectors smoothly to where a limb reaches them without being stretched: a stretched elbow swings fast."""
     far = away.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    easy, most = _BENT_SHARE * bones, _STRETCHED_SHARE * bones
+    easy, most = _BENT_SHARE * bones, STRETCHED_SHARE * bones
     near = torch.where(far > easy, most - (most - easy) * torch.exp(-(far - easy).clamp_min(0) / (most - easy)), far)
     return away / far * near
 
@@ -303,8 +303,3 @@ def _bend_within(away: Float[Tensor, "frames 3"], bones: Float[Tensor, ""]) -> F
 def _widen(wanted: Tensor, frames: int) -> Tensor:
     kernel = torch.ones(1, 1, 2 * frames + 1)
     return torch.nn.functional.conv1d(wanted.float()[None, None], kernel, padding=frames)[0, 0] > 0
-
-
-def measure_misses(positions: Float[Tensor, "frames joints 3"], targets: EffectorTargets) -> Float[Tensor, " frames"]:
-    """Measure how far the farthest limb is from its target in each frame, metres."""
-    return ((positions - targets.places).norm(dim=-1) * targets.wanted).amax(dim=-1)

@@ -27,7 +27,6 @@ from mapctl.runtime.progress import Progress
 from mapctl.terms import FootContact
 from scenes.props import build_obstacle, build_target
 
-
 _WRAPPED = 6  # frames of a loop's beginning that are resampled after its end
 
 
