@@ -64,7 +64,7 @@ def select_initial_state(
     with torch.no_grad():
         features, _ = prior.rollout(state, noise, prior.plan(state, noise))
     ground_poses = GroundPose(
-        _first_point(curve).expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs)
+        curve.ground_point(0.0).float().expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs)
     )
     before, planted = torch.zeros(0, skeleton.num_joints, 3), LAYOUT.pick(state.last_frame, "contacts") > 0.5
     context = WindowContext(prior, state, ground_poses, before, ahead, skeleton, fps, planted, first_frame=1)
@@ -107,10 +107,6 @@ def start_from_state(state: DensityState, ground_pose: GroundPose, skeleton: Ske
     before = ground_pose.before(displacement, turn[0])
     joints = decode(first, before, skeleton=skeleton).joint_positions().to(first.dtype)
     return MotionStart(CommittedFrames(state, ground_pose, first, joints), before)
-
-
-def _first_point(curve: Curve) -> Float[Tensor, "2"]:
-    return curve.point(0.0)[..., :: curve.dims - 1].float()
 
 
 def _align_headings(features: Tensor, curve: Curve, arcs: Tensor) -> Float[Tensor, " starts"]:

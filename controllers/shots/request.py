@@ -156,7 +156,7 @@ class ShotRequest:
 
     @property
     def _start(self) -> Float[Tensor, "2"]:
-        return self.curve.start[:: self.curve.dims - 1]
+        return self.curve.ground_point(0.0)
 
     @property
     def begins_standing(self) -> bool:

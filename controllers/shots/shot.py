@@ -217,10 +217,8 @@ def _extend(arcs: Float[Tensor, " frames"], more: int) -> Float[Tensor, " ahead"
 
 def _stand(rest: Motion, way: Way, span: Span) -> Motion:
     """Stand where the way is during a span, facing along it."""
-    arc = way.arcs[span.start : span.start + 1]
-    place, tangent = way.curve.point(arc)[0, :: way.curve.dims - 1], way.curve.tangent(arc)[0]
-    turned = rotate_about_vertical(rest, torch.atan2(tangent[0], tangent[-1]))
-    return move_to(turned, place)
+    arc = way.arcs[span.start]
+    return move_to(rotate_about_vertical(rest, way.curve.heading(arc)), way.curve.ground_point(arc))
 
 
 def _join_ledgers(ledgers) -> Ledger:

@@ -197,4 +197,4 @@ def _check_path(request: ShotRequest, way: Way, hips: Tensor) -> Wish:
 def _measure_offsets(way: Way, hips: Tensor) -> Tensor:
     """Measure the distance of the hips to the way by frame, metres."""
     near = way.wished.nearest(hips, way.wished_arcs)
-    return vectors.length(hips - way.wished.point(near)[:, :: way.wished.dims - 1])
+    return vectors.length(hips - way.wished.ground_point(near))

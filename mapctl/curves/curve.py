@@ -66,6 +66,11 @@ class Curve:
         return self.points.shape[-1]
 
     @property
+    def ground_axes(self) -> slice:
+        """Where x and z are in a point or a direction of the curve."""
+        return slice(None, None, self.dims - 1)
+
+    @property
     def start(self) -> Float[Tensor, "dims"]:
         """The first point, metres."""
         return self.points[0]
@@ -75,7 +80,7 @@ class Curve:
         """Direction of travel at the start, radians: 0 is +Z, +pi/2 is +X; only what lies ahead counts."""
         # Chords centred a little ahead see only what follows; extrapolating is exact on circular arcs.
         ahead = self._half_base * torch.tensor([1.0, 2.0], dtype=torch.float64)
-        near, far = unwrap_angle(_direction_heading(self.tangent(ahead))).tolist()
+        near, far = unwrap_angle(self.heading(ahead)).tolist()
         return math.remainder(2 * near - far, 2 * math.pi)
 
     @property
@@ -97,6 +102,10 @@ class Curve:
         arc = _to_tensor(arc)
         return self._point_at(arc).to(arc.dtype)
 
+    def ground_point(self, arc: Arc) -> Float[Tensor, "*batch 2"]:
+        """Return the position over the ground (x, z) at an arc, metres."""
+        return self.point(arc)[..., self.ground_axes]
+
     def tangent(self, arc: Arc) -> Float[Tensor, "*batch dims"]:
         """Return the unit direction of travel: a chord of 5 cm, so that the jitter of a drawing does not flip it."""
         arc = _to_tensor(arc)
@@ -105,6 +114,11 @@ class Curve:
         gone = chord.detach().norm(dim=-1, keepdim=True) < 1e-6
         chord = torch.where(gone, self._tables[2][self._segment(arc)[1]], chord)
         return _normalise(chord).to(arc.dtype)
+
+    def heading(self, arc: Arc) -> Float[Tensor, "*batch"]:
+        """Return the direction of travel over the ground, radians in -pi to pi: 0 is +Z, +pi/2 is +X."""
+        tangent = self.tangent(arc)
+        return torch.atan2(tangent[..., 0], tangent[..., -1])
 
     def left(self, arc: Arc) -> Float[Tensor, "*batch 2"]:
         """Return the unit ground vector (x, z) to the left of travel."""
@@ -115,7 +129,7 @@ class Curve:
     @cached_property
     def _vertex_heading(self) -> tuple[Tensor, Tensor]:
         """Unwrapped heading at every vertex, and its slope to the next."""
-        heading = unwrap_angle(_direction_heading(self.tangent(self._arcs)))
+        heading = unwrap_angle(self.heading(self._arcs))
         return heading, heading.diff() / self._arcs.diff()
 
     def _heading_at(self, arc: Tensor) -> Tensor:
@@ -199,7 +213,7 @@ class Curve:
     def signed_offset(self, points_world: Float[Tensor, "*batch axes"], arc: Arc) -> Float[Tensor, "*batch"]:
         """Return metres from the curve's position at `arc` to each point, sideways on the ground; left is positive."""
         apart = self.to_curve_axes(points_world) - self.point(arc)
-        return (apart[..., :: self.dims - 1] * self.left(arc)).sum(-1)
+        return (apart[..., self.ground_axes] * self.left(arc)).sum(-1)
 
 
 def _to_tensor(arc: Arc) -> Tensor:
@@ -213,7 +227,3 @@ def _find_segment(knots: Tensor, arc: Tensor) -> Int[Tensor, "*batch"]:
 
 def _normalise(vector: Tensor) -> Tensor:
     return vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-
-
-def _direction_heading(direction: Tensor) -> Tensor:
-    return torch.atan2(direction[..., 0], direction[..., -1])

@@ -63,16 +63,14 @@ def apply_detour(curve: Curve, offsets: Float[Tensor, " arcs"]) -> Curve:
     fine = torch.linspace(0, curve.length, max(2, round(curve.length / 0.02)), dtype=torch.float64)
     between = torch.from_numpy(np.interp(fine.numpy(), arcs.numpy(), offsets.numpy()))
     moved = curve.point(fine).clone()
-    ground = slice(0, None, curve.dims - 1)
-    moved[:, ground] = _ground_points(curve, fine, between[:, None])[:, 0]
+    moved[:, curve.ground_axes] = _ground_points(curve, fine, between[:, None])[:, 0]
     return curves.from_points(moved, closed=False)
 
 
 def _ground_points(
     curve: Curve, arcs: Float[Tensor, " arcs"], offsets: Float[Tensor, "arcs offsets"]
 ) -> Float[Tensor, "arcs offsets 2"]:
-    on_ground = curve.point(arcs)[:, None, :: curve.dims - 1]
-    return on_ground + offsets[..., None] * curve.left(arcs)[:, None]
+    return curve.ground_point(arcs)[:, None] + offsets[..., None] * curve.left(arcs)[:, None]
 
 
 def _find_free(curve: Curve, arcs: Tensor, offsets: Tensor, clearance: ClearanceOf) -> Bool[Tensor, "arcs offsets"]:

@@ -58,8 +58,8 @@ def find_reversals(curve: Curve) -> list[float]:
 
 
 def _heading(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:
-    tangent = curve.tangent(arcs if curve.closed else arcs.clamp(0, curve.length))
-    return torch.atan2(tangent[..., 0], tangent[..., -1])
+    """Return the heading at arcs, radians; beyond the ends of an open curve that of the ends."""
+    return curve.heading(arcs if curve.closed else arcs.clamp(0, curve.length))
 
 
 def _limit_speeds(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:

@@ -44,8 +44,8 @@ def move_root_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curv
             last = last + curve.length
         at = first + share * (last - first)
         position = curve.point(at) + _interpolate_edges(offsets, share)
-        turns = _compute_curve_heading(curve, torch.stack([first, last])) - facing[edges]
-        turn = _compute_curve_heading(curve, at) - _interpolate_edges(rotations.wrap_angle(turns)[:, None], share)[:, 0]
+        turns = curve.heading(torch.stack([first, last])) - facing[edges]
+        turn = curve.heading(at) - _interpolate_edges(rotations.wrap_angle(turns)[:, None], share)[:, 0]
         root[start:stop, 0], root[start:stop, 2] = position[:, 0], position[:, 1]
         own = rotations.about_y(turn - heading(quats[start:stop, 0]))
         quats[start:stop, 0] = rotations.multiply(own, quats[start:stop, 0])
@@ -56,9 +56,3 @@ def _interpolate_edges(
     ends: Float[Tensor, "2 width"], share: Float[Tensor, " frames"]
 ) -> Float[Tensor, "frames width"]:
     return torch.lerp(ends[0], ends[1], share[:, None])
-
-
-def _compute_curve_heading(curve: Curve, arcs: Float[Tensor, " points"]) -> Float[Tensor, " points"]:
-    """Compute the heading of the curve, radians."""
-    tangent = curve.tangent(arcs)
-    return torch.atan2(tangent[..., 0], tangent[..., -1])

@@ -1,6 +1,5 @@
 """A clip that a shot ends in: the shot's last frame is a frame of the clip, and moves as the clip does there."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -50,14 +49,14 @@ class Arrival:
 
     def bring_curve(self, curve: Curve) -> Curve:
         """Return an open curve moved so that it leads to the arrival and ends there."""
-        angle = self.direction - _find_heading(curve, curve.length)
+        angle = self.direction - float(curve.heading(curve.length))
         place = self.motion.root_position[0, ::2]
         return replace(curve, points=bring_curve_points(curve.points, curve.points[-1], angle, place))
 
     def bring_to(self, curve: Curve, arc: float) -> "Arrival":
         """Return the arrival moved so that it is at an arc of a curve, on its way along it."""
-        turned = rotate_about_vertical(self.motion, _find_heading(curve, arc) - self.direction)
-        return Arrival(move_to(turned, curve.point(arc)[:: curve.dims - 1]))
+        turned = rotate_about_vertical(self.motion, float(curve.heading(arc)) - self.direction)
+        return Arrival(move_to(turned, curve.ground_point(arc)))
 
 
 def arrive(motion: Motion, arrival: Arrival, inbetweener: Inbetweener) -> Motion:
@@ -76,8 +75,3 @@ def arrive(motion: Motion, arrival: Arrival, inbetweener: Inbetweener) -> Motion
         tried.append(Filling(longer, MissingMask.of_frames(missing, motion.num_joints), (first, frames - 1)))
     chosen = tried[choose_filling(tried, inbetweener)]
     return fill(chosen.motion, chosen.missing, inbetweener).motion.slice(0, frames)
-
-
-def _find_heading(curve: Curve, arc: float) -> float:
-    tangent = curve.tangent(arc)
-    return math.atan2(float(tangent[0]), float(tangent[-1]))

@@ -69,7 +69,7 @@ class Lead:
     def bring_to(self, curve: Curve) -> "Lead":
         """Return the lead moved so that it ends where a curve begins, on its way along it."""
         turned = rotate_about_vertical(self.motion, curve.start_heading - self.direction)
-        return Lead(move_to(turned, curve.start[:: curve.dims - 1], frame=-1))
+        return Lead(move_to(turned, curve.ground_point(0.0), frame=-1))
 
     def start(self, prior: Density, character: Character) -> MotionStart:
         """Return the density's state at its end, of the prior's size."""

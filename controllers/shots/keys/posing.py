@@ -123,15 +123,14 @@ def _place_pose(found: Motion, key: PoseKey, way: Way, frame: int) -> Motion:
     if key.place is not None:
         root[0, ::2] = root.new_tensor(key.place)
     elif key.pose is not None:
-        root[0, ::2] = way.curve.point(arc)[0, :: way.curve.dims - 1]
+        root[0, ::2] = way.curve.ground_point(arc)
     if key.height is not None:
         root[0, 1] = key.height
     angle = None
     if key.facing_deg is not None:
         angle = torch.deg2rad(root.new_tensor([key.facing_deg]))
     elif key.pose is not None:
-        tangent = way.curve.tangent(arc)[0]
-        angle = torch.atan2(tangent[0], tangent[-1])[None].to(root)
+        angle = way.curve.heading(arc).to(root)
     if angle is not None:
         turn = rotations.about_y(angle - kinematics.heading(quats[:, 0]))
         quats[:, 0] = rotations.multiply(turn, quats[:, 0])

@@ -171,7 +171,7 @@ def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:
     positions = rest.joint_positions()[0]
     for reach in reaches:
         frame = min(round(reach.seconds * PRIOR_FPS), len(way.arcs) - 1)
-        on_way = way.curve.point(way.arcs[frame])[:: way.curve.dims - 1]
+        on_way = way.curve.ground_point(way.arcs[frame])
         for name, place in reach.places.items():
             limb = LIMBS[name]
             bones = limb.length(rest.skeleton)
@@ -218,8 +218,8 @@ def _find_lacking_aside(way: Way, arc: Tensor, rest: Motion, name: str, place: S
     limb, positions = LIMBS[name], rest.joint_positions()[0]
     bones = limb.length(rest.skeleton)
     target = way.curve.points.new_tensor(place)
-    ground = target[::2] - way.curve.point(arc)[:: way.curve.dims - 1]
-    left, ahead = float(ground @ way.curve.left(arc)), float(ground @ way.curve.tangent(arc)[:: way.curve.dims - 1])
+    ground = target[::2] - way.curve.ground_point(arc)
+    left, ahead = float(ground @ way.curve.left(arc)), float(ground @ way.curve.tangent(arc)[way.curve.ground_axes])
     beside = left - float(positions[limb.upper, 0])
     room = (EASY_SHARE * bones) ** 2 - ahead**2 - float(target[1] - positions[limb.upper, 1]) ** 2
     lacking = max(0.0, abs(beside) - math.sqrt(max(0.0, room)))
@@ -278,7 +278,7 @@ def _keep_feet(motion: Motion, before: Motion) -> Motion:
 
 def _is_blocked(way: Way, request: ShotRequest) -> bool:
     """Return whether a way leads through an obstacle."""
-    places = way.curve.point(way.arcs)[:, :: way.curve.dims - 1]
+    places = way.curve.ground_point(way.arcs)
     return bool(request.obstacles) and float(measure_clearance(request.obstacles, places).amin()) < _BODY
 
 

@@ -69,7 +69,7 @@ def plan_way(request: ShotRequest) -> Way:
     if not request.obstacles and request.others is None:
         return _plain(request.curve, speeds)
 
-    at_start = float(measure_clearance(request.obstacles, request.curve.start[None, :: request.curve.dims - 1]))
+    at_start = float(measure_clearance(request.obstacles, request.curve.ground_point(0.0)[None]))
 
     def clearance(points: Tensor, at: Tensor) -> Tensor:
         # Who begins beside an obstacle has to get away from it first.
@@ -105,7 +105,7 @@ def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) ->
     before = torch.linspace(0, length, max(2, round(length / _FINE_STEP) + 1), dtype=torch.float64)
     at = torch.linspace(0, length, len(offsets), dtype=torch.float64)
     aside = torch.from_numpy(np.interp(before.numpy(), at.numpy(), offsets.numpy()))
-    ground = way.curve.point(before)[:, :: way.curve.dims - 1] + aside[:, None] * way.curve.left(before)
+    ground = way.curve.ground_point(before) + aside[:, None] * way.curve.left(before)
     along = torch.cat([ground.new_zeros(1), vectors.length(torch.diff(ground, dim=0)).cumsum(0)])
     longer = np.interp([*sorted(met), length], before.numpy(), (along - before).numpy())
     knots, gained = [0.0], [0.0]

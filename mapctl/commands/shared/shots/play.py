@@ -141,7 +141,7 @@ def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPl
 
 
 def _walk_along(way: Way) -> Float[Tensor, "frames 2"]:
-    return way.curve.point(way.arcs)[:, :: way.curve.dims - 1]
+    return way.curve.ground_point(way.arcs)
 
 
 def _find_others(
