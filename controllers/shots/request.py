@@ -101,6 +101,11 @@ class PoseKey:
         return max(self.tolerance.values(), default=0.0) if isinstance(self.tolerance, Mapping) else self.tolerance
 
     @property
+    def tells_body(self) -> bool:
+        """Whether it tells more of a pose than its hips."""
+        return self.pose is not None and not self.root_only
+
+    @property
     def tells_facing(self) -> bool:
         """Whether it tells the hips' rotation."""
         return self.pose is not None or self.facing_deg is not None

@@ -161,7 +161,7 @@ def _check_pose(met: MetPose, motion: Motion) -> Wish:
         limit = max(_FACING_TOLERANCE_DEG, key.most)
         name = f"facing {key.facing_deg:g} degrees at {key.seconds:.2f} s"
         return Wish(name, asked, degrees, limit, "degrees", seconds=_span(key))
-    what = "hips" if key.pose is None or key.root_only else "pose"
+    what = "pose" if key.tells_body else "hips"
     limit = 100 * max(_POSE_TOLERANCE, key.most)
     return Wish(f"{what} at {key.seconds:.2f} s", asked, 100 * metres, limit, "cm", seconds=_span(key))
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
@@ -62,11 +62,11 @@ def meet_poses(
 
 def measure_pose_error(motion: Motion, met: MetPose) -> tuple[float, float]:
     """Measure the largest distance of what a key tells from where it is to be, metres, and of the heading, degrees."""
-    held, key = slice(met.start, met.stop), met.key
-    away = (motion.joint_positions()[held] - met.wanted.joint_positions()).norm(dim=-1)
-    counted = away if key.pose is not None and not key.root_only else away[:, :1]
-    turned = kinematics.heading(motion.local_quat_xyzw[held, 0]) - kinematics.heading(met.wanted.local_quat_xyzw[:, 0])
-    return float(counted.max()), float(torch.rad2deg(rotations.wrap_angle(turned).abs().max()))
+    held = motion.slice(met.start, met.stop)
+    away = (held.joint_positions() - met.wanted.joint_positions()).norm(dim=-1)
+    counted = away if met.key.tells_body else away[:, :1]
+    turned = _measure_turns(held, met.wanted)
+    return float(counted.max()), float(torch.rad2deg(turned.max()))
 
 
 def as_reaches(keys: Sequence[PoseKey], way: Way, found: Motion) -> tuple[Reach, ...]:
@@ -86,7 +86,7 @@ def pose_frames(met: Sequence[MetPose], frames: int) -> Bool[Tensor, " frames"]:
     """Mark the frames in which a whole pose is held."""
     held = torch.zeros(frames, dtype=torch.bool)
     for one in met:
-        if one.key.pose is not None and not one.key.root_only:
+        if one.key.tells_body:
             held[one.start : one.stop] = True
     return held
 
@@ -163,20 +163,24 @@ def _blend(one: Motion, other: Motion, share: float) -> Motion:
 def _measure_off(pose: Motion, asked: Motion, key: PoseKey) -> float:
     """Measure how far off a pose is, centimetres, or degrees where only a facing is told."""
     if key.tells_facing_alone:
-        turned = kinematics.heading(pose.local_quat_xyzw[:, 0]) - kinematics.heading(asked.local_quat_xyzw[:, 0])
-        return float(torch.rad2deg(rotations.wrap_angle(turned).abs())[0])
+        return float(torch.rad2deg(_measure_turns(pose, asked))[0])
     return 100 * float((pose.joint_positions() - asked.joint_positions()).norm(dim=-1).max())
+
+
+def _measure_turns(motion: Motion, other: Motion) -> Float[Tensor, " frames"]:
+    """Measure by how much the headings of two motions' hips differ, radians; one of them may be one frame."""
+    headings = [kinematics.heading(each.local_quat_xyzw[:, 0]) for each in (motion, other)]
+    return rotations.wrap_angle(headings[0] - headings[1]).abs()
 
 
 def _find_least_width(motion: Motion, pose: Motion, frame: int) -> int:
     """Find the fewest frames in which one gets to a pose without haste."""
     here = motion.slice(frame, frame + 1)
     moved = pose.joint_positions()[0] - here.joint_positions()[0]
-    turned = kinematics.heading(pose.local_quat_xyzw[:, 0]) - kinematics.heading(here.local_quat_xyzw[:, 0])
     seconds = (
         float(moved[0].norm()) / _HIPS_SPEED,
         float((moved - moved[0]).norm(dim=-1).max()) / _JOINT_SPEED,
-        float(rotations.wrap_angle(turned).abs()) / _TURN_RATE,
+        float(_measure_turns(pose, here)) / _TURN_RATE,
     )
     return round(max(seconds) * PRIOR_FPS)
 
@@ -193,7 +197,7 @@ def _build_filling(
     missing[0] = missing[-1] = False
     mask = MissingMask.of_frames(missing, joints)
     mask = MissingMask(mask.joints.clone(), mask.root.clone())
-    if key.pose is not None and not key.root_only:
+    if key.tells_body:
         root[part], quats[part] = pose.root_position, pose.local_quat_xyzw
         mask.root[part], mask.joints[part] = False, False
     else:
