@@ -59,12 +59,27 @@ def apply_detour(curve: Curve, offsets: Float[Tensor, " arcs"]) -> Curve:
     """Return the curve moved sideways by offsets at evenly spaced arcs, as `find_detour` returns them."""
     if not bool((offsets.abs() > 1e-3).any()):
         return curve
-    arcs = torch.linspace(0, curve.length, len(offsets), dtype=torch.float64)
     fine = torch.linspace(0, curve.length, max(2, round(curve.length / 0.02)), dtype=torch.float64)
-    between = torch.from_numpy(np.interp(fine.numpy(), arcs.numpy(), offsets.numpy()))
     moved = curve.point(fine).clone()
-    moved[:, curve.ground_axes] = _ground_points(curve, fine, between[:, None])[:, 0]
+    moved[:, curve.ground_axes] = find_ground_beside(curve, offsets, fine)
     return curves.from_points(moved, closed=False)
+
+
+def find_ground_beside(
+    curve: Curve, offsets: Float[Tensor, " knots"], arcs: Float[Tensor, " arcs"]
+) -> Float[Tensor, "arcs 2"]:
+    """Find where arcs of a curve, metres, are on the ground once it is moved sideways by offsets at evenly spaced
+    arcs, as `find_detour` returns them."""
+    between = interpolate_evenly(curve, offsets, arcs)
+    return _ground_points(curve, arcs, between[:, None])[:, 0]
+
+
+def interpolate_evenly(
+    curve: Curve, values: Float[Tensor, " knots"], arcs: Float[Tensor, " arcs"]
+) -> Float[Tensor, " arcs"]:
+    """Interpolate values at evenly spaced arcs of a curve to others, metres."""
+    knots = torch.linspace(0, curve.length, len(values), dtype=torch.float64)
+    return torch.from_numpy(np.interp(arcs.numpy(), knots.numpy(), values.numpy()))
 
 
 def _ground_points(

@@ -1,6 +1,7 @@
 """Slowing down before corners: speeds along a curve that leave time to turn."""
 
 import math
+from itertools import accumulate
 
 import torch
 from jaxtyping import Float
@@ -29,17 +30,13 @@ def slow_for_corners(curve: Curve, profile: SpeedProfile) -> SpeedProfile:
     limit = _limit_speeds(curve, arcs)
     if bool((wanted <= limit).all()):
         return profile
-    speeds = torch.minimum(wanted, limit)
-    step = float(arcs[1])
+    speeds, step = torch.minimum(wanted, limit).tolist(), float(arcs[1])
     for _ in range(2 if curve.closed else 1):  # what is before a loop's first corner is its end
-        for order in (range(count - 2, -1, -1), range(1, count)):
-            sign = 1 if order.step < 0 else -1
-            for at in order:
-                reached = (speeds[at + sign] ** 2 + 2 * _BRAKING * step).sqrt()
-                speeds[at] = torch.minimum(speeds[at], reached)
+        braked = _limit_rise(speeds[::-1], step)[::-1]
+        speeds = _limit_rise(braked, step)
         if curve.closed:
-            speeds[0] = speeds[-1] = torch.minimum(speeds[0], speeds[-1])
-    return SpeedProfile(tuple(arcs.tolist()), tuple(speeds.tolist()))
+            speeds[0] = speeds[-1] = min(speeds[0], speeds[-1])
+    return SpeedProfile(tuple(arcs.tolist()), tuple(speeds))
 
 
 def turns_sharply(curve: Curve) -> bool:
@@ -55,6 +52,12 @@ def find_reversals(curve: Curve) -> list[float]:
     turned = rotations.wrap_angle(_heading(curve, arcs + _REVERSAL_STEP) - _heading(curve, arcs - _REVERSAL_STEP)).abs()
     runs = true_intervals((turned > _REVERSAL_ANGLE)[:, None])
     return [float(arcs[start:stop].mean()) for _, start, stop in runs]
+
+
+def _limit_rise(speeds: list[float], step: float) -> list[float]:
+    """Lower speeds, m/s, at arcs `step` metres apart, so that none rises faster than one brakes."""
+    gained = 2 * _BRAKING * step
+    return list(accumulate(speeds, lambda before, speed: min(speed, math.sqrt(before**2 + gained))))
 
 
 def _heading(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:

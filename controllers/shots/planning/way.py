@@ -13,7 +13,7 @@ from torch import Tensor
 from controllers.shots.planning.timeline import StandingEnds, limit_timed_speeds, plan_speeds
 from controllers.shots.request import Others, ShotRequest
 from mapctl.curves import Curve
-from mapctl.curves.detour import apply_detour, find_detour
+from mapctl.curves.detour import apply_detour, find_detour, find_ground_beside, interpolate_evenly
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.cornering import find_reversals, slow_for_corners
@@ -103,9 +103,7 @@ def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) ->
         return way
     length = way.curve.length
     before = torch.linspace(0, length, max(2, round(length / _FINE_STEP) + 1), dtype=torch.float64)
-    at = torch.linspace(0, length, len(offsets), dtype=torch.float64)
-    aside = torch.from_numpy(np.interp(before.numpy(), at.numpy(), offsets.numpy()))
-    ground = way.curve.ground_point(before) + aside[:, None] * way.curve.left(before)
+    ground = find_ground_beside(way.curve, offsets, before)
     along = torch.cat([ground.new_zeros(1), vectors.length(torch.diff(ground, dim=0)).cumsum(0)])
     longer = np.interp([*sorted(met), length], before.numpy(), (along - before).numpy())
     knots, gained = [0.0], [0.0]
@@ -118,7 +116,7 @@ def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) ->
             gained.append(float(extra))
     arcs = way.arcs + torch.from_numpy(np.interp(way.arcs.numpy(), knots, gained))
     speeds = torch.diff(arcs, append=2 * arcs[-1:] - arcs[-2:-1]) * PRIOR_FPS
-    moved = torch.from_numpy(np.interp(way.arcs.numpy(), at.numpy(), offsets.abs().numpy()))
+    moved = interpolate_evenly(way.curve, offsets.abs(), way.arcs)
     return replace(way, curve=curve, speeds=speeds, arcs=arcs, wished_arcs=way.arcs, aside=moved)
 
 
