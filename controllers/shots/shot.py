@@ -18,9 +18,10 @@ from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.clips.arrival import arrive
 from controllers.shots.joining import TAIL, JoinSettings, Piece, join_pieces, spread_over
+from controllers.shots.keys.approaching import check_reaches, go_down, lean_way
 from controllers.shots.keys.looking import turn_heads
 from controllers.shots.keys.posing import as_reaches, meet_poses, pose_frames
-from controllers.shots.keys.reaching import ReachTargets, check_reaches, go_down, lean_way, settle_reaches
+from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.timeline import Span, lay_timeline
 from controllers.shots.planning.way import Way, cut_curve, plan_way

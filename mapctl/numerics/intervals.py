@@ -18,6 +18,12 @@ def true_intervals(mask: Bool[Tensor, "frames columns"]) -> Iterator[tuple[int, 
         yield column, start, stop
 
 
+def widen(mask: Bool[Tensor, " frames"], frames: int) -> Bool[Tensor, " frames"]:
+    """Return a mask that is also true for some frames before and after each run of true."""
+    kernel = torch.ones(1, 1, 2 * frames + 1)
+    return torch.nn.functional.conv1d(mask.float()[None, None], kernel, padding=frames)[0, 0] > 0
+
+
 def fill_missing(values: Float[Tensor, "batch frames width"], observed: Bool[Tensor, "batch frames"]) -> Tensor:
     """Fill frames that were not observed linearly between those around them; hold first and last beyond."""
     before, after = last_observed(observed), next_observed(observed)

@@ -9,8 +9,9 @@ from helpers import walk
 
 import priors
 from controllers.shots.clips.arrival import Arrival, arrive
+from controllers.shots.keys.approaching import go_down
 from controllers.shots.keys.posing import as_reaches, measure_pose_error, meet_poses
-from controllers.shots.keys.reaching import ReachTargets, go_down, settle_reaches
+from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.prices import measure_prices

@@ -11,7 +11,7 @@ from controllers.benchmarks.shots.fulfilment import draw_shot
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.joining import JoinSettings, Piece, join_pieces
-from controllers.shots.keys.reaching import check_reaches
+from controllers.shots.keys.approaching import check_reaches
 from controllers.shots.planning.way import plan_way
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import ShotSettings, walk_pieces
