@@ -40,8 +40,6 @@ from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import KeepApart, KeepClear, Term
 
-_SPARE = 4  # frames that a walk which ends the shot goes on for, to be cut off
-
 
 @dataclass(frozen=True)
 class ShotSettings:
@@ -173,9 +171,8 @@ def _walk(
     settings: ShotSettings,
     generator: torch.Generator,
 ) -> tuple[Motion, Ledger, tuple[WindowRecord, ...]]:
-    """Walk the frames of a span and some more, which go on at its last speed."""
-    # A horizon's last frame has nothing behind it that it would have to lead to.
-    tail = TAIL if span.stop < len(way.speeds) else _SPARE
+    """Walk the frames of a span, and some more at its last speed where another span follows."""
+    tail = TAIL if span.stop < len(way.speeds) else 0
     frames = span.stop - span.start + tail
     arcs = _extend(way.arcs[span.start : span.stop], tail + settings.follow.window.frames)
     curve = way.curve
