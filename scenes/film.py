@@ -40,7 +40,7 @@ def film(
 ) -> list[Path]:
     """Film the actors walking together; one pass serves all outputs. Returns the paths written.
 
-    `actors` are Shots, or tuples (motion, curve, colour, start seconds) of which all but the motion may be
+    `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes) of which all but the motion may be
     left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
     the trajectory over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
     them. `size` is the width and height in pixels (MP4 rounds up to even). `props` are what stands around

@@ -114,6 +114,17 @@ def build_discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: i
     return Surface(np.insert(flat, 1, MARK_HEIGHT, axis=1), (faces + shifts).reshape(-1, 3), rgba)
 
 
+def build_arrow(start: Array, heading: float, rgb: Array, *, length: float) -> Surface:
+    """Build a flat arrow on the ground from a start (2,) x, z along a heading, radians from +Z toward +X."""
+    shaft, wing = 0.08, 0.26  # half widths, shares of the length
+    along, left = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
+    outline = [(0, shaft), (0.55, shaft), (0.55, -shaft), (0, -shaft), (0.55, wing), (1, 0), (0.55, -wing)]
+    flat = np.stack([start + length * (ahead * along + aside * left) for ahead, aside in outline])
+    vertices = np.insert(flat, 1, MARK_HEIGHT + 0.001, axis=1)
+    faces = np.array([[0, 2, 1], [0, 3, 2], [4, 6, 5]])
+    return Surface(vertices, faces, np.tile([*rgb, 0.9], (len(flat), 1)))
+
+
 def build_shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
     """Build the soft shadow of capsules (n, 2, 3) on the ground, darker and sharper the closer they are to it.
 

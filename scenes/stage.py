@@ -19,6 +19,7 @@ from mapctl.motion import Motion
 from scenes import overlays
 from scenes.cameras import CameraSettings, View, compute_views
 from scenes.content import Content, Figure
+from scenes.wishes import StagedWishes, Wishes
 
 _RIBBON_STEP = 0.06
 
@@ -34,6 +35,8 @@ class Shot(NamedTuple):
     """Name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
     start_seconds: float = 0.0
     """Start of the motion, seconds; until then the actor holds its first pose."""
+    wishes: Wishes = Wishes()
+    """What the actor is asked for beside the curve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,8 @@ class StagedActor:
     """(frames, feet) whether the foot is planted."""
     start: int
     """Film frame of the motion's first frame."""
+    wishes: StagedWishes
+    """What it is asked for beside the curve."""
 
     def frame(self, film_frame: int) -> int:
         """Return the motion's frame at a film's; the first before it starts and the last after it ends."""
@@ -64,6 +69,7 @@ class Stage:
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
         self._grid = overlays.build_grid(self._places()[:, [0, 2]])
         wishes = [player.wish for player in self.players if player.wish is not None]
+        self._veils = [figure for player in self.players for figure in player.wishes.poses]
         self._still = merge_surfaces([self._grid, *wishes, *props])
 
     @property
@@ -76,11 +82,13 @@ class Stage:
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
         trails = [overlays.cut_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_build_contact_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
-        ground = [self._still, *trails, *(m for m in marks if m is not None)]
-        return Content(ground, figures)
+        asked = [mark for player in self.players for mark in player.wishes.marks_at(film_frame)]
+        ground = [self._still, *trails, *(m for m in marks if m is not None), *asked]
+        return Content(ground, figures, self._veils)
 
     def compose_ghosts(self, film_frames: Sequence[int]) -> Content:
-        """Compose all actors at several times in one picture, earlier ones paler, with the whole trails."""
+        """Compose all actors at several times in one picture, earlier ones paler, with the whole trails and all that
+        they are asked for."""
         fades = np.linspace(0.62, 0.0, len(film_frames)) if len(film_frames) > 1 else [0.0]
         moments = list(zip(film_frames, fades, strict=True))
         figures = [
@@ -90,7 +98,8 @@ class Stage:
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
         trails = [player.trail for player in self.players]
-        return Content([self._still, *trails], figures)
+        marks = [mark for player in self.players for mark in player.wishes.all_marks()]
+        return Content([self._still, *trails, *marks], figures, self._veils)
 
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
         """Return one view a frame that shows all actors, and all curves unless the camera follows."""
@@ -123,7 +132,8 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     ribbon = None if shot.curve is None else _build_curve_ribbon(shot.curve, wish)
     path = body.anatomy.hips_world[:, [0, 2]]
     trail = overlays.build_ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT)
-    return StagedActor(body, ribbon, trail, _detect_foot_contacts(body, float(fps)), round(shot.start_seconds * fps))
+    planted, wishes = _detect_foot_contacts(body, float(fps)), StagedWishes.of(shot.wishes, motion, shot.start_seconds)
+    return StagedActor(body, ribbon, trail, planted, round(shot.start_seconds * fps), wishes)
 
 
 def _build_curve_ribbon(curve: Curve, rgb: Array) -> Surface:

@@ -20,14 +20,14 @@ from controllers.shots.clips.arrival import arrive
 from controllers.shots.joining import TAIL, JoinSettings, Piece, join_pieces, spread_over
 from controllers.shots.keys.approaching import check_reaches, go_down, lean_way
 from controllers.shots.keys.looking import turn_heads
-from controllers.shots.keys.posing import as_reaches, meet_poses, pose_frames
+from controllers.shots.keys.posing import MetPose, as_reaches, meet_poses, pose_frames
 from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.timeline import Span, lay_timeline
 from controllers.shots.planning.way import Way, cut_curve, plan_way
 from controllers.shots.prices import Price
 from controllers.shots.repair import repair_jumps
-from controllers.shots.request import ShotRequest
+from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.wishes import Wish, check_wishes, describe_fights
 from mapctl.errors import MapctlError
@@ -59,6 +59,10 @@ class ShotSolution(Solution):
     """The way that was planned."""
     wishes: tuple[Wish, ...] = ()
     """Each wish: asked, got, and the residual."""
+    reaches: tuple[Reach, ...] = ()
+    """What is reached for, keys' own hands and feet too, at the times at which it was."""
+    met: tuple[MetPose, ...] = ()
+    """Keys of poses, places and facings, as they were met."""
     prices: tuple[Price, ...] = ()
     """What each wish costs the others, where that was measured."""
 
@@ -126,6 +130,8 @@ def solve_shot(
         seconds=time.perf_counter() - began,
         way=way,
         wishes=wishes,
+        reaches=reaches,
+        met=met,
     )
 
 

@@ -13,7 +13,7 @@ from mapctl.errors import MapctlError
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from scenes.cameras import View
-from scenes.content import Content
+from scenes.content import Content, blend_veils
 from scenes.overlays import build_shadow
 from scenes.renderers.lighting import shade
 
@@ -49,6 +49,10 @@ class OffscreenPainter:
         self._scene.set_pose(self._camera, view.pose)
         self._renderer.viewport_width, self._renderer.viewport_height = view.width, view.height
         picture, _ = self._renderer.render(self._scene, self._gl.RenderFlags.FLAT)
+        if content.veils:
+            veils = [figure.surface() for figure in content.veils]
+            nodes.append(self._scene.add(self._build_mesh(veils, self._solid, eye)))
+            picture = blend_veils(picture, self._renderer.render(self._scene, self._gl.RenderFlags.FLAT)[0])
         for node in nodes:
             self._scene.remove_node(node)
         return picture

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure as Sheet
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import View
-from scenes.content import Content, Figure
+from scenes.content import Content, Figure, blend_veils
 from scenes.overlays import LIGHT
 from scenes.renderers import STICK_FIGURES
 
@@ -47,6 +47,14 @@ class StickPainter:
             _draw_shadow(axes, view, figure)
         for figure in content.figures:
             _draw_figure(axes, view, figure)
+        picture = self._shoot(view)
+        if not content.veils:
+            return picture
+        for figure in content.veils:
+            _draw_figure(axes, view, figure)
+        return blend_veils(picture, self._shoot(view))
+
+    def _shoot(self, view: View) -> Array:
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[: view.height, : view.width, :3].copy()
 
@@ -70,7 +78,7 @@ def _draw_shadow(axes, view: View, figure: Figure) -> None:
 
 def _draw_figure(axes, view: View, figure: Figure) -> None:
     ends, radii, rgb = figure.body.sticks(figure.frame)
-    _draw_lines(axes, view, ends, radii, colours.blend_colours(rgb, colours.rgb(colours.BACKGROUND), figure.fade))
+    _draw_lines(axes, view, ends, radii + figure.shell, figure.tint(rgb))
 
 
 def _draw_lines(axes, view: View, ends: Array, radii: Array, shown: Array) -> None:

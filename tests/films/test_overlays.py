@@ -36,6 +36,7 @@ def test_all_flat_surfaces_face_up():
     surfaces = [
         overlays.build_ribbon(np.array([[0.0, 0.0], [0.3, 1.0]]), width=0.1, rgb=np.ones(3), height=0.0),
         overlays.build_discs(np.zeros((1, 2)), np.ones((1, 3))),
+        overlays.build_arrow(np.zeros(2), 0.7, np.ones(3), length=0.5),
         overlays.build_grid(np.zeros((1, 2))),
         overlays.build_shadow(np.array([[[0.0, 0.1, 0.0], [0.0, 1.0, 0.0]]]), np.array([0.1])),
     ]

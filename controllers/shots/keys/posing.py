@@ -38,6 +38,11 @@ class MetPose:
     stop: int
     """One past its last frame."""
 
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """From when to when it is met, seconds since the shot's first frame."""
+        return self.start / PRIOR_FPS, (self.stop - 1) / PRIOR_FPS
+
 
 def meet_poses(
     motion: Motion, keys: Sequence[PoseKey], way: Way, inbetweener: Inbetweener

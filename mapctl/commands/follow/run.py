@@ -12,7 +12,8 @@ from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
-from mapctl.commands.shared.shots.play import PlayedShot, list_props, play_shot
+from mapctl.commands.shared.shots.play import PlayedShot, play_shot
+from mapctl.commands.shared.shots.stage import build_obstacles, stage_actor
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -94,8 +95,7 @@ def _write(command: FollowCurve, done: Walk | PlayedShot, video: Path | None) ->
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)
     if video is not None:
-        actors, camera = [(done.solution.motion, done.request.curve)], CameraSettings(command.camera or "follow")
+        actors, camera = [stage_actor(done)], CameraSettings(command.camera or "follow")
         with show_progress("filming", quiet=command.quiet) as progress:
             size = options.parse_size(command.size or _SIZE)
-            props = list_props([done.request]) if isinstance(done, PlayedShot) else []
-            film(actors, video, camera=camera, size=size, props=props, progress=progress)
+            film(actors, video, camera=camera, size=size, props=build_obstacles([done]), progress=progress)

@@ -15,7 +15,8 @@ from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
-from mapctl.commands.shared.shots.play import PlayedShot, let_others_pass, list_props, play_shot
+from mapctl.commands.shared.shots.play import PlayedShot, let_others_pass, play_shot
+from mapctl.commands.shared.shots.stage import build_obstacles, stage_actor
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.cornering import turns_sharply
@@ -23,7 +24,6 @@ from mapctl.intent.path import PathRequest
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.film import film
 from scenes.scene_file import Actor, SceneDescription, load
-from scenes.stage import Shot
 
 
 def run(command: RunScene) -> int:
@@ -128,11 +128,11 @@ def _film(
     command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path]
 ) -> None:
     shots = [
-        Shot(done.solution.motion, done.request.curve, actor.colour, actor.start_seconds)
+        stage_actor(done, colour=actor.colour, start_seconds=actor.start_seconds)
         for actor, done in zip(scene.actors, walks, strict=True)
     ]
     with show_progress("filming", quiet=command.quiet) as progress:
-        props = list_props([done.request for done in walks if isinstance(done, PlayedShot)])
+        props = build_obstacles(walks)
         film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, props=props, progress=progress)
 
 

@@ -18,14 +18,12 @@ from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from mapctl import report
 from mapctl.commands.shared.shots.plan import ShotPlan
 from mapctl.features import PRIOR_FPS
-from mapctl.mesh.primitives import Surface
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.protocols import Inbetweener
 from mapctl.recording.frequency_bands import resample_by_splines
 from mapctl.runtime.progress import Progress
 from mapctl.terms import FootContact
-from scenes.props import build_obstacle, build_target
 
 _WRAPPED = 6  # frames of a loop's beginning that are resampled after its end
 
@@ -166,10 +164,3 @@ def _resample_smoothly(motion: Motion, fps: Fraction) -> Motion:
     seconds = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
     frames = int((motion.num_frames - 1) * fps / motion.fps) + 1
     return resample_by_splines(motion, seconds, fps=fps, frames=frames)
-
-
-def list_props(requests: Sequence[ShotRequest]) -> list[Surface]:
-    """List what a film shows of requests: each obstacle once, and the targets of hands and feet."""
-    obstacles = dict.fromkeys(obstacle for request in requests for obstacle in request.obstacles)
-    places = [place for request in requests for reach in request.reaches for place in reach.places.values()]
-    return [*map(build_obstacle, obstacles), *map(build_target, places)]

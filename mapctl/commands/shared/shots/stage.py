@@ -1,0 +1,45 @@
+"""Solved shots and walks on the stage of a film, with what was asked of them."""
+
+from collections.abc import Sequence
+
+from controllers.shots.keys.posing import MetPose
+from controllers.shots.request import Look, Reach
+from mapctl import kinematics
+from mapctl.commands.shared.path_walk import Walk
+from mapctl.commands.shared.shots.play import PlayedShot
+from mapctl.mesh.primitives import Surface
+from scenes.props import build_hips_mark, build_look_mark, build_obstacle, build_target
+from scenes.stage import Shot
+from scenes.wishes import Mark, Wishes
+
+
+def stage_actor(done: Walk | PlayedShot, *, colour: str | None = None, start_seconds: float = 0.0) -> Shot:
+    """Put what an actor did on a stage, and what it was asked for: targets, places to look at, places and facings of
+    the hips, and whole poses."""
+    wishes = _collect_wishes(done) if isinstance(done, PlayedShot) else Wishes()
+    return Shot(done.solution.motion, done.request.curve, colour, start_seconds, wishes)
+
+
+def build_obstacles(done: Sequence[Walk | PlayedShot]) -> list[Surface]:
+    """Build every obstacle of some actors once."""
+    shots = [one.request for one in done if isinstance(one, PlayedShot)]
+    return [build_obstacle(each) for each in dict.fromkeys(each for request in shots for each in request.obstacles)]
+
+
+def _collect_wishes(done: PlayedShot) -> Wishes:
+    solution = done.solution
+    marks = [
+        Mark(build_target(place), _find_span(reach)) for reach in solution.reaches for place in reach.places.values()
+    ]
+    marks += [Mark(build_look_mark(look.place), _find_span(look)) for look in done.request.looks]
+    marks += [_mark_hips(met) for met in solution.met if not met.key.tells_body]
+    return Wishes(marks, [met.wanted for met in solution.met if met.key.tells_body])
+
+
+def _mark_hips(met: MetPose) -> Mark:
+    heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.tells_facing else None
+    return Mark(build_hips_mark(met.wanted.root_position[0, ::2].numpy(), heading), met.seconds)
+
+
+def _find_span(key: Reach | Look) -> tuple[float, float]:
+    return key.seconds, key.seconds + key.hold_seconds
