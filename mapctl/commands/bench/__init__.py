@@ -190,9 +190,15 @@ class Transitions(Table):
 
 @dataclass(frozen=True, kw_only=True)
 class Shots(PriorTable):
-    """Random shots of one to four wishes: how many hold, which are told not to, and how it looks beside plain walks."""
+    """Random shots of one to four wishes: how many hold, which are told not to, and how it looks beside plain walks; or
+    walks round corners."""
 
     work = "mapctl.commands.bench.shots"
+
+    corners: bool = False
+    """Instead of random shots: walks round corners, through a hairpin and back on their own way."""
+    seeds: options.Count = 2
+    """Seeds of each such walk."""
 
     count: options.Count = 40
     """Shots."""
