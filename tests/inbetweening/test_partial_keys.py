@@ -8,10 +8,15 @@ import pytest
 import torch
 from captures import on_rig
 from helpers import walk
+from linear_inbetweener import LinearInbetweener
 from methods import by_method
 from tiny_infiller import tiny_infiller
 
+from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.tween import tween
+from mapctl.inbetweening import GapQuery
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.metrics import worst_frame
 from mapctl.retarget import to_canonical
@@ -98,3 +103,34 @@ def test_a_hand_that_would_have_to_be_thrown_is_named_with_its_acceleration():
     high = tuple((motion.root_position[3] + torch.tensor([0.0, 0.9, 0.2]).double()).tolist())
     done = asked(motion, (0, Key(3, places={"leftHand": high}), 59))
     assert any("leftHand goes " in note and "m/s^2; mocap's hardly ever reach 130" in note for note in done.notes)
+
+
+class Told(LinearInbetweener):
+    """One that takes hands and feet in single frames into account, as far as it says."""
+
+    @property
+    def takes_partial_keys(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.9, False), (1.25, True)], ids=["within reach", "beyond"])
+def test_the_body_moves_for_a_hand_only_where_its_arm_does_not_reach(share, moves):
+    motion, at, limb = walk(60), 30, LIMBS["leftHand"]
+    shoulder = motion.joint_positions()[at, limb.upper]
+    places, wanted = torch.zeros(60, CANONICAL.num_joints, 3).double(), torch.zeros(60, CANONICAL.num_joints) > 0
+    direction = torch.nn.functional.normalize(torch.tensor([0.4, 0.0, 1.0]).double(), dim=0)
+    places[at, limb.end], wanted[at, limb.end] = shoulder + share * limb.length(CANONICAL) * direction, True
+    missing = torch.zeros(60, dtype=torch.bool)
+    missing[15:45] = True
+    mask = MissingMask.of_frames(missing, CANONICAL.num_joints)
+    query = GapQuery(motion, mask, torch.arange(60) / 30.0, EffectorTargets(places, wanted))
+    made, targets = propose_through_keys(query, Told(), torch.Generator())
+    freely = Told().propose(query).motion
+    hips = (made.motion.root_position - freely.root_position).norm(dim=-1)
+    assert bool(hips[at] > 0.01) == moves
+    assert targets is not None
+    assert torch.equal(targets.wanted, wanted)
+    away = (targets.places[at, limb.end] - made.motion.joint_positions()[at, limb.upper]).norm()
+    assert float(away) <= limb.length(CANONICAL)
+    if not moves:
+        assert torch.equal(made.motion.local_quat_xyzw, freely.local_quat_xyzw)

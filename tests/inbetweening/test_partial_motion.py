@@ -17,7 +17,7 @@ from mapctl.inbetweening.partial_motion import (
     mirror_quats,
 )
 from mapctl.inbetweening.query import GapQuery
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, LIMBS
 
 FRAMES = 40
 MEAN = torch.nn.functional.normalize(
@@ -88,6 +88,25 @@ def test_a_rough_path_is_followed():
     motion = replace(motion, root_position=torch.where(path[..., None], way, motion.root_position))
     made = interpolate_partial_motion(replace(motion, known=replace(known, path=path)), MEAN, 0.9)
     torch.testing.assert_close(made.root_position[path][:, ::2], way[None][path][:, ::2])
+
+
+def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
+    told = torch.zeros(1, FRAMES, len(EFFECTORS), dtype=torch.bool)
+    hand, foot = EFFECTORS.index(CANONICAL.index("leftHand")), EFFECTORS.index(CANONICAL.index("rightFoot"))
+    told[0, 17, hand] = told[0, 5, foot] = True
+    motion = partial_motion(replace(gap(), effectors=told))
+    plain = interpolate_partial_motion(replace(motion, known=gap()), MEAN, 0.9)
+    places, limb = world_positions(plain), LIMBS["leftHand"]
+    place = places[0, 17, limb.upper] + torch.tensor([0.1, 0.2, 0.3])
+    motion.targets[0, 17, hand], motion.targets[0, 5, foot] = place, 5.0
+    made = world_positions(interpolate_partial_motion(motion, MEAN, 0.9))
+    torch.testing.assert_close(made[0, 17, limb.end].float(), place.float(), atol=2e-3, rtol=0)
+    off = (made - places)[0, :, limb.end].norm(dim=-1)
+    assert 0 < float(off[11]) < float(off[14]) < float(off[17])
+    assert float(torch.diff(off).abs().max()) < 0.4 * float(off[17]), "there and back"
+    others = torch.ones(FRAMES, CANONICAL.num_joints, dtype=torch.bool)
+    others[10:25, [limb.lower, limb.end]] = False
+    torch.testing.assert_close(made[0][others], places[0][others], atol=1e-9, rtol=0)
 
 
 def test_known_positions_are_those_of_a_query():
