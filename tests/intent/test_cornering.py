@@ -47,6 +47,16 @@ def test_a_loop_slows_down_for_the_corner_at_its_beginning():
     assert profile.at(square.length - 0.3) < 1.15
 
 
+def test_a_loop_slows_down_at_its_end_for_a_corner_soon_after_its_beginning():
+    square = polygon((0, 3.6), (0, 4), (4, 4), (4, 0), (0, 0), (0, 3.6), closed=True)
+    profile = slow_for_corners(square, USUAL)
+    assert profile.at(0.4) < 0.8
+    speeds = np.array(profile.speeds)
+    around = np.concatenate([speeds, speeds[1:]])
+    assert np.diff(around**2).max() < 2 * 0.9 * 0.0501
+    assert np.diff(around**2).min() > -2 * 0.9 * 0.0501
+
+
 def test_reversals_are_found_where_they_are_and_hairpins_are_none():
     there = find_reversals(polygon((0, 0), (0, 4), (0, 1), (2, 1)))
     assert there == pytest.approx([4.0], abs=0.05)

@@ -217,9 +217,13 @@ def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
     long = walk(frames + OVERLAP, turn_rate=2 * math.pi / (frames / 30))
     made = close_loop(long, frames, inbetweener)
     assert made.num_frames == frames
-    twice = torch.cat([made.joint_positions(), made.joint_positions()])
-    steps = torch.diff(twice, dim=0).norm(dim=-1)[:, ENDS].amax(dim=1)
-    assert float(steps[frames - 1]) <= 1.5 * float(steps[: frames - 1].max())
+
+    def hardest(motion: Motion) -> float:
+        twice = torch.cat([motion.joint_positions(), motion.joint_positions()])
+        return 900 * float(torch.diff(twice, n=2, dim=0).norm(dim=-1)[:, ENDS].max())
+
+    # A lap that is cut off has 197 m/s^2 where it begins again; laps put together without one made anew have 116.
+    assert hardest(made) < 35 < 100 < hardest(long.slice(0, frames))
     torch.testing.assert_close(made.root_position[60:], long.root_position[60:frames])
 
 
