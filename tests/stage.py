@@ -45,6 +45,9 @@ class Actor:
     def command(self, command):
         self.heard.append(("command", command))
 
+    def aim(self, command):
+        self.heard.append(("aim", command))
+
     def walk(self, points, speed):
         if len(points) < 2:
             raise RequestError("a curve needs two points")

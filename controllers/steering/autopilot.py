@@ -24,6 +24,12 @@ class Autopilot:
         """Hold this command from now on."""
         self._command, self._pursuit = command, None
 
+    def aim(self, command: Command) -> None:
+        """Reach, look and walk round obstacles as this command says; nothing else of it counts."""
+        self._command = replace(
+            self._command, reach=command.reach, look_at=command.look_at, obstacles=command.obstacles
+        )
+
     def walk(self, curve: Curve, speed: float) -> None:
         """Walk along a curve with the step length and labels of the last command; stop at the end of an open one."""
         self._pursuit = PurePursuit(curve, speed=speed)
@@ -45,7 +51,11 @@ class Autopilot:
             # The highest speed from which braking stops in time: v^2 = 2 a s.
             speed = min(pursued.speed, math.sqrt(2 * self._limits.braking * max(0.0, left - _ARRIVAL_DISTANCE)))
             if left <= _ARRIVAL_DISTANCE:
-                self.command(Command(0.0, pursued.heading, told=self._command.told))
+                self.command(
+                    replace(
+                        self._command, speed=0.0, heading=pursued.heading, facing=None, turning=None, step_length=None
+                    )
+                )
                 return self._command
             pursued = Command(speed, pursued.heading)
         return replace(self._command, speed=pursued.speed, heading=pursued.heading, facing=None, turning=None)

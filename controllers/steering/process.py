@@ -61,6 +61,10 @@ class CharacterProcess:
         curves.through(positions)  # so that errors are raised here, not in the process
         self._send("walk", positions, speed)
 
+    def aim(self, command: Command) -> None:
+        """See LiveCharacter."""
+        self._send("aim", command)
+
     def pause(self, paused: bool) -> None:
         """See LiveCharacter."""
         self._send("pause", paused)

@@ -110,6 +110,8 @@ class ProcessClock:
             self.again = True
         elif word == "pause":
             self._pause(*content)
+        elif word == "aim":
+            self._pilot.aim(*content)
         elif word == "walk":
             points, speed = content
             self._pilot.walk(curves.through(points), min(speed, self._prior.limits.max_steering_speed))

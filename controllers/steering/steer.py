@@ -16,8 +16,10 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
+from controllers.steering.overlay import Overlay
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
+from mapctl.intent.avoidance import lead_around
 from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
 from mapctl.pose import decode
 from mapctl.problem.context import WindowRequest
@@ -30,7 +32,7 @@ from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
-from mapctl.terms import FootContact, LatentPrior, RootVelocity, StepLength, Term
+from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
@@ -103,6 +105,8 @@ class SteerState:
     """Frames delivered so far, the first pose included."""
     terms: tuple[Term, ...] = ()
     """The caller's own terms, for the prior's size."""
+    overlay: Overlay = field(default_factory=Overlay)
+    """What hands and head are doing beside the walk."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -180,25 +184,28 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     """
     began = time.perf_counter()
     settings, character = state.settings, state.character
-    command = character.command(command)
+    asked, command = command, character.command(_lead_around(state, command))
     stuck = _velocity_error(state) > settings.stuck
     if stuck:
         state = _restart_target(state)
     targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     conditioned = replace(state, prior=_condition_prior(state.prior, command.told)) if command.told else state
     terms = (*_build_steering_terms(state, targets, command.step_length), *state.terms)
+    if asked.obstacles:
+        terms = (*terms, character.term(KeepClear(asked.obstacles)))
     done, outcome = _solve_step(conditioned, terms, seconds, free=stuck)
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
         restarted = replace(conditioned, settings=replace(settings, least_evaluations=0), committed=cold)
         done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
     new = done.features[-settings.commit :]
+    forecast = (done.forecast if done.forecast is not None else done.joints_world[:0]) * character.scale
     motion = character.motion(decode(new, state.committed.place, skeleton=character.unit_skeleton))
+    overlay, motion = state.overlay.pose(motion, asked, forecast)
     record, committed_targets = done.windows[-1], tuple(targets[: settings.commit])
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
     status = Status(Outcome.BUDGET, (note,)) if cut_short else Status(Outcome.DONE)
-    forecast = done.forecast if done.forecast is not None else done.joints_world[:0]
     frames = SteerFrames(
         motion,
         status,
@@ -208,7 +215,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         time.perf_counter() - began,
         contacts=LAYOUT.pick(new, "contacts"),
         steering_targets=tuple(_scale_to_character(target, character) for target in committed_targets),
-        forecast=forecast * character.scale,
+        forecast=forecast,
         evaluations=record.evaluations,
     )
     velocities = torch.tensor([target.velocity for target in committed_targets])
@@ -218,8 +225,19 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         target=committed_targets[-1],
         past_targets=torch.cat([state.past_targets, velocities])[-_PAST_TARGET_FRAMES:],
         frames=state.frames + len(new),
+        overlay=overlay,
     )
     return next_state, frames
+
+
+def _lead_around(state: SteerState, command: Command) -> Command:
+    """Lead a command round its obstacles, in the character's metres; one to turn on and on is left to its terms."""
+    if not command.obstacles or command.turning is not None:
+        return command
+    x, _, z = (state.committed.joints_world[-1, 0] * state.character.scale).tolist()
+    heading = state.target.heading if state.target.speed > 0 else float(state.committed.place.heading)
+    led = lead_around(command.obstacles, place=(x, z), heading=heading, wanted=command.heading, speed=command.speed)
+    return command if led == command.heading else replace(command, heading=led)
 
 
 def _scale_to_character(target: SteeringTarget, character: Character) -> SteeringTarget:

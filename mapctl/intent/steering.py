@@ -2,11 +2,15 @@
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 
+REACHING_HANDS = ("leftHand", "rightHand")
+"""Joints that live targets may be given for."""
 STEP_LENGTHS = (0.3, 1.2)
 """Shortest and longest step that can be asked for, metres. Beyond them feet slide to meet the target and speed is lost:
 at 1.2 m/s, planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 99 m the whole body slides at 9 m/s."""
@@ -30,6 +34,12 @@ class Command:
     told: tuple[str, ...] = ()
     """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the other targets.
     """
+    reach: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Places in the world that hands are to reach while they come past, metres, by REACHING_HANDS."""
+    look_at: tuple[float, float, float] | None = None
+    """Place in the world that is to be looked at, metres."""
+    obstacles: tuple[Obstacle, ...] = ()
+    """Discs and boxes on the ground to walk round."""
 
     def __post_init__(self):
         if not (math.isfinite(self.speed) and self.speed >= 0):
@@ -40,6 +50,11 @@ class Command:
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):
                 raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
+        for name, place in {**self.reach, **({} if self.look_at is None else {"look_at": self.look_at})}.items():
+            if name not in (*REACHING_HANDS, "look_at"):
+                raise RequestError(f"a command reaches with {' or '.join(REACHING_HANDS)}, not with {name}")
+            if len(place) != 3 or not all(map(math.isfinite, place)):
+                raise RequestError(f"the place for {name} must be three finite numbers of metres, got {place}")
 
     def within(self, fastest: float, *, when: str = "") -> tuple["Command", list[str]]:
         """Limit the command to what can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.

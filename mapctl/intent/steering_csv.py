@@ -1,8 +1,8 @@
-"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, optionally, facing_deg, turn_deg_s, step_m, gait
-and style.
+"""Steering scripts: CSV files of time_s, speed_mps, heading_deg and, optionally, facing_deg, turn_deg_s, step_m, gait,
+style, and places in the world as three columns each: left_hand_x, left_hand_y, left_hand_z, right_hand_x, ..., look_z.
 
-A line that leaves an optional column empty faces where it goes, goes straight, has a free step length, and gives the
-prior no label.
+A line that leaves an optional column empty faces where it goes, goes straight, has a free step length, gives the prior
+no label, and reaches for nothing and looks at nothing in particular.
 """
 
 import math
@@ -11,12 +11,21 @@ from os import PathLike
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.text import finite_number, read_table, shorten
-from mapctl.intent.steering import Command, CommandTrack
+from mapctl.intent.steering import REACHING_HANDS, Command, CommandTrack
 
 _REQUIRED_COLUMNS = ("time_s", "speed_mps", "heading_deg")
 _LABEL_COLUMNS = ("gait", "style")
-_ALLOWED_COLUMNS = (*_REQUIRED_COLUMNS, "facing_deg", "turn_deg_s", "step_m", *_LABEL_COLUMNS)
-_MAX_SPEED, _MAX_TIME, _MAX_VALUE = 1000.0, 1e6, 1e6
+_HAND_COLUMNS = dict(zip(("left_hand", "right_hand"), REACHING_HANDS, strict=True))
+_PLACES = (*_HAND_COLUMNS, "look")
+_ALLOWED_COLUMNS = (
+    *_REQUIRED_COLUMNS,
+    "facing_deg",
+    "turn_deg_s",
+    "step_m",
+    *_LABEL_COLUMNS,
+    *(f"{name}_{axis}" for name in _PLACES for axis in "xyz"),
+)
+_MAX_SPEED, _MAX_TIME, _MAX_VALUE, _MAX_PLACE = 1000.0, 1e6, 1e6, 1e4
 
 
 def read_commands(path: str | PathLike[str]) -> CommandTrack:
@@ -68,7 +77,20 @@ class _Line:
             self.angle("turn_deg_s"),
             self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None,
             told,
+            {joint: place for name, joint in _HAND_COLUMNS.items() if (place := self.place(name)) is not None},
+            self.place("look"),
         )
+
+    def place(self, name: str) -> tuple[float, float, float] | None:
+        """Return a place of three columns, metres; None where the line leaves all of them open."""
+        columns = [f"{name}_{axis}" for axis in "xyz"]
+        told = [column for column in columns if self.words.get(column)]
+        if not told:
+            return None
+        if len(told) < len(columns):
+            raise FileFormatError(self.path, f"{name} needs {', '.join(columns)}, all or none", self.number)
+        x, y, z = (self.within(column, -_MAX_PLACE, _MAX_PLACE) for column in columns)
+        return x, y, z
 
     def angle(self, name: str) -> float | None:
         """Return an angle in radians; None where the line leaves it open."""

@@ -8,14 +8,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
 
 from mapctl import contacts, rotations
+from mapctl.curves.obstacles import measure_clearance
 from mapctl.intent.steering import Command, CommandTrack
 from mapctl.joint_roles import find_feet
+from mapctl.kinematics.head_turning import measure_look_angle
 from mapctl.metrics.realism.gait import step_lengths
 from mapctl.motion import Motion
 
 _SLOW_SECONDS = 0.25  # a Gaussian that removes a stride's own rise and fall of speed
+_HELD_DISTANCE = 0.01  # metres from its place within which a hand is there
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
 _HOLD_SECONDS = 0.4  # seconds for which a command must hold to count as reached
 _NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
@@ -48,12 +52,15 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
     it never was), steady_speed_mps (net displacement over time; mean speed while turning), steady_heading_error_deg and
     steady_turn_deg_s (None where the other, standing, or no steady part was wanted), step_m and steady_step_m (None
-    unless a step length was wanted).
+    unless a step length was wanted). For each hand with a place: `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds
+    in which it was within a centimetre of it; `look_nearest_deg`, the least
+    angle between where the head faces and what is looked at; `clearance_cm`, of the nearest joint to an obstacle.
     """
     velocity, rows = compute_low_pass_velocity(motion), []
     asked = any(command.step_length is not None for command in track.commands)
     steps = _step_length_by_frame(motion) if asked else np.full(len(velocity.seconds), math.nan)
-    ground = motion.joint_positions()[:, 0, ::2].numpy()
+    places = motion.joint_positions()
+    ground = places[:, 0, ::2].numpy()
     ends = [*track.times[1:], float(velocity.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
         part = (velocity.seconds >= began) & (velocity.seconds <= until)
@@ -68,10 +75,26 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
         steady = np.flatnonzero(part & (velocity.seconds >= began + _STEADY_AFTER))
         row |= _measure_steady_errors(velocity, ground, steady, command, float(motion.fps))
         taken = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
-        rows.append(
-            row | {"step_m": command.step_length, "steady_step_m": float(np.mean(taken)) if len(taken) else None}
-        )
+        row |= {"step_m": command.step_length, "steady_step_m": float(np.mean(taken)) if len(taken) else None}
+        rows.append(row | _measure_places(motion, places, np.flatnonzero(part), command))
     return rows
+
+
+def _measure_places(motion: Motion, places: Tensor, frames: ndarray, command: Command) -> dict[str, float | None]:
+    """Measure what came of the places that a command names, over its frames."""
+    found: dict[str, float | None] = {}
+    if not len(frames):
+        return found
+    for hand, place in command.reach.items():
+        away = (places[frames, motion.skeleton.index(hand)] - places.new_tensor(place)).norm(dim=-1)
+        found[f"{hand}_nearest_cm"] = 100 * float(away.min())
+        found[f"{hand}_held_s"] = float((away < _HELD_DISTANCE).sum()) / float(motion.fps)
+    if command.look_at is not None:
+        looked = measure_look_angle(motion, places.new_tensor([command.look_at]))[frames]
+        found["look_nearest_deg"] = math.degrees(float(looked.min()))
+    if command.obstacles:
+        found["clearance_cm"] = 100 * float(measure_clearance(command.obstacles, places[frames][..., ::2]).min())
+    return found
 
 
 def _step_length_by_frame(motion: Motion) -> Float[ndarray, " frames"]:

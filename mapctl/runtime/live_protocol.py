@@ -70,6 +70,10 @@ class LiveCharacter(Protocol):
         """Walk along a smooth curve through two or more points (x and z, metres) at a speed in m/s, then stand."""
         ...
 
+    def aim(self, command: Command) -> None:
+        """Reach, look and walk round obstacles as this command says; nothing else of it counts, and a path is kept."""
+        ...
+
     def pause(self, paused: bool) -> None:
         """Stop the clock, or let it go on."""
         ...

@@ -1,10 +1,13 @@
 """One character on the stage: its mover, what is shown of it, and its recording."""
 
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import viser
 
+from mapctl.curves.obstacles import Obstacle
 from mapctl.features import PRIOR_FPS
 from mapctl.mesh import colours
 from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
@@ -34,16 +37,20 @@ class LiveActor:
         self._marks = ground.GroundMarks(scene, f"{world}/marks{number + 1}", character.skeleton)
         self._waiting: deque[tuple[float, FrameChunk, int]] = deque()
 
-    def command(self) -> None:
-        """Send the character its orders."""
-        self.character.command(self.orders.command)
+    def command(self, obstacles: Sequence[Obstacle] = ()) -> None:
+        """Send the character its orders; it leaves its path."""
+        self.character.command(replace(self.orders.command, obstacles=tuple(obstacles)))
 
-    def reset(self) -> None:
+    def aim(self, obstacles: Sequence[Obstacle] = ()) -> None:
+        """Send the character what it reaches for, looks at and walks round; it keeps its path."""
+        self.character.aim(replace(self.orders.command, obstacles=tuple(obstacles)))
+
+    def reset(self, obstacles: Sequence[Obstacle] = ()) -> None:
         """Restart with the first orders; a recording goes on."""
         self._waiting.clear()
         self.orders, self.gone = self.first, ""
         self.pace.forget()
-        self.command()
+        self.command(obstacles)
         self.character.reset()
 
     def take(self, delivered: FrameChunk, now: float) -> None:

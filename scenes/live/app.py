@@ -25,6 +25,7 @@ from scenes.live.inputs import InputLimits, SteeringInputs
 from scenes.live.notifications import Notifications
 from scenes.live.readouts import Readouts
 from scenes.live.recording import FORMATS, RecordedFile, Recording, encode_with_fallback, save_without_replacing
+from scenes.live.target_orders import LiveTargets
 
 HOST = "127.0.0.1"
 """Nobody but this machine can connect."""
@@ -65,8 +66,9 @@ class LiveApp:
         self._chosen, self._is_paused = 0, False
         self._typed_at: float | None = None
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.targets = LiveTargets(scene, _WORLD, self._members, lambda: self._chosen_member, self._enqueue)
         self._panel = ControlPanel(
-            gui, self, characters=len(characters), bounds=self._bounds, below=self._notices.below
+            gui, self, self.targets, characters=len(characters), bounds=self._bounds, below=self._notices.below
         )
         self._panel.show(self._members[0].orders)
         self._gauges = Readouts(gui)
@@ -152,6 +154,7 @@ class LiveApp:
             self._chosen = character
             self._gauges.forget()
             self._panel.show(self._chosen_member.orders)
+            self.targets.show()
             self._label_recording()
 
         self._enqueue(chosen)
@@ -174,9 +177,10 @@ class LiveApp:
         def begun_anew() -> None:
             for member in self._members:
                 self._notices.state(f"gone {member.name}", None)
-                self._run_safely(member.reset)
+                self._run_safely(lambda one=member: one.reset(self.targets.obstacles))
             self._gauges.forget()
             self._panel.show(self._chosen_member.orders)
+            self.targets.show()
 
         self._enqueue(begun_anew)
 
@@ -232,7 +236,7 @@ class LiveApp:
         for name in changes:
             self._notices.held(name, getattr(member.orders, name))
         self._notices.show_refusals(refusals)
-        member.command()
+        member.command(self.targets.obstacles)
 
     def _show_due(self, now: float) -> None:
         for member in self._members:

@@ -12,8 +12,10 @@ import viser
 from mapctl.intent.steering import STEP_LENGTHS
 from scenes.live.inputs import UNCONDITIONED, InputLimits, SteeringInputs
 from scenes.live.recording import FORMATS
+from scenes.live.targets import DISC_RADII, HANDS
 
 _SPEED_STEP, _HEADING_STEP = 0.2, 15.0  # m/s and degrees of one press of a key
+_NO_HAND = "none"
 _DEFAULT_STEP_LENGTH = 0.65  # metres, where measured steps begin
 
 
@@ -58,11 +60,35 @@ class ViewerActions(Protocol):
         ...
 
 
+@runtime_checkable
+class TargetActions(Protocol):
+    """Requests about what is reached for, looked at and walked round."""
+
+    def aim(self, **changes: Any) -> None:
+        """Change what the chosen character reaches for and looks at: `hand`, `looks`, `target`; it keeps its path."""
+        ...
+
+    def put_disc(self, radius: float | None) -> None:
+        """Put a disc to walk round, of a radius in metres; None takes it away."""
+        ...
+
+    def bring(self) -> None:
+        """Put target and disc before the chosen character."""
+        ...
+
+
 class ControlPanel:
     """Sliders, lists, buttons and keys, shared by all browsers."""
 
     def __init__(
-        self, gui: viser.GuiApi, deck: ViewerActions, *, characters: int, bounds: InputLimits, below: Callable[[], None]
+        self,
+        gui: viser.GuiApi,
+        deck: ViewerActions,
+        targets: TargetActions,
+        *,
+        characters: int,
+        bounds: InputLimits,
+        below: Callable[[], None],
     ):
         """Build the controls; `below` adds what is shown below those that steer."""
         self._deck = deck
@@ -77,6 +103,8 @@ class ControlPanel:
             self.draw = gui.add_checkbox("Draw by clicking on the ground", False)
             _bind_button(gui.add_button("Walk it", icon=viser.Icon.ROUTE), deck.walk_path)
             _bind_button(gui.add_button("Clear", icon=viser.Icon.ERASER), deck.clear_path)
+        with gui.add_folder("Reach and avoid"):
+            self._add_targets(gui, targets)
         with gui.add_folder("Play"):
             self.follow = gui.add_checkbox("Follow the character", True)
             self.paused = gui.add_button("Pause")
@@ -103,6 +131,7 @@ class ControlPanel:
             self.step_length.value = orders.step_length
         for group, handle in self.told.items():
             handle.value = orders.told.get(group, UNCONDITIONED)
+        self.hand.value, self.looks.value = orders.hand or _NO_HAND, orders.looks
         self.enable(orders)
 
     def enable(self, orders: SteeringInputs) -> None:
@@ -132,6 +161,17 @@ class ControlPanel:
         self._bind_control(self.step_length, lambda value: typed(step_length=value) if self.measured.value else None)
         for group, handle in self.told.items():
             self._bind_control(handle, lambda value, of=group: typed(told={of: value}))
+
+    def _add_targets(self, gui: viser.GuiApi, targets: TargetActions) -> None:
+        self.hand = gui.add_dropdown("Hand", [_NO_HAND, *HANDS], hint="drag the ball that it reaches for")
+        self.looks = gui.add_checkbox("Look at it", False)
+        self.disc = gui.add_checkbox("Disc to walk round", False)
+        self.radius = gui.add_slider("Radius, m", *DISC_RADII, 0.1, 0.5)
+        self._bind_control(self.hand, lambda value: targets.aim(hand=None if value == _NO_HAND else value))
+        self._bind_control(self.looks, lambda value: targets.aim(looks=value))
+        self._bind_control(self.disc, lambda value: targets.put_disc(self.radius.value if value else None))
+        self._bind_control(self.radius, lambda value: targets.put_disc(value) if self.disc.value else None)
+        _bind_button(gui.add_button("Bring them here", icon=viser.Icon.MAP_PIN), targets.bring)
 
     def _add_hotkeys(self, gui: viser.GuiApi) -> None:
         deck = self._deck

@@ -31,8 +31,8 @@ def add_grid(scene: viser.SceneApi, name: str) -> None:
         cell_thickness=0.8,
         section_thickness=1.4,
         fade_distance=40.0,
-        cell_color=_to_rgb_bytes(colours.GRID),
-        section_color=_to_rgb_bytes(colours.GRID),
+        cell_color=to_rgb_bytes(colours.GRID),
+        section_color=to_rgb_bytes(colours.GRID),
     )
 
 
@@ -48,7 +48,7 @@ class GroundMarks:
                 f"{name}/foot{k}",
                 vertices,
                 faces,
-                color=_to_rgb_bytes(colour),
+                color=to_rgb_bytes(colour),
                 opacity=0.6,
                 visible=False,
                 side="double",
@@ -73,7 +73,7 @@ class GroundMarks:
         bones = [(child, parent) for child, parent in enumerate(self._parents) if parent >= 0]
         segments += [joints[round(share * (len(joints) - 1))][np.array(bones)] for share in _FIGURE_SHARES]
         lines = np.concatenate(segments).astype(np.float32)
-        self._scene.add_line_segments(f"{self._name}/forecast", lines, _to_rgb_bytes(colours.TRAIL), thickness=0.012)
+        self._scene.add_line_segments(f"{self._name}/forecast", lines, to_rgb_bytes(colours.TRAIL), thickness=0.012)
 
 
 class DrawnPath:
@@ -101,7 +101,7 @@ class DrawnPath:
             handle.remove()
         self._shown = [
             self._scene.add_icosphere(
-                f"{self._name}/point{k}", 0.05, color=_to_rgb_bytes(colours.TARGET), position=(x, 0.02, z)
+                f"{self._name}/point{k}", 0.05, color=to_rgb_bytes(colours.TARGET), position=(x, 0.02, z)
             )
             for k, (x, z) in enumerate(self.points)
         ]
@@ -109,7 +109,7 @@ class DrawnPath:
             segments = np.stack([line[:-1], line[1:]], axis=1).astype(np.float32)
             self._shown.append(
                 self._scene.add_line_segments(
-                    f"{self._name}/line", segments, _to_rgb_bytes(colours.TARGET), thickness=0.025
+                    f"{self._name}/line", segments, to_rgb_bytes(colours.TARGET), thickness=0.025
                 )
             )
 
@@ -148,6 +148,7 @@ def _build_disc(radius: float = 0.085, corners: int = 24) -> tuple[Array, Array]
     return np.vstack([np.zeros(3), rim]), np.stack([np.zeros(corners, int), index, np.roll(index, -1)], axis=-1)
 
 
-def _to_rgb_bytes(colour: str) -> tuple[int, int, int]:
+def to_rgb_bytes(colour: str) -> tuple[int, int, int]:
+    """Return a colour as viser takes it, 0 to 255."""
     red, green, blue = (round(255 * float(share)) for share in colours.rgb(colour))
     return red, green, blue

@@ -27,13 +27,25 @@ class SteeringInputs:
     """Step length, metres; None leaves it to the prior."""
     told: Mapping[str, str] = field(default_factory=dict)
     """Chosen label by group (gait, style)."""
+    hand: str | None = None
+    """Hand that reaches for the target, `left` or `right`; None for neither."""
+    looks: bool = False
+    """Whether the head looks at the target."""
+    target: tuple[float, float, float] | None = None
+    """Place of the target in the world, metres; None until there is one."""
 
     @property
     def command(self) -> Command:
         """Command for a LiveCharacter."""
         facing = None if self.facing is None else math.radians(self.facing)
         return Command(
-            self.speed, math.radians(self.heading), facing, step_length=self.step_length, told=tuple(self.told.values())
+            self.speed,
+            math.radians(self.heading),
+            facing,
+            step_length=self.step_length,
+            told=tuple(self.told.values()),
+            reach={f"{self.hand}Hand": self.target} if self.hand and self.target else {},
+            look_at=self.target if self.looks else None,
         )
 
 
@@ -74,7 +86,7 @@ class InputLimits:
         return replace(orders, **found), refused
 
     def _limit_number(self, orders: SteeringInputs, name: str, asked: Any) -> float | None:
-        if name not in _NUMBER_FIELDS or not _is_number(asked):
+        if name not in _NUMBER_FIELDS or not is_number(asked):
             may_be_none = name in ("facing", "step_length") and asked is None
             return None if may_be_none else getattr(orders, name)
         if name in ("heading", "facing"):
@@ -103,7 +115,7 @@ class InputLimits:
             )
         if asked == held:
             return None
-        if not _is_number(asked):
+        if not is_number(asked):
             held = "none" if held is None else f"{held:g}"
             return f"{name.replace('_', ' ').capitalize()}: {str(asked)[:20]!r} is no number; {held} holds."
         if name not in _WORDS_AND_UNITS:
@@ -114,5 +126,6 @@ class InputLimits:
         return f"A {words} of {asked:g} {unit} was {way} to {held:g}: it can be {low:g} to {high:g} {unit}."
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Return whether what a browser sent is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

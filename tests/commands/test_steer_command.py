@@ -146,3 +146,23 @@ def test_steps_of_a_walk_are_measured():
     motion = walk(180)
     row = measure_commands(motion, CommandTrack((0.0,), (Command(1.2, 0.0, step_length=0.6),)))[0]
     assert row["steady_step_m"] == pytest.approx(1.2 / (2 * 0.9), rel=0.15)  # two steps a stride
+
+
+def test_what_hands_and_head_are_told_and_what_is_walked_round_is_reported(steer, tmp_path, capsys):
+    script = (
+        "time_s,speed_mps,heading_deg,right_hand_x,right_hand_y,right_hand_z,look_x,look_y,look_z\n"
+        "0,0,0,-0.3,1.1,0.4,-1,1.3,2\n2,0,0,,,,,,\n2.2,0,0,,,,,,\n"
+    )
+    assert steer(script, "--avoid", "0,3,0.5", "--report", tmp_path / "r.json") == 0
+    first, last = json.loads((tmp_path / "r.json").read_text())["commands"][:2]
+    assert first["rightHand_nearest_cm"] < 40
+    assert first["look_nearest_deg"] < 60
+    assert 100 < first["clearance_cm"] < 400
+    assert "rightHand_nearest_cm" not in last
+    assert "right hand" in capsys.readouterr().out
+
+
+def test_who_begins_within_an_obstacle_is_refused(steer, tmp_path, capsys):
+    assert steer(SCRIPT, "--avoid", "0.1,0,0.5") == 2
+    assert "40 cm within an obstacle" in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()

@@ -29,6 +29,9 @@ def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(head
     assert abs(wishes[-1].heading - heading) <= math.pi + 1e-6
 
 
+HAND = "left_hand_x,left_hand_y,left_hand_z"
+
+
 def test_facing_goes_with_travel_unless_it_is_held():
     wish = SteeringTarget(1.0, 0.0, 0.0)
     walked, strafed = (
@@ -87,6 +90,9 @@ def test_angles_of_many_turns_are_the_same_direction_and_others_stay_to_the_bit(
         (lambda: Command(1, math.inf), "heading must be"),
         (lambda: Command(1, 0, math.nan), "facing must be"),
         (lambda: Command(1, 0, turning=math.inf), "turning must be"),
+        (lambda: Command(1, 0, reach={"leftFoot": (0, 0, 0)}), "reaches with leftHand or rightHand, not with leftFoot"),
+        (lambda: Command(1, 0, reach={"leftHand": (0, 0, math.nan)}), "leftHand must be three finite numbers"),
+        (lambda: Command(1, 0, look_at=(0, 1, math.inf)), "look_at must be three finite numbers"),
         (lambda: CommandTrack((), ()), "at least one"),
         (lambda: CommandTrack((1.0, 1.0), (Command(1, 0),) * 2), "must rise, got 1 s after 1 s"),
         (lambda: SteeringLimits(turn_rate=0), "turn_rate must be positive"),
@@ -142,12 +148,22 @@ def test_turning_gait_and_style_may_be_left_empty(read):
         ("time_s,speed_mps,heading_deg\n0,-1,0\n", 2, "between 0 and 1000"),
         ("time_s,speed_mps,heading_deg\n2,1,0\n1,1,0\n", 3, "time_s must rise, got 1 after 2"),
         ("time_s,speed_mps,heading_deg\n-1,1,0\n", 2, "time_s must lie"),
+        ("time_s,speed_mps,heading_deg,look_x,look_y\n0,1,0,1,2\n", 2, "look needs look_x, look_y, look_z"),
+        (f"time_s,speed_mps,heading_deg,{HAND}\n0,1,0,1,,2\n", 2, "left_hand needs left_hand_x"),
+        (f"time_s,speed_mps,heading_deg,{HAND}\n0,1,0,1,2,x\n", 2, "left_hand_z must be a number"),
+        (f"time_s,speed_mps,heading_deg,{HAND}\n0,1,0,1,2,1e5\n", 2, "left_hand_z must lie"),
     ],
 )
 def test_bad_files_are_named_with_their_line(read, text, line, message):
     with pytest.raises(FileFormatError, match=message) as told:
         read(text)
     assert told.value.line == line
+
+
+def test_places_hold_for_their_line_alone(read):
+    track = read(f"time_s,speed_mps,heading_deg,{HAND},look_x,look_y,look_z\n0,1,0,0.4,1.2,3,,,\n1,1,0,,,,0,1,2\n")
+    assert [command.reach for command in track.commands] == [{"leftHand": (0.4, 1.2, 3.0)}, {}]
+    assert [command.look_at for command in track.commands] == [None, (0.0, 1.0, 2.0)]
 
 
 def test_a_binary_file_is_no_script(read):

@@ -12,6 +12,7 @@ from stage import Actor, delivered, run
 
 from mapctl import formats
 from mapctl.commands.live import run as live
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import LiveCharacter
@@ -97,6 +98,59 @@ def test_a_drawn_path_is_given_to_walk_and_none_is_said(show, actors):
     run(show, 1)
     assert actors[0].heard == [("walk", [(0.0, 0.0), (1.0, 1.0), (1.0, 3.0)], 1.2)]
     assert show._path.points == []
+
+
+def test_a_target_appears_is_dragged_and_belongs_to_its_character(show, actors):
+    show.targets.aim(hand="left")
+    run(show, 1)
+    word, first = actors[0].heard[-1]
+    assert word == "aim"
+    assert set(first.reach) == {"leftHand"}
+    assert show.targets._target._handle.visible
+    show.targets.aim(target=(1.0, 1.1, 2.0))
+    show.targets.aim(looks=True)
+    run(show, 1)
+    assert actors[0].heard[-1][1].reach == {"leftHand": (1.0, 1.1, 2.0)}
+    assert actors[0].heard[-1][1].look_at == (1.0, 1.1, 2.0)
+    assert actors[1].heard == []
+    show.choose(1)
+    run(show, 1)
+    assert not show.targets._target._handle.visible
+    show.choose(0)
+    show.order(speed=2.0)
+    run(show, 1)
+    assert actors[0].heard[-1] == (
+        "command",
+        Command(2.0, 0.0, reach={"leftHand": (1.0, 1.1, 2.0)}, look_at=(1.0, 1.1, 2.0)),
+    )
+
+
+def test_a_disc_is_for_everybody_and_is_dragged_and_taken_away(show, actors):
+    show.targets.put_disc(0.5)
+    run(show, 1)
+    assert [actor.heard[-1][1].obstacles[0].radius for actor in actors] == [0.5, 0.5]
+    assert show.targets._disc._handle.visible
+    show.targets._move_disc((1.0, 0.0, 4.0))
+    show.targets.put_disc(0.8)
+    run(show, 1)
+    assert actors[1].heard[-1][1].obstacles == (Obstacle((1.0, 4.0), 0.8),)
+    show.targets.put_disc(None)
+    run(show, 1)
+    assert actors[0].heard[-1][1].obstacles == ()
+    assert not show.targets._disc._handle.visible
+
+
+def test_what_no_page_of_ours_sends_changes_no_target(show, actors):
+    show.targets.aim(hand="left", target=(0.0, 1.0, 2.0))
+    show.targets.put_disc(0.5)
+    run(show, 1)
+    heard = actors[0].heard[-1]
+    for wrong in ({"hand": "third"}, {"target": (math.nan, 0.0, 0.0)}, {"target": "x"}, {"looks": 3}):
+        show.targets.aim(**wrong)
+    for radius in (math.inf, -1.0, True):
+        show.targets.put_disc(radius)
+    run(show, 1)
+    assert actors[0].heard[-1] == heard
 
 
 def test_rays_meet_the_ground():

@@ -42,6 +42,23 @@ def collected(remote, seconds):
     return found
 
 
+def test_a_hand_goes_to_what_is_aimed_at(remote):
+    remote.command(Command(0.0, 0.0))
+    remote.reset()
+    last = collected(remote, 1.0)[-1].motion(remote.skeleton).joint_positions()[-1]
+    hand, shoulder = (remote.skeleton.index(name) for name in ("leftHand", "leftUpperArm"))
+    place = tuple((last[shoulder] + last.new_tensor([0.3, 0.2, 0.1])).tolist())
+    remote.aim(Command(0.0, 0.0, reach={"leftHand": place}))
+    pieces = collected(remote, 2.0)
+    away = [
+        float((piece.motion(remote.skeleton).joint_positions()[-1, hand] - last.new_tensor(place)).norm())
+        for piece in pieces
+    ]
+    assert min(away) < 0.5 * away[0]
+    remote.aim(Command(0.0, 0.0))
+    remote.command(Command(1.2, 0.0))
+
+
 def test_it_is_a_live_character_that_walks_in_time(remote):
     assert isinstance(remote, LiveCharacter)
     remote.reset()

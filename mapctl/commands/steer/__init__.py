@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.command import Command
@@ -20,8 +20,9 @@ class Steer(Command):
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
-    strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style as the prior knows them. The
-    last line's time is the end."""
+    strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style as the prior knows them,
+    left_hand_x, left_hand_y, left_hand_z (and right_hand_, look_) for a place in metres that a hand reaches or that is
+    looked at. The last line's time is the end."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
@@ -32,6 +33,8 @@ class Steer(Command):
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
+    avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
+    """A disc on the ground to walk around, metres; may be given several times."""
     seed: options.Count = 0
     """Seed of the first pose."""
     acceleration: options.Number = SteeringLimits.acceleration

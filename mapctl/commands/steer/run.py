@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.steer import Steer
+from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import CommandTrack, SteeringLimits
 from mapctl.intent.steering_csv import read_commands
@@ -27,13 +29,14 @@ from mapctl.terms import FootContact
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.plots.steering import plot
 
+_PLACE_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
 _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
 
 
 def run(command: Steer) -> int:
     """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
     _check(command)
-    track = read_commands(command.commands)
+    track = _add_obstacles(read_commands(command.commands), [Obstacle.parse(text) for text in command.avoid])
     character, prior = read_character(command.rig), priors.load(command.prior)
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
     for labels in {wanted.told for wanted in track.commands if wanted.told}:
@@ -64,6 +67,14 @@ def _check(command: Steer) -> None:
 
 def _limits(command: Steer) -> SteeringLimits:
     return SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
+
+
+def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> CommandTrack:
+    """Return a track whose commands lead round obstacles; RequestError where one begins within one."""
+    clear = float(measure_clearance(tuple(obstacles), torch.zeros(2, dtype=torch.float64)))
+    if clear < 0:
+        raise RequestError(f"the character starts at 0,0, {100 * -clear:.0f} cm within an obstacle")
+    return CommandTrack(track.times, tuple(replace(one, obstacles=tuple(obstacles)) for one in track.commands))
 
 
 def _run_steering(
@@ -121,6 +132,15 @@ class _ProgressDisplay:
         self.progress(min(self.frames, round(due * PRIOR_FPS) + frames.motion.num_frames), self.frames)
 
 
+def _format_place(row: Mapping[str, Any], name: str, words: str) -> str:
+    """Say how near a hand came to its place, and for how long it was there; nothing where none was wanted."""
+    nearest = row.get(f"{name}_nearest_cm")
+    if nearest is None:
+        return ""
+    held = row[f"{name}_held_s"]
+    return f", {words} there for {held:.1f} s" if held else f", {words} {nearest:.0f} cm short"
+
+
 def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
     lines = []
     for row in found["commands"][:-1]:
@@ -130,9 +150,14 @@ def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str
         turned = "" if off is None else f", {off:+.1f} degrees off"
         turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
         turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
+        looked = row.get("look_nearest_deg")
+        places = "" if looked is None else f", head {looked:.0f} degrees off what it looks at"
+        places += "".join(_format_place(row, name, words) for name, words in _PLACE_WORDS.items())
         turn = row["turn_deg_s"]
         direction = f"to {row['heading_deg']:.0f} degrees" if turn is None else f"turning {turn:.0f} degrees/s"
-        lines.append(f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}")
+        lines.append(
+            f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}{places}"
+        )
     cost, latency = found["timing"], found["timing"]["command_latency_s"]
     waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
     slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""

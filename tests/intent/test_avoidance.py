@@ -1,0 +1,59 @@
+"""Directions that lead round obstacles."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.intent.avoidance import lead_around
+
+AHEAD = dict(place=(0.0, 0.0), heading=0.0, wanted=0.0, speed=1.2)
+
+
+def walked(obstacles, wanted=0.0, *, frames=240, speed=1.2, at=(0.0, 0.0)):
+    """Places of a point that goes where it is led, turning at most 2.5 rad/s."""
+    place, heading, found = np.array(at), wanted, []
+    for _ in range(frames):
+        led = lead_around(obstacles, place=tuple(place), heading=heading, wanted=wanted, speed=speed)
+        heading += np.clip(math.remainder(led - heading, 2 * math.pi), -2.5 / 30, 2.5 / 30)
+        place = place + speed / 30 * np.array([math.sin(heading), math.cos(heading)])
+        found.append(place)
+    return np.array(found)
+
+
+def test_without_anything_in_the_way_the_wanted_direction_stays():
+    assert lead_around((), **AHEAD) == 0.0
+    assert lead_around((Obstacle((3.0, 1.0), 0.5),), **AHEAD) == pytest.approx(0.0, abs=1e-9)
+    assert lead_around((Obstacle((0.0, -1.0), 0.5),), **AHEAD) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "obstacles",
+    [
+        (Obstacle((0.0, 3.0), 0.5),),
+        (Obstacle((0.2, 3.0), 1.0),),
+        (Obstacle((0.0, 3.0), size=(2.0, 0.4), turn_deg=20.0),),
+        (Obstacle((-0.5, 3.0), 0.5), Obstacle((0.6, 3.5), 0.5)),
+    ],
+)
+def test_a_point_gets_past_and_goes_on_as_wanted(obstacles):
+    way = walked(obstacles)
+    assert float(measure_clearance(obstacles, torch.from_numpy(way)).min()) > 0.25
+    assert way[-1, 1] > 6.5
+    last = np.diff(way[-10:], axis=0)
+    assert np.abs(np.arctan2(last[:, 0], last[:, 1])).max() < 0.05
+
+
+def test_it_keeps_to_the_side_that_it_has_chosen():
+    way = walked((Obstacle((0.0, 3.0), 0.8),))
+    side = np.sign(way[np.abs(way[:, 0]) > 0.05, 0])
+    assert len(set(side)) == 1
+
+
+def test_who_is_too_near_already_gets_out():
+    beside = (Obstacle((0.5, 0.3), 0.35),)
+    clear = measure_clearance(beside, torch.from_numpy(walked(beside, frames=60)))
+    assert float(clear.min()) > 0.1
+    assert float(clear[-1]) > 0.4
