@@ -77,14 +77,16 @@ class Generation(PriorTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Steer(PriorTable):
-    """Random commands: which are reached, and how soon."""
+    """Random commands: which are reached, and how soon; or places to reach in passing, and discs to walk round."""
 
     work = "mapctl.commands.bench.steer"
 
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     count: options.Count = 48
-    """Commands to give."""
+    """Commands to give, or walks of each kind."""
+    targets: bool = False
+    """Hands that reach and discs that are walked round, instead of speeds and directions."""
 
 
 @dataclass(frozen=True, kw_only=True)
