@@ -35,7 +35,6 @@ def find_jumps(motion: Motion) -> Bool[Tensor, " steps"]:
     after."""
     places = motion.joint_positions()
     speed = torch.diff(places[:, _ENDS] - places[:, :1], dim=0).norm(dim=-1) * PRIOR_FPS
-    beside = torch.zeros_like(speed)
-    beside[2:] = speed[:-2]
-    beside[:-2] = torch.maximum(beside[:-2], speed[2:])
+    beside = torch.full_like(speed, torch.inf)  # at the ends nothing shows what was before, or comes after
+    beside[2:-2] = torch.maximum(speed[:-4], speed[4:])
     return ((speed > _JUMP_SPEED) & (speed > _JUMP_RATIO * beside)).any(dim=1)

@@ -17,6 +17,7 @@ from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.clips.arrival import arrive
+from controllers.shots.clips.lead import go_on
 from controllers.shots.joining import TAIL, JoinSettings, Piece, join_pieces, spread_over
 from controllers.shots.keys.approaching import check_reaches, go_down, lean_way
 from controllers.shots.keys.looking import turn_heads
@@ -102,7 +103,9 @@ def solve_shot(
         prior, request, walked_way, rest, character=character, settings=settings, generator=generator, progress=progress
     )
     motion, missing = join_pieces(pieces, inbetweener, settings.join)
-    if bool(missing.any()):
+    if request.lead is not None:
+        motion = go_on(motion, missing, request.lead, inbetweener)
+    elif bool(missing.any()):
         motion = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
     motion = repair_jumps(motion, inbetweener)
     if request.loop:

@@ -17,7 +17,7 @@ from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command
 from mapctl.kinematics import inverse
-from mapctl.kinematics.arm_aims import bend_within, lead_about
+from mapctl.kinematics.arm_aims import bend_within, find_out, lead_about
 from mapctl.kinematics.head_turning import turn_head
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
@@ -125,17 +125,8 @@ def _is_in_reach(
     """Return whether a hand gets to a place from a pose, with a lean of the trunk; one on its way a little farther."""
     limb = LIMBS[name]
     away = joints.new_tensor(place) - joints[limb.upper]
-    length = float(skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
-    near = float(away.norm()) < length + _NEAR + _LET_GO * keep
-    return near and float(away @ _find_out(name, joints[None])[0]) > -_BEHIND * float(away.norm())
-
-
-def _find_out(name: str, joints: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames 3"]:
-    """Find the unit vectors that lead level to the front and to a hand's own side."""
-    left, right = (joints[:, LIMBS[side].upper] for side in ("leftHand", "rightHand"))
-    across = torch.nn.functional.normalize((left - right) * joints.new_tensor([1.0, 0.0, 1.0]), dim=-1)
-    ahead = torch.stack([-across[:, 2], torch.zeros_like(across[:, 0]), across[:, 0]], dim=-1)
-    return torch.nn.functional.normalize(ahead + (0.5 if name == "leftHand" else -0.5) * across, dim=-1)
+    near = float(away.norm()) < limb.length(skeleton) + _NEAR + _LET_GO * keep
+    return near and float(away @ find_out(name, joints[None])[0]) > -_BEHIND * float(away.norm())
 
 
 def _lean(walk: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
@@ -144,7 +135,7 @@ def _lean(walk: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
     joints, turn = walk.joint_positions(), torch.zeros(walk.num_frames, 3, dtype=torch.float64)
     for name, (weight, place) in arms.items():
         limb = LIMBS[name]
-        length = float(walk.skeleton.offsets[[limb.lower, limb.end]].norm(dim=-1).sum())
+        length = limb.length(walk.skeleton)
         shoulder, away = joints[:, limb.upper] - joints[:, _TRUNK[0]], place - joints[:, limb.upper]
         short = (away.norm(dim=-1) - _EASY_SHARE * length).clamp_min(0)
         angle = short**2 / (short + _LEAN_EASE) / shoulder.norm(dim=-1)
@@ -165,10 +156,10 @@ def _reach(motion: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
     quats = motion.local_quat_xyzw.clone()
     for name, (weight, place) in arms.items():
         limb, offsets = LIMBS[name], motion.skeleton.offsets.to(joints)
-        length = offsets[[limb.lower, limb.end]].norm(dim=-1).sum()
+        length = limb.length(motion.skeleton)
         aim = place.to(joints) - joints[:, limb.upper]
         aim = bend_within(aim, length, easy=_BENT_SHARE, most=_STRETCHED_SHARE)
-        own, out = joints[:, limb.end] - joints[:, limb.upper], _find_out(name, joints)
+        own, out = joints[:, limb.end] - joints[:, limb.upper], find_out(name, joints)
         aim = lead_about(own, aim, weight.to(joints), out=out)
         turned, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
         above = world[:, CANONICAL.parents[limb.upper]]

@@ -4,11 +4,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.skeleton import LIMBS
+
 _DETOUR = 0.8  # share of the way out that a turn between opposite directions takes
+_OWN_SIDE = 0.5  # of the way out that leads to a limb's own side, where 1 leads ahead
+
+
+def find_out(name: str, joints: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames 3"]:
+    """Find the unit vectors that lead level ahead of the shoulders, and somewhat to the own side of a hand or foot,
+    from world positions of canonical joints."""
+    left, right = (joints[:, LIMBS[side].upper] for side in ("leftHand", "rightHand"))
+    across = torch.nn.functional.normalize((left - right) * joints.new_tensor([1.0, 0.0, 1.0]), dim=-1)
+    ahead = torch.stack([-across[:, 2], torch.zeros_like(across[:, 0]), across[:, 0]], dim=-1)
+    side = _OWN_SIDE if name.startswith("left") else -_OWN_SIDE
+    return torch.nn.functional.normalize(ahead + side * across, dim=-1)
 
 
 def bend_within(
-    away: Float[Tensor, "frames 3"], length: float | Tensor, *, easy: float, most: float
+    away: Float[Tensor, "frames 3"], length: float, *, easy: float, most: float
 ) -> Float[Tensor, "frames 3"]:
     """Bring vectors, metres, smoothly to where a limb of some length reaches them without being stretched: a stretched
     elbow swings fast. From the share `easy` of the length on they are shortened, to the share `most` at last."""

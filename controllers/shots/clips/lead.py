@@ -2,22 +2,32 @@
 
 from dataclasses import dataclass, replace
 
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
 from controllers.common.character import Character
 from controllers.common.initial_state import MotionStart, start_from_state
+from controllers.inbetweening.pipeline import fill
 from mapctl import kinematics
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics.placing import bring_curve_points, measure_travel, move_to, rotate_about_vertical
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.receding_horizon import replay
-from mapctl.protocols import Density
+from mapctl.protocols import Density, Inbetweener
 
 _MEMORY_FRAMES = 120  # at PRIOR_FPS, that warm up the density's state
 TRAVEL_FRAMES = 15
 """Frames at PRIOR_FPS over which a clip's direction of travel is measured."""
 STANDING_SPEED = 0.3
 """m/s below which a clip stands, and its hips' heading is its direction."""
+_STILL_SPEED = 0.3  # m/s of a joint, above which it gestures
+_PAST_FRAMES = 10  # of a clip, that an in-betweener sees before a shot's first frame
+_REST_FRAMES, _SOON = 24, 45  # frames in which limbs come to rest, or until the first step where it ends that soon
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +56,12 @@ class Lead:
     def stands(self) -> bool:
         """Whether it ends standing."""
         return self._travel[0] < STANDING_SPEED
+
+    @property
+    def gestures(self) -> bool:
+        """Whether it ends standing while limbs move: they come to rest first."""
+        end = self.motion.slice(max(0, self.motion.num_frames - 4), self.motion.num_frames).joint_positions()
+        return self.stands and float(torch.diff(end, dim=0).norm(dim=-1).max()) * PRIOR_FPS > _STILL_SPEED
 
     @property
     def direction(self) -> float:
@@ -81,6 +97,22 @@ class Lead:
         state = replay(prior, observed[1:], prior.start_after(observed[:1]))
         end = GroundPose(ground[-1].float(), heading[-1].float())
         return start_from_state(state, end, character.unit_skeleton)
+
+
+def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetweener: Inbetweener) -> Motion:
+    """Make the missing frames of a shot's motion; who gestures where the clip ends comes to rest on the way to the first
+    step, told how the clip was moving."""
+    if not lead.gestures:
+        return fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    first = next(((start, stop) for _, start, stop in true_intervals(missing[:, None].clone())), None)
+    rest = first[1] if first is not None and first[0] < _SOON else min(_REST_FRAMES, motion.num_frames - 1)
+    missing = missing.clone()
+    missing[1:rest] = True
+    count = min(_PAST_FRAMES, lead.motion.num_frames - 1)
+    past = replace(lead.motion.slice(lead.motion.num_frames - 1 - count, lead.motion.num_frames - 1), moving_offsets={})
+    missing = torch.cat([missing.new_zeros(count), missing])
+    whole = fill(past.join(motion), MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    return whole.slice(count, whole.num_frames)
 
 
 def _reverse(motion: Motion) -> Motion:

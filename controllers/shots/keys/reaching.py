@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.shots.request import Reach
-from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.kinematics.arm_aims import bend_within, find_out, lead_about
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals, widen
@@ -101,8 +101,8 @@ class ReachTargets:
         """
         places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
         frame = torch.arange(len(wanted))
-        for limb in LIMBS.values():
-            reached = self.targets.wanted[:, limb.end]
+        for name, limb in LIMBS.items():
+            reached, out = self.targets.wanted[:, limb.end], find_out(name, positions)
             shoulder = positions[:, limb.upper]
             bones = limb.length(motion.skeleton)
             way = positions[:, limb.end] - shoulder
@@ -110,7 +110,8 @@ class ReachTargets:
                 away = (first - frame).clamp_min(0) + (frame - last + 1).clamp_min(0)
                 share = smootherstep((1 - away / (AROUND_FRAMES + 1)).to(way))
                 aim = places[frame.clamp(first, last - 1), limb.end] - shoulder
-                way = torch.where(share[:, None] > 0, _lead_about(way, _bend_within(aim, bones), share), way)
+                aim = bend_within(aim, bones, easy=_BENT_SHARE, most=STRETCHED_SHARE)
+                way = torch.where(share[:, None] > 0, lead_about(way, aim, share, out=out), way)
             near = widen(reached, AROUND_FRAMES)
             places[:, limb.end] = torch.where(reached[:, None], places[:, limb.end], shoulder + way)
             wanted[:, limb.end] = near
@@ -150,21 +151,3 @@ def settle_reaches(reaches: Sequence[Reach], motion: Motion) -> tuple[Reach, ...
         best = first + int(away[first : max(first, last) + 1].argmin())
         found.append(replace(reach, seconds=best / PRIOR_FPS))
     return tuple(found)
-
-
-def _lead_about(
-    one: Float[Tensor, "frames 3"], other: Float[Tensor, "frames 3"], share: Float[Tensor, " frames"]
-) -> Float[Tensor, "frames 3"]:
-    """Turn one vector toward another by a share of the angle between them, its length by the same share."""
-    lengths = [vector.norm(dim=-1, keepdim=True).clamp_min(1e-6) for vector in (one, other)]
-    whole = rotations.to_rotation_vector(rotations.between_vectors(one / lengths[0], other / lengths[1]))
-    turned = rotations.rotate(rotations.from_rotation_vector(share[:, None] * whole), one / lengths[0])
-    return turned * torch.lerp(lengths[0], lengths[1], share[:, None])
-
-
-def _bend_within(away: Float[Tensor, "frames 3"], bones: float) -> Float[Tensor, "frames 3"]:
-    """Bring vectors smoothly to where a limb reaches them without being stretched: a stretched elbow swings fast."""
-    far = away.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    easy, most = _BENT_SHARE * bones, STRETCHED_SHARE * bones
-    near = torch.where(far > easy, most - (most - easy) * torch.exp(-(far - easy).clamp_min(0) / (most - easy)), far)
-    return away / far * near

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
@@ -17,15 +16,13 @@ from controllers.shots.request import Others, ShotRequest
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from mapctl import report
 from mapctl.commands.shared.shots.plan import ShotPlan
+from mapctl.commands.shared.shots.rates import resample_shot
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.protocols import Inbetweener
-from mapctl.recording.frequency_bands import resample_by_splines
 from mapctl.runtime.progress import Progress
 from mapctl.terms import FootContact
-
-_WRAPPED = 6  # frames of a loop's beginning that are resampled after its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +42,7 @@ class PlayedShot:
     @property
     def on_rig(self) -> Motion:
         """Motion on the actor's rig, at its rate."""
-        motion, fps = self.solution.motion, self.plan.fps
-        if not self.request.loop:
-            return self.plan.character.on_rig(_resample_smoothly(motion, fps))
-        # The first frames again, so that there are frames between the last and the first too.
-        resampled = _resample_smoothly(motion.join(motion.slice(0, _WRAPPED)), fps)
-        return self.plan.character.on_rig(resampled.slice(0, round(motion.num_frames * fps / PRIOR_FPS)))
+        return self.plan.character.on_rig(resample_shot(self.solution, self.request, self.plan.fps))
 
     @property
     def interrupted(self) -> bool:
@@ -155,12 +147,3 @@ def _find_others(
         hips.append(track[frames])
     count = min(len(each) for each in hips)
     return Others(torch.stack([each[:count] for each in hips]), distance)
-
-
-def _resample_smoothly(motion: Motion, fps: Fraction) -> Motion:
-    """Resample to another rate, a higher one by splines."""
-    if fps <= motion.fps:
-        return motion.resample(fps)
-    seconds = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
-    frames = int((motion.num_frames - 1) * fps / motion.fps) + 1
-    return resample_by_splines(motion, seconds, fps=fps, frames=frames)
