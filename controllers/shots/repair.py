@@ -1,6 +1,8 @@
 """Frames in which a hand or a toe jumps, made anew: now and then a walk plants a swinging foot from one frame to the
 next."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -18,8 +20,16 @@ _JUMP_RATIO = 1.6  # of the speed two frames earlier and later: limbs that swing
 _AROUND = 6  # frames before and after a jump
 
 
-def repair_jumps(motion: Motion, inbetweener: Inbetweener) -> Motion:
-    """Make frames around jumps anew; the first and the last frame stay."""
+def repair_jumps(motion: Motion, inbetweener: Inbetweener, *, past: Motion | None = None) -> Motion:
+    """Make frames around jumps anew, where that is calmer; the first and the last frame stay. `past` are the frames
+    before the first, where there are any."""
+    if past is not None:
+        whole = repair_jumps(past.join(motion), inbetweener)
+        return replace(
+            motion,
+            root_position=torch.cat([motion.root_position[:1], whole.root_position[past.num_frames + 1 :]]),
+            local_quat_xyzw=torch.cat([motion.local_quat_xyzw[:1], whole.local_quat_xyzw[past.num_frames + 1 :]]),
+        )
     jumps = find_jumps(motion)
     missing = torch.zeros(motion.num_frames, dtype=torch.bool)
     for frame in jumps.nonzero()[:, 0].tolist():
@@ -27,7 +37,13 @@ def repair_jumps(motion: Motion, inbetweener: Inbetweener) -> Motion:
     missing[-1] = False
     if not bool(missing.any()):
         return motion
-    return fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    made = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    return made if _find_peak(made) < _find_peak(motion) else motion
+
+
+def _find_peak(motion: Motion) -> float:
+    """Find the largest second difference of hands and toes, metres: fast limbs that were no jump are made no better."""
+    return float(torch.diff(motion.joint_positions()[:, _ENDS], n=2, dim=0).norm(dim=-1).max())
 
 
 def find_jumps(motion: Motion) -> Bool[Tensor, " steps"]:

@@ -107,7 +107,8 @@ def solve_shot(
         motion = go_on(motion, missing, request.lead, inbetweener)
     elif bool(missing.any()):
         motion = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
-    motion = repair_jumps(motion, inbetweener)
+    past = request.lead.past if request.lead is not None else None
+    motion = repair_jumps(motion, inbetweener, past=past)
     if request.loop:
         motion = close_loop(motion, frames, inbetweener)
     if request.arrival is not None:

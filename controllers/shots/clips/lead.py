@@ -26,7 +26,7 @@ TRAVEL_FRAMES = 15
 STANDING_SPEED = 0.3
 """m/s below which a clip stands, and its hips' heading is its direction."""
 _STILL_SPEED = 0.3  # m/s of a joint, above which it gestures
-_PAST_FRAMES = 10  # of a clip, that an in-betweener sees before a shot's first frame
+_PAST_FRAMES = 10  # of a clip, that are seen before a shot's first frame
 _REST_FRAMES, _SOON = 24, 45  # frames in which limbs come to rest, or until the first step where it ends that soon
 
 
@@ -51,6 +51,12 @@ class Lead:
     def last_pose(self) -> Motion:
         """Its last frame."""
         return self.motion.slice(self.motion.num_frames - 1, self.motion.num_frames)
+
+    @property
+    def past(self) -> Motion:
+        """The frames before its last, as far as they say how it moves."""
+        last = self.motion.num_frames - 1
+        return replace(self.motion.slice(max(0, last - _PAST_FRAMES), last), moving_offsets={})
 
     @property
     def stands(self) -> bool:
@@ -100,19 +106,18 @@ class Lead:
 
 
 def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetweener: Inbetweener) -> Motion:
-    """Make the missing frames of a shot's motion; who gestures where the clip ends comes to rest on the way to the first
-    step, told how the clip was moving."""
+    """Make the missing frames of a shot's motion; who gestures where the clip ends comes to rest on the way to the
+    first step, told how the clip was moving."""
     if not lead.gestures:
         return fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
     first = next(((start, stop) for _, start, stop in true_intervals(missing[:, None].clone())), None)
     rest = first[1] if first is not None and first[0] < _SOON else min(_REST_FRAMES, motion.num_frames - 1)
     missing = missing.clone()
     missing[1:rest] = True
-    count = min(_PAST_FRAMES, lead.motion.num_frames - 1)
-    past = replace(lead.motion.slice(lead.motion.num_frames - 1 - count, lead.motion.num_frames - 1), moving_offsets={})
-    missing = torch.cat([missing.new_zeros(count), missing])
+    past = lead.past
+    missing = torch.cat([missing.new_zeros(past.num_frames), missing])
     whole = fill(past.join(motion), MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
-    return whole.slice(count, whole.num_frames)
+    return whole.slice(past.num_frames, whole.num_frames)
 
 
 def _reverse(motion: Motion) -> Motion:

@@ -10,14 +10,14 @@ from controllers.shots.shot import ShotSolution
 from mapctl.motion import Motion
 from mapctl.recording.frequency_bands import resample_by_splines
 
-_BESIDE = 6  # frames before the first and after the last
+_BESIDE = 6  # frames after the last
 
 
 def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -> Motion:
     """Resample a shot's motion, a higher rate by splines: through the frames of a clip that it goes on from or ends in,
     and for a loop through its own, so that its last frame leads into its first at that rate."""
     motion = solution.motion
-    before, after = _find_before(request), _find_after(solution, request)
+    before, after = request.lead.past if request.lead is not None else None, _find_after(solution, request)
     frames = round(motion.num_frames * fps / motion.fps) if request.loop else None
     frames = frames or int((motion.num_frames - 1) * fps / motion.fps) + 1
     whole = _join([before, motion, after])
@@ -26,14 +26,6 @@ def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -
     first = 0 if before is None else before.num_frames
     seconds = (torch.arange(whole.num_frames, dtype=torch.float64) - first) / float(motion.fps)
     return resample_by_splines(whole, seconds, fps=fps, frames=frames)
-
-
-def _find_before(request: ShotRequest) -> Motion | None:
-    """Find the frames before the first, which is the last of a clip."""
-    if request.lead is None:
-        return None
-    last = request.lead.motion.num_frames - 1
-    return request.lead.motion.slice(max(0, last - _BESIDE), last)
 
 
 def _find_after(solution: ShotSolution, request: ShotRequest) -> Motion | None:
