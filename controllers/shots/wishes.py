@@ -25,7 +25,9 @@ _REACH_TOLERANCE = 0.01  # metres
 _POSE_TOLERANCE, _FACING_TOLERANCE_DEG = 0.001, 0.1  # metres
 _LOOK_TOLERANCE_DEG = 15.0
 _STILL_TOLERANCE = 0.06  # m/s
-_NEAR_REACH_SECONDS = 1.0
+_PROGRESS_TOLERANCE = 0.5  # metres from where one is to be at a time
+_SEAM_RATIO = 1.2  # of a loop's largest step from one frame to the next
+_NEAR_KEY_SECONDS = 1.0
 _ASIDE = 0.05  # metres beside the curve, from which on a way is bent toward a reach
 _STILL_AT_START, _STILL_AT_END = 12, 24  # frames at PRIOR_FPS in which one is to stand, beginning and ending
 _FIGHT_FRAMES = 20  # before and after a wish, in which others are against it
@@ -86,7 +88,10 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
     """Measure every wish of a request on its motion, at PRIOR_FPS; poses as they were met."""
     positions = motion.joint_positions()
     hips = positions[:, 0, ::2]
-    found = [_check_path(request, way, hips)]
+    away = _find_frames_away(request, way)
+    found = [_check_path(way, hips, away), _check_progress(way, hips, away)]
+    if request.loop:
+        found.append(_check_seam(positions))
     for reach in request.reaches:
         targets = ReachTargets.of((reach,), motion.num_frames).targets
         miss = 100 * float(compute_target_errors(positions, targets).max())
@@ -181,17 +186,33 @@ def _find_remedy(reach: Reach, motion: Motion) -> str:
     return f"{100 * float(lacking.min()):.0f} cm nearer"
 
 
-def _check_path(request: ShotRequest, way: Way, hips: Tensor) -> Wish:
-    """Measure the mean distance to the way, away from reaches."""
-    away = way.aside < _ASIDE
-    for reach in request.reaches:
-        first = (reach.seconds - _NEAR_REACH_SECONDS) * PRIOR_FPS
-        last = (reach.seconds + reach.hold_seconds + _NEAR_REACH_SECONDS) * PRIOR_FPS
-        away[max(0, math.floor(first)) : max(0, math.ceil(last))] = False
-    if not bool(away.any()):
-        away[:] = True
+def _check_path(way: Way, hips: Tensor, away: Tensor) -> Wish:
+    """Measure the mean distance to the way in the frames that are `away` from keys."""
     off = _measure_offsets(way, hips)
     return Wish("path", "on the curve", 100 * float(off[away].mean()), 100 * _PATH_TOLERANCE, "cm")
+
+
+def _check_progress(way: Way, hips: Tensor, away: Tensor) -> Wish:
+    """Measure how far the hips come to be from where they are to be on the way at that time."""
+    behind = vectors.length(hips - way.wished.ground_point(way.wished_arcs))[away]
+    return Wish("progress", "on time", 100 * float(behind.max()), 100 * _PROGRESS_TOLERANCE, "cm")
+
+
+def _check_seam(positions: Tensor) -> Wish:
+    """Measure the step from a loop's last frame to its first beside the largest within it."""
+    steps = torch.diff(torch.cat([positions, positions[:1]]), dim=0).norm(dim=-1).amax(dim=1) * PRIOR_FPS
+    most = _SEAM_RATIO * float(steps[:-1].max())
+    return Wish("loop", "last frame leads into the first", float(steps[-1]), most, "m/s")
+
+
+def _find_frames_away(request: ShotRequest, way: Way) -> Tensor:
+    """Find the frames that are away from reaches and poses and from where the way is bent; all where none is."""
+    away = way.aside < _ASIDE
+    for key in (*request.reaches, *request.poses):
+        first = (key.seconds - _NEAR_KEY_SECONDS) * PRIOR_FPS
+        last = (key.seconds + key.hold_seconds + _NEAR_KEY_SECONDS) * PRIOR_FPS
+        away[max(0, math.floor(first)) : max(0, math.ceil(last))] = False
+    return away if bool(away.any()) else torch.ones_like(away)
 
 
 def _measure_offsets(way: Way, hips: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ _AHEAD = 0.35  # metres before and after an arc over which the direction changes
 _TURN_RATE = 1.55  # rad/s at which one turns a corner without leaving it by more than a few centimetres
 _SLOWEST = 0.7  # m/s, to which corners slow one down at most: who is slower hardly walks
 _REVERSAL_STEP = 0.02  # metres before and after an arc, over which a reversal turns
-_REVERSAL_ANGLE = math.radians(150.0)
+_REVERSAL_ANGLE = math.radians(110.0)  # from which on a corner is turned on the spot
 _BRAKING = 0.9  # m/s^2, before a corner and after it
 
 

@@ -49,7 +49,7 @@ def test_follow_starts_and_ends_standing_and_tells_every_wish(keys, tmp_path, ca
     assert set(motion.skeleton.names) == set(CANONICAL.names)
     found = json.loads(report.read_text())
     names = {wish["wish"].split(" at")[0] for wish in found["wishes"]}
-    assert names == {"path", "obstacles", "look", "stand"}
+    assert names == {"path", "progress", "obstacles", "look", "stand"}
     assert all({"asked", "got", "residual", "unit", "holds"} <= wish.keys() for wish in found["wishes"])
 
 
@@ -67,7 +67,12 @@ def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
     miss = (made.joint_positions()[0] - clip.joint_positions()[60]).norm(dim=-1)
     assert float(miss.max()) < 0.01
     report = json.loads((tmp_path / "out" / "a.json").read_text())
-    assert [wish["wish"] for wish in report["actors"]["by"]["wishes"]] == ["path", "obstacles", "keep apart"]
+    assert [wish["wish"] for wish in report["actors"]["by"]["wishes"]] == [
+        "path",
+        "progress",
+        "obstacles",
+        "keep apart",
+    ]
 
 
 REFUSED = {

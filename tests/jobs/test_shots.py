@@ -10,20 +10,21 @@ from helpers import walk
 
 import priors
 from controllers.common.character import Character
-from controllers.shots import shot as shot_module
+from controllers.shots import walking
 from controllers.shots.clips.lead import Lead
-from controllers.shots.keys.looking import measure_look_errors, turn_heads
+from controllers.shots.keys.looking import look_where_hands_reach, measure_look_errors, turn_heads
 from controllers.shots.keys.reaching import ReachTargets
 from controllers.shots.planning.timeline import Span, StandingEnds, lay_timeline, limit_timed_speeds, plan_speeds
 from controllers.shots.planning.way import cut_curve, plan_way
 from controllers.shots.request import Look, Others, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import solve_shot
-from mapctl import curves
+from mapctl import curves, rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
 from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.kinematics.head_turning import measure_look_angle
 from mapctl.metrics import worst_frame
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 
@@ -294,8 +295,8 @@ def test_a_shot_that_is_interrupted_is_not_half_a_shot(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    solve = shot_module.walk_arcs
-    monkeypatch.setattr(shot_module, "walk_arcs", lambda *args, **words: solve(*args, **words, progress=stop))
+    solve = walking.walk_arcs
+    monkeypatch.setattr(walking, "walk_arcs", lambda *args, **words: solve(*args, **words, progress=stop))
     with pytest.raises(KeyboardInterrupt):
         solve_shot(prior, priors.load_inbetweener(), ShotRequest(LINE, seconds=3.0))
 
@@ -327,3 +328,42 @@ def test_a_reach_that_is_far_off_is_told_with_its_distance():
     assert missed.residual > 20
     assert missed.remedy.endswith("cm nearer")
     assert missed.remedy in done.status.text
+
+
+def test_who_goes_on_from_a_gesture_comes_to_rest_without_a_jolt():
+    """Hands that were moving move on: the first steps are no harder than those within the clip and the shot."""
+    prior, fps = priors.load("locomotion"), 30
+    rest = build_rest_pose(prior, CANONICAL, TOE_REST_HEIGHT)
+    frames = 40
+    swing = 1.2 * torch.sin(torch.arange(frames, dtype=torch.float64) / fps * 2 * torch.pi / 0.9)
+    quats = rest.local_quat_xyzw.expand(frames, -1, -1).clone()
+    for name in ("leftUpperArm", "rightUpperArm"):
+        turn = rotations.from_rotation_vector(swing[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+        quats[:, CANONICAL.index(name)] = rotations.multiply(turn, quats[:, CANONICAL.index(name)])
+    clip = replace(rest, root_position=rest.root_position.expand(frames, 3), local_quat_xyzw=quats)
+    lead = Lead.of(clip, 28)
+    assert lead.gestures
+    curve = lead.bring_curve(LINE)
+    done = solve_shot(prior, priors.load_inbetweener(), ShotRequest(curve, seconds=2.0, lead=lead))
+    places = torch.cat([clip.slice(0, 28).joint_positions(), done.motion.joint_positions()])
+    bent = torch.diff(places, n=2, dim=0).norm(dim=-1).amax(dim=1) * fps**2
+    assert float(bent[24:32].max()) < 1.2 * max(float(bent[:24].max()), float(bent[40:].max()))
+    moved = torch.diff(places[28:36], dim=0).norm(dim=-1).amax() * fps
+    assert float(moved) > 0.5, "it does not freeze"
+
+
+def test_a_head_glances_at_what_a_hand_reaches_for_and_not_where_it_looks_already():
+    rest = build_rest_pose(priors.load("locomotion"), CANONICAL, TOE_REST_HEIGHT)
+    motion = replace(
+        rest, root_position=rest.root_position.expand(90, 3), local_quat_xyzw=rest.local_quat_xyzw.expand(90, -1, -1)
+    )
+    place, free = (0.6, 1.0, 0.5), torch.zeros(90, dtype=torch.bool)
+    reach = Reach(1.5, {"leftHand": place})
+    away = torch.tensor([place], dtype=torch.float64)
+    before = measure_look_angle(motion, away)
+    glanced = measure_look_angle(look_where_hands_reach(motion, [reach], [], free), away)
+    assert float(glanced[45]) < 0.4 * float(before[45])
+    assert float((glanced - before)[[0, -1]].abs().max()) < 1e-9
+    for looks, posed in (([Look(1.5, (0.0, 1.5, 3.0))], free), ([], ~free)):
+        kept = measure_look_angle(look_where_hands_reach(motion, [reach], looks, posed), away)
+        assert float((kept - before).abs().max()) < 1e-9

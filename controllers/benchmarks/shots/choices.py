@@ -9,13 +9,14 @@ import torch
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.benchmarks.shots.fulfilment import draw_shot
 from controllers.common.character import Character
+from controllers.following.follow import FollowSettings
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.joining import JoinSettings, Piece, join_pieces
 from controllers.shots.keys.approaching import check_reaches
 from controllers.shots.planning.way import plan_way
 from controllers.shots.rest_pose import build_rest_pose
-from controllers.shots.shot import ShotSettings, walk_pieces
 from controllers.shots.transitions import judge
+from controllers.shots.walking import walk_pieces
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask
@@ -86,7 +87,7 @@ def _walk_shot(prior: Density, generator: torch.Generator, number: int) -> list[
     if not stands:
         return []
     seeded = torch.Generator().manual_seed(number)
-    return walk_pieces(prior, request, way, rest, character=Character(), settings=ShotSettings(), generator=seeded)[0]
+    return walk_pieces(prior, request, way, rest, character=Character(), settings=FollowSettings(), generator=seeded)[0]
 
 
 def _measure_join(pieces: list[Piece], inbetweener: Inbetweener, settings: JoinSettings) -> dict[str, float]:
