@@ -73,3 +73,14 @@ def test_speed_is_measured(prior, monkeypatch, capsys):
 def test_work_is_found(kind):
     if kind is not bench.Bench:  # which only has sub-commands
         assert callable(import_module(kind.work or f"{kind.__module__}.run").run)
+
+
+def test_live_targets_are_measured(prior, monkeypatch, capsys):
+    monkeypatch.setattr("controllers.benchmarks.live_targets._SECONDS", 1.5)
+    assert run("bench", "steer", "--targets", "--count", 1, "--prior", prior, "--json") == 0
+    rows = {row["targets"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    assert list(rows) == ["walking on", "reaching in passing", "reaching, standing", "round a disc"]
+    assert rows["walking on"]["within_1_cm_percent"] is None
+    assert rows["reaching, standing"]["held_s_mean"] >= 0
+    assert rows["round a disc"]["clearance_cm_least"] > 0
+    assert rows["walking on"]["toe_mps_max"] == rows["reaching in passing"]["toe_mps_max"], "legs walk on as they do"
