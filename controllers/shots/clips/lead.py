@@ -1,5 +1,6 @@
 """A clip that a shot goes on from: where it ends, the shot begins, in the same pose and the same stride."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,6 +26,7 @@ TRAVEL_FRAMES = 15
 """Frames at PRIOR_FPS over which a clip's direction of travel is measured."""
 STANDING_SPEED = 0.3
 """m/s below which a clip stands, and its hips' heading is its direction."""
+_ASIDE = math.radians(75.0)  # between the hips' heading and the direction of travel
 _STILL_SPEED = 0.3  # m/s of a joint, above which it gestures
 _PAST_FRAMES = 10  # of a clip, that are seen before a shot's first frame
 _REST_FRAMES, _SOON = 24, 45  # frames in which limbs come to rest, or until the first step where it ends that soon
@@ -60,8 +62,9 @@ class Lead:
 
     @property
     def stands(self) -> bool:
-        """Whether it ends standing."""
-        return self._travel[0] < STANDING_SPEED
+        """Whether it ends standing, or going backwards or sideways, which no walk goes on from without a stop."""
+        speed, direction = self._travel
+        return speed < STANDING_SPEED or abs(math.remainder(direction - self._heading, math.tau)) > _ASIDE
 
     @property
     def gestures(self) -> bool:
@@ -71,10 +74,12 @@ class Lead:
 
     @property
     def direction(self) -> float:
-        """Direction of travel at its end, radians; the hips' heading of somebody who stands."""
-        if self.stands:
-            return float(kinematics.heading(self.motion.local_quat_xyzw[-1:, 0]))
-        return self._travel[1]
+        """Direction of travel at its end, radians; the hips' heading of somebody who stands or does not go ahead."""
+        return self._heading if self.stands else self._travel[1]
+
+    @property
+    def _heading(self) -> float:
+        return float(kinematics.heading(self.motion.local_quat_xyzw[-1:, 0]))
 
     @property
     def _travel(self) -> tuple[float, float]:
