@@ -193,8 +193,8 @@ def _check_path(way: Way, hips: Tensor, away: Tensor) -> Wish:
 
 
 def _check_progress(way: Way, hips: Tensor, away: Tensor) -> Wish:
-    """Measure how far the hips come to be from where they are to be on the way at that time."""
-    behind = vectors.length(hips - way.wished.ground_point(way.wished_arcs))[away]
+    """Measure how far the hips come to be from where they are to be at that time, on the way as it is bent."""
+    behind = vectors.length(hips - way.curve.ground_point(way.arcs))[away]
     return Wish("progress", "on time", 100 * float(behind.max()), 100 * _PROGRESS_TOLERANCE, "cm")
 
 
