@@ -1,13 +1,15 @@
 """`mapctl bench`: a sub-command a table, each with its own options; and every command's work is found."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 import pytest
-from helpers import run
+from helpers import run, walk
 
+from controllers.benchmarks.shots import fulfilment
 from controllers.benchmarks.solver import SpeedBenchmarkSettings, benchmark_speed
 from mapctl import cli
 from mapctl.commands import COMMANDS, bench
@@ -84,3 +86,11 @@ def test_live_targets_are_measured(prior, monkeypatch, capsys):
     assert rows["reaching, standing"]["held_s_mean"] >= 0
     assert rows["round a disc"]["clearance_cm_least"] > 0
     assert rows["walking on"]["toe_mps_max"] == rows["reaching in passing"]["toe_mps_max"], "legs walk on as they do"
+
+
+def test_shots_are_told_from_mocap_as_a_percentage():
+    """By the real classifier, on motions that are known: those that slide are told apart, the same ones are not."""
+    mocap = [walk(300).slice(start, start + 90) for start in range(0, 200, 10)]
+    sliding = [replace(clip, root_position=clip.root_position[:1].expand(90, 3)) for clip in mocap]
+    told, same = (fulfilment._tell_apart(motions, mocap, 0)["told_apart_pct"] for motions in (sliding, mocap))
+    assert told > 90 > same

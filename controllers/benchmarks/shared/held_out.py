@@ -8,6 +8,7 @@ from pathlib import Path
 from controllers.denoising.denoise import begins_with_tpose
 from mapctl import formats, retarget
 from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 
 HeldOut = Mapping[str, Sequence[str]]
@@ -63,6 +64,12 @@ def load_canonical(data: Path, held_out: HeldOut, count: int, *, fps: int | None
         motion = retarget.to_canonical(clip.motion)[0]
         kinds.setdefault(clip.kind, []).append(motion if fps is None else motion.resample(fps))
     return kinds
+
+
+def load_held_out(data: Path, held_out: HeldOut) -> list[Motion]:
+    """Load all held-out clips of more than a second, whole, on canonical joints at PRIOR_FPS."""
+    clips = [retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS) for path in find_held_out(data, held_out)]
+    return [clip for clip in clips if clip.num_frames > PRIOR_FPS]
 
 
 def classify_clip(name: str) -> str:

@@ -1,7 +1,7 @@
 """Benchmark of shots: random wishes that are to hold at once, how many do, which are told not to, and how it looks."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +17,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.timed_speed import TimedSpeed
 from mapctl.metrics import body, feet, worst_frame
+from mapctl.metrics.realism import measure_realism
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, TOES
@@ -44,9 +45,11 @@ def benchmark_shots(
     *,
     count: int,
     seed: int = 0,
+    mocap: Sequence[Motion] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Solve random shots of one to four wishes: rows by kind of wish, and of all beside plain walks of the same curves.
+    """Solve random shots of one to four wishes: rows by kind of wish, and of all beside plain walks of the same curves;
+    with `mocap`, at PRIOR_FPS, how often a classifier tells these two sets from it, and halves of it from each other.
 
     A shot has failed silently if its status is done and a viewer would see a fault: a hand or a toe that moves faster
     than 5.5 m/s about the hips, or planted toes at more than 8 cm/s.
@@ -76,7 +79,19 @@ def benchmark_shots(
         rows.append(
             {"wishes": "walk alone", "shots": len(walks), **_measure([one for one, _ in walks]), "frame_ms": cost}
         )
+        if mocap:
+            shots = [each.solution.motion for each in made if each.solution is not None]
+            rows[-2:] = [
+                row | _tell_apart(motions, mocap, seed)
+                for row, motions in zip(rows[-2:], (shots, [one for one, _ in walks]), strict=True)
+            ]
     return rows
+
+
+def _tell_apart(motions: Sequence[Motion], mocap: Sequence[Motion], seed: int) -> Row:
+    """Measure in what share of one-second windows a classifier tells motions from mocap, and mocap from itself."""
+    found = measure_realism(motions, mocap, generator=torch.Generator().manual_seed(seed))
+    return {"told_apart_pct": 100 * found.accuracy, "mocap_told_apart_pct": 100 * found.floor_accuracy}
 
 
 def draw_shot(generator: torch.Generator) -> tuple[ShotRequest, tuple[str, ...]]:

@@ -206,6 +206,8 @@ class Shots(PriorTable):
     """Shots."""
     seed: options.Count = 0
     """Seed of the wishes."""
+    data: options.MaybeDataFolder = None
+    """The folder that the prior was trained on: shots and walks are then told from its clips that were held out."""
     inbetweener: options.Name = "transformer"
     """The bundled transformer, or the file or run folder of a trained transformer."""
 

@@ -12,6 +12,7 @@ from mapctl.errors import RequestError
 OutFile = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
 DataFolder = Annotated[Path, arg(metavar="DIR")]
+MaybeDataFolder = Annotated[Path | None, arg(metavar="DIR")]
 File = Annotated[Path, arg(metavar="FILE")]
 InFile = Positional[Annotated[Path, arg(metavar="IN")]]
 CurveText = Annotated[str, arg(metavar="CURVE")]
