@@ -52,6 +52,13 @@ def test_it_keeps_to_the_side_that_it_has_chosen():
     assert len(set(side)) == 1
 
 
+def test_who_is_on_the_way_past_one_side_is_led_past_it():
+    ahead = (Obstacle((0.0, 2.0), 0.5),)
+    for heading in (0.5, -0.5):
+        led = lead_around(ahead, place=(0.0, 0.0), heading=heading, wanted=0.0, speed=1.2)
+        assert led * heading > 0
+
+
 def test_who_is_too_near_already_gets_out():
     beside = (Obstacle((0.5, 0.3), 0.35),)
     clear = measure_clearance(beside, torch.from_numpy(walked(beside, frames=60)))

@@ -15,8 +15,10 @@ from controllers.steering import steer
 from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
 from controllers.steering.pure_pursuit import PurePursuit
 from mapctl import curves
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command, CommandTrack
+from mapctl.skeleton import CANONICAL, Skeleton
 
 
 def steered(steps, command=AHEAD, **how):
@@ -286,3 +288,25 @@ def test_pursuit_is_both_ends_of_a_loop():
     state, _ = begun(pursuit.first)
     _, records = drive(state, pursuit, [pursuit], frames=10)
     assert len(records) == 3
+
+
+def test_obstacles_lead_the_direction_round_and_hold_joints_off():
+    state, _ = begun()
+    disc = (Obstacle((0.0, 1.2), 0.4),)
+    _, calm = steer.step(state, AHEAD)
+    _, led = steer.step(state, replace(AHEAD, obstacles=disc))
+    assert abs(led.steering_targets[-1].heading) > 0.05 > abs(calm.steering_targets[-1].heading)
+    names = {entry.name for entry in led.ledger.entries}
+    assert names == {entry.name for entry in calm.ledger.entries} | {"clear"}
+
+
+def test_obstacles_are_of_the_characters_own_metres():
+    """One of half the size is led round what is half as far and half as large, to the same side."""
+    turned = []
+    for size in (1.0, 0.5):
+        body = Skeleton(CANONICAL.names, CANONICAL.parents, size * CANONICAL.offsets)
+        state, _ = steer.begin(DENSITY, AHEAD, generator=generator(0), settings=QUICK, skeleton=body)
+        command = Command(1.2 * size, 0.0, obstacles=(Obstacle((0.05 * size, 1.4 * size), 0.6 * size),))
+        turned.append(steer.step(state, command)[1].steering_targets[-1].heading)
+    assert min(map(abs, turned)) > 0.05
+    assert turned[0] * turned[1] > 0
