@@ -6,7 +6,8 @@ from dataclasses import replace
 from controllers.steering.pure_pursuit import PurePursuit
 from controllers.steering.steer import SteerFrames
 from mapctl.curves.curve import Curve
-from mapctl.intent.steering import Command, SteeringLimits
+from mapctl.intent.steering import Command
+from mapctl.intent.steering_limits import SteeringLimits
 
 _ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops
 

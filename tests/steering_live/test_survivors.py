@@ -12,7 +12,8 @@ from tiny_steering import AHEAD, QUICK, begun
 
 from controllers.steering import loop, steer
 from controllers.steering.loop import LoopSettings
-from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
+from mapctl.intent.steering import Command, SteeringTarget
+from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.terms import FootContact
 

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import tiny_denoiser
 import tiny_infiller
+import tiny_path
 import tiny_transformer
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
@@ -29,7 +30,7 @@ from priors import checkpoints, tensor_files
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus, density_quality, run, run_files
-from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, pose_transformer, refiner
+from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, path, pose_transformer, refiner
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ MODELS = {
     ),
     "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
     "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
+    "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
 }
 
 

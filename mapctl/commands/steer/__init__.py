@@ -9,7 +9,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.command import Command
-from mapctl.intent.steering import SteeringLimits
+from mapctl.intent.steering_limits import SteeringLimits
 
 _TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
 

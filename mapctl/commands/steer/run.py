@@ -20,8 +20,9 @@ from mapctl.commands.steer import Steer
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import CommandTrack, SteeringLimits
+from mapctl.intent.steering import CommandTrack
 from mapctl.intent.steering_csv import read_commands
+from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.metrics.travel import measure_commands
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution, Status
