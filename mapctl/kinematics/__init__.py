@@ -62,6 +62,13 @@ def heading(hips_world_quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*
     return rotations.split_heading(hips_world_quat_xyzw)[0]
 
 
+def heading_of_matrix(hips_world_matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Return the facing angle as `heading` does, radians, of rotation matrices; differentiable but upside down."""
+    across = hips_world_matrix[..., 0, 2] - hips_world_matrix[..., 2, 0]
+    trace = hips_world_matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+    return rotations.wrap_angle(2 * torch.atan2(across, 1 + trace))
+
+
 def positions_from_matrices(
     skeleton: Skeleton, local_matrix: Float[Tensor, "*batch joints 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:

@@ -10,7 +10,7 @@ from methods import UNFINISHED
 from tiny_path import ToldPath, tiny_path
 
 from controllers import retraced
-from controllers.inbetweening.geometry.path_closing import close_path
+from mapctl.inbetweening.path_closing import close_path
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
 from mapctl.errors import RequestError

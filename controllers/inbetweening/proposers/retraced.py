@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from controllers.inbetweening.geometry.path_closing import close_path
+from mapctl.inbetweening.path_closing import close_path
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory

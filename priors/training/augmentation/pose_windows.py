@@ -65,28 +65,39 @@ class PoseWindows:
             chosen = torch.rand(batch, generator=generator) < variation.share
             change = variation.tempo * (2 * torch.rand(batch, generator=generator) - 1)
             tempo = torch.where(chosen, 1 + change, 1.0)
-        span = 1 + ((frames - 1) * tempo).ceil().long()
-        room = (self.lengths - int(span.max()) + 1).clamp_min(0).float()
-        if not bool(room.any()):
-            raise RequestError(f"no clip is as long as the window of {int(span.max())} frames")
-        clip = torch.multinomial(room * self.weights, batch, replacement=True, generator=generator)
-        first = (torch.rand(batch, generator=generator) * (self.lengths[clip] - span + 1)).long()
+        clip, first = self.pick(1 + ((frames - 1) * tempo).ceil().long(), generator)
         window = self.at(clip, first, frames, tempo)
         mirrored = torch.rand(batch, generator=generator) < 0.5
-        window = _choose(mirrored, window.mirrored(), window)
+        window = choose_rows(mirrored, window.mirrored(), window)
         if variation is None:
             return window
         return _reshape_bodies(window, variation, generator)
+
+    def pick(
+        self, span: Int[Tensor, " batch"], generator: torch.Generator
+    ) -> tuple[Int[Tensor, " batch"], Int[Tensor, " batch"]]:
+        """Pick clips, and the first frames of windows of so many frames in them; RequestError where no clip is so
+        long."""
+        room = (self.lengths - int(span.max()) + 1).clamp_min(0).float()
+        if not bool(room.any()):
+            raise RequestError(f"no clip is as long as the window of {int(span.max())} frames")
+        clip = torch.multinomial(room * self.weights, len(span), replacement=True, generator=generator)
+        return clip, (torch.rand(len(span), generator=generator) * (self.lengths[clip] - span + 1)).long()
 
     def at(
         self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], frames: int, tempo: Float[Tensor, " batch"]
     ) -> PartialMotion:
         """From these frames of these clips on, in steps of `tempo` frames."""
         time = first[:, None] + torch.arange(frames) * tempo[:, None].double()
+        return self.gather(clip[:, None].expand_as(time), time)
+
+    def gather(self, clip: Int[Tensor, "batch frames"], time: Float[Tensor, "batch frames"]) -> PartialMotion:
+        """Gather frames of any clips; times are in frames and may lie between two, those beyond a clip's last frame
+        show that."""
         low = time.floor().long()
         weight = (time - low).float()
-        last = self.lengths[clip][:, None] - 1
-        one, other = (self.starts[clip][:, None] + at.minimum(last) for at in (low, low + 1))
+        last = self.lengths[clip] - 1
+        one, other = (self.starts[clip] + at.minimum(last) for at in (low, low + 1))
         nearest = torch.where(weight < 0.5, one, other)
         quats, after = self.quats[one], self.quats[other]
         after = torch.where((quats * after).sum(dim=-1, keepdim=True) < 0, -after, after)
@@ -95,7 +106,7 @@ class PoseWindows:
         height = torch.lerp(self.height[one], self.height[other], weight[..., None])
         root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
         heading = torch.lerp(self.heading[one], self.heading[other], weight)
-        batch = len(clip)
+        batch, frames = clip.shape
         offsets = CANONICAL.offsets.float().expand(batch, -1, -1)
         known = KnownParts.whole(torch.ones(batch, frames, dtype=torch.bool))
         targets = torch.zeros(batch, frames, len(EFFECTORS), 3)
@@ -112,7 +123,7 @@ def find_kind(name: str, kinds: Sequence[str]) -> int:
     return next((number for number, kind in enumerate(kinds) if re.search(kind, name)), len(kinds))
 
 
-def _choose(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> PartialMotion:
+def choose_rows(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> PartialMotion:
     """Take rows of one where they are chosen, of the other elsewhere; both know everything."""
 
     def pick(name: str) -> Tensor:

@@ -1,0 +1,31 @@
+"""A generator of long in-betweens of a few kilobytes, with drawn weights."""
+
+from pathlib import Path
+
+import tiny_path
+import torch
+
+from priors import checkpoints
+from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
+
+CONFIG = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
+
+
+def network(*, seed: int = 0, drawn: float = 0.05) -> GeneratorNetwork:
+    """With weights of this seed; those of the last layer are drawn with this spread."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        made = GeneratorNetwork(CONFIG)
+        torch.nn.init.normal_(made.last.weight, std=drawn)
+    return made.eval().requires_grad_(False)
+
+
+def card(path: str = "") -> checkpoints.Card:
+    """Of the tiny tweener, which was trained with the path predictor of this hash."""
+    return checkpoints.Card(
+        "tweener",
+        CONFIG.as_card(),
+        licence="none, it is made up",
+        data={"path": path},
+        **checkpoints.Card.layout_fields(),
+    )
