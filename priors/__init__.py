@@ -14,7 +14,9 @@ from priors.pose_transformer import inbetweener as pose_transformer
 from priors.pose_transformer.inbetweener import PoseTransformer
 from priors.refiner import network as refiner_network
 from priors.refiner.network import LstmRefiner
+from priors.tweening import inbetweener as tweening
 from priors.tweening import path as path_network
+from priors.tweening.inbetweener import Tweener
 from priors.tweening.path import ConvPathPredictor
 
 AUTO = ("locomotion", "general")
@@ -48,19 +50,25 @@ def load_infiller(name: str) -> ConvInfiller:
     return infiller_network.load(name)
 
 
-def load_inbetweener(name: str = "transformer") -> ConvInfiller | PoseTransformer:
-    """The bundled pose transformer, or a trained transformer or infiller by its file or run folder; CheckpointError for
-    anything else."""
+def load_inbetweener(name: str = "transformer", path: str = "path") -> ConvInfiller | PoseTransformer | Tweener:
+    """The bundled pose transformer or tweener, or a trained transformer, infiller or tweener by its file or run folder;
+    CheckpointError for anything else. A tweener goes by the path predictor `path`."""
     path = checkpoints.locate(name)
     kind = checkpoints.read_card(path.with_suffix(".json")).kind
-    if kind not in _INBETWEENERS:
+    if kind not in (*_INBETWEENERS, "tweener"):
         raise CheckpointError(f"{path}: a {kind} is no in-betweener")
-    return _INBETWEENERS[kind](name)
+    return load_tweener(name, path) if kind == "tweener" else _INBETWEENERS[kind](name)
 
 
 def load_transformer(name: str = "transformer") -> PoseTransformer:
     """The bundled pose transformer, or a trained one by its file or run folder."""
     return pose_transformer.load(name)
+
+
+def load_tweener(name: str = "tweener", path: str = "path") -> Tweener:
+    """The bundled generator of long in-betweens, or a trained one by its file or run folder, with the path predictor
+    that it was trained with."""
+    return tweening.load(name, path)
 
 
 def load_path(name: str = "path") -> ConvPathPredictor:

@@ -1,8 +1,5 @@
 """A generator of long in-betweens of a few kilobytes, with drawn weights."""
 
-from pathlib import Path
-
-import tiny_path
 import torch
 
 from priors import checkpoints

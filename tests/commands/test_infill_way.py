@@ -76,7 +76,7 @@ def test_a_whole_clip_may_be_walked_in_place(clip, path, tmp_path):
         (["--way", "0:60", "--gap", "10:20"], "lost over all frames of a motion whose joints are lost as well"),
         (["--way", "0:60", "--joints", "leftHand"], "lost over all frames of a motion whose joints are lost as well"),
         (["--way", "5:20", "--curve", "line:3"], "--way and --curve both say where the hips go"),
-        (["--gap", "5:20"], "--path predicts the hips' place where --way says that it is lost"),
+        (["--gap", "5:20"], "--path predicts the hips' place for --way and for --method tweener"),
         (["--way", "5:20", "--path", "nobody"], "no prior 'nobody'"),
         (["--way", "5:20", "--path", "denoiser"], "a denoiser is no path"),
     ],

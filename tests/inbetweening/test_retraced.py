@@ -10,11 +10,11 @@ from methods import UNFINISHED
 from tiny_path import ToldPath, tiny_path
 
 from controllers import retraced
-from mapctl.inbetweening.path_closing import close_path
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.path_closing import close_path
 from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, leg_length

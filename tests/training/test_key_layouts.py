@@ -1,5 +1,7 @@
 """Sequences of keys that the generator of long in-betweens is trained on."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from helpers import corpus, generator
@@ -19,7 +21,7 @@ def windows():
 def gaps_of(known):
     """Last frame of a key, and the first of the next."""
     frames = known.nonzero()[:, 0].tolist()
-    return [(one, other) for one, other in zip(frames, frames[1:], strict=False) if other > one + 1]
+    return [(one, other) for one, other in pairwise(frames) if other > one + 1]
 
 
 def draw(windows, seed, progress=1.0, settings=SETTINGS):

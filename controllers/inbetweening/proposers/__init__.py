@@ -25,15 +25,18 @@ class ModelLoaders:
     """Loaders of the models that an in-betweener needs, called when it needs them."""
 
     network: Callable[[str], Inbetweener]
-    """Loader of the network that a method asks for: `infiller`, `transformer`, or `auto` for whichever is given."""
+    """Loader of the network that a method asks for by its own name; of whichever is given for `auto`."""
     densities: Callable[[], Sequence[Density]]
     """Loader of the densities for rollouts."""
+    tweener: Callable[[], Inbetweener | None]
+    """Loader of the network for long gaps that `auto` takes beside the other; None without one."""
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
-    "auto": lambda models: AutoInbetweener(models.network("auto"), models.densities()),
+    "auto": lambda models: AutoInbetweener(models.network("auto"), models.densities(), tweener=models.tweener()),
     "transformer": lambda models: models.network("transformer"),
     "infiller": lambda models: models.network("infiller"),
+    "tweener": lambda models: models.network("tweener"),
     "rollouts": lambda models: RolloutInbetweener(models.densities(), models.network("auto")),
     "slerp": lambda models: SlerpInbetweener(),
 }

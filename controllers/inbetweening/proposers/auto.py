@@ -46,6 +46,8 @@ class ChoiceSettings:
     """Known frames on both sides of a gap that are enough context for the network."""
     known: int = 60
     """Frames of the longest gap with enough context in which only the network is tried."""
+    long: int = 75
+    """Frames of the shortest gap between whole poses that is a tweener's."""
     acceptable_cost: float = 0.2
     """Cost, m/s, of a proposal below which no other one is tried."""
     tempos: tuple[float, ...] = (1.0, 0.94, 1.06)
@@ -98,6 +100,8 @@ class AutoInbetweener(Inbetweener):
     """Densities for rollouts; without any nothing is rolled."""
     settings: ChoiceSettings = field(default_factory=ChoiceSettings)
     """Thresholds and weights of the choice."""
+    tweener: Inbetweener | None = None
+    """In-betweener for long gaps between whole poses; without one they are the others'."""
 
     @property
     def rough(self) -> Inbetweener:
@@ -115,18 +119,32 @@ class AutoInbetweener(Inbetweener):
         gaps = [gap for gap in query.enclosed_gaps if not _has_enough_context(query, *gap, self.settings)]
         if self.takes_partial_keys:
             gaps = [gap for gap in gaps if not _has_partial_keys(query, *gap)]
+        long = self._propose_long(query, gaps, generator)
         roller = Roller.of(query, first, self.densities) if self.densities and gaps else None
         best, others = _Candidate(first.motion, first.contact_logits, first.source, 0.0), list(first.others)
         unfilled = {other.start: other.by for other in first.others}
         for start, stop in gaps:
             before = replace(best, by=unfilled.get(start, first.source))
-            best = _choose_candidate(query, before, roller, (start, stop), self.settings)
-            reason = next((other.reason for other in first.others if other.start == start), "")
+            if long is not None and _is_long(query, start, stop, self.settings):
+                best = _choose_still(query, _fill_from(long, before, (start, stop)), (start, stop), self.settings)
+            else:
+                best = _choose_candidate(query, before, roller, (start, stop), self.settings)
+            told = first.others if long is None or best.by != long.source else long.others
+            reason = next((other.reason for other in told if other.start == start), "")
             others.append(GapSource(start, stop, best.by, reason))
             if roller is not None:
                 roller.body, roller.contact_logits = query.to_unit_size(best.body), best.contact_logits
         chosen = replace(first, motion=best.body, contact_logits=best.contact_logits, others=tuple(others))
         return extrapolate_end(query, chosen, self.densities, RolloutSettings())
+
+    def _propose_long(
+        self, query: GapQuery, gaps: Sequence[tuple[int, int]], generator: torch.Generator | None
+    ) -> Proposal | None:
+        """Return the tweener's proposal, where there is a tweener and a gap for it."""
+        if self.tweener is None or query.keep_trajectory:
+            return None
+        wanted = any(_is_long(query, *gap, self.settings) for gap in gaps)
+        return self.tweener.propose(query, generator=generator) if wanted else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +172,25 @@ def _has_partial_keys(query: GapQuery, start: int, stop: int) -> bool:
     edges = [start - 1, stop]
     partly = missing.joints[edges].any() | missing.root[edges].any()
     return bool(partly) or (targets is not None and bool(targets.wanted[start:stop].any()))
+
+
+def _is_long(query: GapQuery, start: int, stop: int, settings: ChoiceSettings) -> bool:
+    """Return whether a gap is a tweener's: long, and without partial keys."""
+    return stop - start >= settings.long and not _has_partial_keys(query, start, stop)
+
+
+def _fill_from(proposal: Proposal, before: _Candidate, gap: tuple[int, int]) -> _Candidate:
+    """Fill a gap as another proposal has it."""
+    part, body, logits = slice(*gap), before.body, before.contact_logits.clone()
+    root, quats = body.root_position.clone(), body.local_quat_xyzw.clone()
+    root[part], quats[part] = proposal.motion.root_position[part], proposal.motion.local_quat_xyzw[part]
+    logits[part] = proposal.contact_logits[part].to(logits)
+    return _Candidate(replace(body, root_position=root, local_quat_xyzw=quats), logits, proposal.source, 0.0)
+
+
+def _choose_still(query: GapQuery, made: _Candidate, gap: tuple[int, int], settings: ChoiceSettings) -> _Candidate:
+    """Hold the pose where the body stands still; else take what is made."""
+    return _hold_pose(query, made, gap) if _is_standing_still(query, *gap, settings) else made
 
 
 def _choose_candidate(

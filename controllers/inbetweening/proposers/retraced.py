@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from mapctl.inbetweening.path_closing import close_path
 from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.path_closing import close_path
 from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.kinematics import heading

@@ -40,8 +40,8 @@ def _check(command: Infill) -> None:
     options.check_seed(command.seed)
     if command.way and command.curve is not None:
         raise RequestError("--way and --curve both say where the hips go; choose one")
-    if command.path is not None and not command.way:
-        raise RequestError("--path predicts the hips' place where --way says that it is lost; leave it out")
+    if command.path is not None and not command.way and command.method != "tweener":
+        raise RequestError("--path predicts the hips' place for --way and for --method tweener; leave it out")
     if command.curve is not None and command.method in ("slerp", "rollouts"):
         raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
     finish, prior = not command.no_finish, command.prior
@@ -94,7 +94,7 @@ def _run_infilling(
 
 
 def _build_inbetweener(command: Infill) -> Inbetweener:
-    return build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior))
+    return build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior, command.path))
 
 
 def _tell(command: Infill, done: InbetweenSolution) -> None:

@@ -42,7 +42,7 @@ def check_method(method: str, *, finish: bool, prior: str | None = None, inbetwe
         raise RequestError("--method slerp knows no network; leave --inbetweener out")
 
 
-def load_models(inbetweener: str | None, prior: str | None) -> ModelLoaders:
+def load_models(inbetweener: str | None, prior: str | None, path: str | None = None) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones; RequestError for a network that is not of the
     kind that the method asks for.
     """
@@ -52,13 +52,15 @@ def load_models(inbetweener: str | None, prior: str | None) -> ModelLoaders:
             raise RequestError(
                 "no infiller is bundled; name one that `mapctl train infiller` made by --inbetweener RUN"
             )
-        network = priors.load_inbetweener(inbetweener or "transformer")
-        wanted = {"infiller": "infiller", "transformer": "pose-transformer"}.get(method, network.card.kind)
+        usual = "tweener" if method == "tweener" else "transformer"
+        network = priors.load_inbetweener(inbetweener or usual, path or "path")
+        kinds = {"infiller": "infiller", "transformer": "pose-transformer", "tweener": "tweener"}
+        wanted = kinds.get(method, network.card.kind)
         if network.card.kind != wanted:
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
         return network
 
-    return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"))
+    return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"), priors.load_tweener)
 
 
 def conclude(status: Status, *, strict: bool) -> int:

@@ -16,7 +16,7 @@ class TrainTweener(ParallelOptions):
     """Train a tweener, which makes motion between keys that are seconds apart."""
 
     model = "tweener"
-    used_by = "use it with mapctl tween --method tweener --tweener"
+    used_by = "use it with mapctl tween --method tweener --inbetweener"
 
     path: Annotated[str, arg(metavar="NAME")] = "path"
     """Path predictor, bundled or trained, that tells where the hips go in what is made."""

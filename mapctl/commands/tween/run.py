@@ -32,7 +32,8 @@ def run(command: Tween) -> int:
     request = _read_key_request(command)
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     clip = _read_keyframe_clip(command, request)
-    models, make = results.load_models(command.inbetweener, command.prior), _prepare_tweening(command, clip)
+    models = results.load_models(command.inbetweener, command.prior, command.path)
+    make = _prepare_tweening(command, clip)
     if command.variations > 1:
         ok = variations.run_variations(command, clip, make, models)
         return exit_status.NOT_SATISFIED if command.strict and not ok else 0
@@ -88,6 +89,8 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
         raise RequestError(f"{unused[0]} is for motion files; {command.source} says itself what its keys are")
     if not _is_key_file(command) and command.keyframes is None:
         raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
+    if command.path is not None and command.method != "tweener":
+        raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
     variations.check_answers(command, given)
     # Variations are rollouts of a density with every method.
     prior = command.prior if command.variations == command.best_of == 1 else None

@@ -1,0 +1,136 @@
+"""The tweener as an in-betweener: poses from the generator, the hips' way from the path predictor, exact keys."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import contacts, rotations
+from mapctl.errors import CheckpointError
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening import GapQuery, PositionImage, Proposal
+from mapctl.inbetweening.path_closing import close_path
+from mapctl.inbetweening.query import GapSource
+from mapctl.inbetweening.root_trajectory import LocalMotion
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
+from mapctl.numerics.smooth_offsets import interpolate_offsets
+from mapctl.protocols import Inbetweener, PathPredictor
+from mapctl.skeleton import TOE_JOINTS
+from priors import checkpoints
+from priors.tweening import path as path_predictor
+from priors.tweening.generator import MAX_KEY_FRAMES, GeneratorConfig, GeneratorNetwork
+from priors.tweening.keys import see_contacts
+
+SOURCE = "tweener"
+"""Name of the in-betweener in notes."""
+_KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
+
+
+@dataclass(frozen=True, eq=False)
+class Tweener(Inbetweener):
+    """A trained generator of long in-betweens with the path predictor that it was trained with."""
+
+    name: str
+    """Name under which it was loaded."""
+    network: GeneratorNetwork
+    """Network in evaluation mode."""
+    path: PathPredictor
+    """Predictor of where the hips go."""
+    card: checkpoints.Card
+    """Card of the weights."""
+    style: Float[Tensor, " style"] | None = field(default=None)
+    """What the network's style encoder makes of a motion's poses; None leaves the style to the keys."""
+
+    @torch.no_grad()
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose poses of the whole motion at once, and lead the hips by them, without sampling.
+
+        What keys were missed by is made good by the smoothest offsets of joints' rotations; what the way misses a known
+        place by is spread in proportion to the way walked. Effector targets are ignored.
+        """
+        shown, missing = query.motion, query.missing
+        image, origin = _show(query)
+        style = torch.zeros(1, self.network.config.style) if self.style is None else self.style[None]
+        local = self.network(image, style).turn_to_world(image).local_matrix[0]
+        made = rotations.from_matrix(local.double())
+        quats = torch.where(missing.joints[..., None], _meet_keys(made, query), shown.local_quat_xyzw)
+        body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
+        root, logits = self._lead(body, query, origin)
+        root = torch.where(missing.root[:, None], root * query.scale, shown.root_position)
+        motion = replace(query.to_character(body), root_position=root)
+        known = image.known[0][:, list(TOE_JOINTS)]
+        planted = contacts.to_logits(contacts.detect_contacts(body.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS))
+        return Proposal(motion, torch.where(known, planted, logits), SOURCE, tuple(_find_too_long(query)))
+
+    def _lead(
+        self, body: Motion, query: GapQuery, origin: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 2"]]:
+        """Lead the hips by how the body moves, from known place to known place, in metres at unit size; also returns
+        the contacts' logits."""
+        facing = heading(body.local_quat_xyzw[:, 0])
+        still = replace(body, root_position=torch.zeros_like(body.root_position))
+        seen = still.joint_positions().float()[None]
+        predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
+        way = predicted.integrate(facing.float()[None])[0].double()
+        led = close_path(way, body.root_position - origin, query.missing.root) + origin
+        if query.keep_trajectory:
+            led = torch.cat([body.root_position[:, :1], led[:, 1:2], body.root_position[:, 2:]], dim=-1)
+        return led, predicted.contacts[0]
+
+
+def _show(query: GapQuery) -> tuple[PositionImage, Float[Tensor, " 3"]]:
+    """Return the query as the network takes it, of unit size and near the origin, and where that origin is."""
+    body, known = query.to_unit_size(query.motion), query.known_positions
+    placed = known[:, 0].nonzero()[:, 0]
+    origin = body.root_position[placed[0] if len(placed) else 0] * torch.tensor([1.0, 0.0, 1.0]).double()
+    places = body.joint_positions()
+    planted = contacts.detect_contacts(places[:, list(TOE_JOINTS)], PRIOR_FPS).float()
+    image = PositionImage.of_world(
+        (places - origin).float()[None],
+        heading(body.local_quat_xyzw[:, 0]).float()[None],
+        see_contacts(planted[None], known.all(dim=1)[None]),
+        known=known[None],
+        present=torch.ones(1, len(places), dtype=torch.bool),
+        toes=TOE_JOINTS,
+    )
+    return image, origin
+
+
+def _meet_keys(made: Float[Tensor, "frames joints 4"], query: GapQuery) -> Float[Tensor, "frames joints 4"]:
+    """Turn joints, smoothly over the frames around, until they are as they are known to be."""
+    wanted, known = query.motion.local_quat_xyzw, ~query.missing.joints
+    off = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(made), wanted))
+    offsets = torch.zeros_like(off)
+    for pattern in known.T.unique(dim=0):
+        joints = (pattern == known.T).all(dim=1)
+        if bool(pattern.any()):
+            values = torch.where(pattern[:, None], off[:, joints].flatten(1), 0.0)
+            solved = interpolate_offsets(values, pattern, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
+            offsets[:, joints] = solved.unflatten(1, (-1, 3))
+    return rotations.multiply(made, rotations.from_rotation_vector(offsets))
+
+
+def _find_too_long(query: GapQuery) -> Iterator[GapSource]:
+    """Yield gaps in which nothing is known and that are longer than the network sees."""
+    reason = f"longer than the {MAX_KEY_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} sees; give more keys"
+    for _, start, stop in true_intervals(query.nothing_known[:, None]):
+        if stop - start > MAX_KEY_FRAMES:
+            yield GapSource(start, stop, SOURCE, reason)
+
+
+def load(name: str = "tweener", path: str = "path") -> Tweener:
+    """Load the bundled tweener, or a trained one by its file or run folder, with the path predictor that it was trained
+    with; CheckpointError for anything else, and for another path predictor."""
+    with checkpoints.open_checkpoint(name, "tweener") as (tensors, card):
+        network = GeneratorNetwork(GeneratorConfig.of_card(card.config))
+        network.load_state_dict(tensors)
+    wanted, found = card.data.get("path"), path_predictor.compute_hash(path)
+    if wanted != found:
+        raise CheckpointError(
+            f"{name} was trained with the path predictor {wanted}; {path} is {found}: name it by --path"
+        )
+    return Tweener(name, network.eval().requires_grad_(False), path_predictor.load(path), card)
