@@ -37,12 +37,14 @@ _UP_RATIOS = ((1.4, 1.6), (2.2, 2.8), (3.6, 4.6), (5.8, 7.2), (8.8, 10.6), (12.6
 class GeneratorConfig(NetworkConfig):
     """Shape of the network."""
 
-    widths: tuple[int, ...] = (96, 128, 192, 256, 288, 320)
+    widths: tuple[int, ...] = (96, 128, 192, 256, 288, 288)
     """Channels of the encoder's layers, each of which halves the frames."""
-    up_widths: tuple[int, ...] = (320, 288, 256, 192, 128, 96)
+    up_widths: tuple[int, ...] = (288, 288, 256, 192, 128, 96)
     """Channels of the decoder's stages, each of which doubles them."""
     style: int = 128
     """Numbers of the vector that a motion's style becomes."""
+    skips: bool = True
+    """Whether the decoder's stages also see what the encoder was given at their rate, which the paper's do not."""
 
     def __post_init__(self):
         if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES or min(*self.widths, *self.up_widths) < 1:
@@ -51,7 +53,7 @@ class GeneratorConfig(NetworkConfig):
             raise RequestError(f"a generator needs a style of at least one number, got {self.style}")
 
 
-PAPER = GeneratorConfig((384, 384, 512, 512, 768, 1024), (1024, 768, 768, 512, 512, 512), style=1024)
+PAPER = GeneratorConfig((384, 384, 512, 512, 768, 1024), (1024, 768, 768, 512, 512, 512), style=1024, skips=False)
 """Sizes of Zhou et al. 2020, table 5."""
 
 
@@ -111,6 +113,10 @@ class GeneratorNetwork(nn.Module):
             for channels, ratio in zip(zip((INPUT_ROWS, *widths[:-1]), widths, strict=True), _DOWN_RATIOS, strict=True)
         )
         self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths))
+        seen = reversed((INPUT_ROWS, *widths[:-1]))
+        self.skips = nn.ModuleList(
+            nn.Conv1d(ins, outs, 1) for ins, outs in zip(seen, self.config.up_widths, strict=True) if self.config.skips
+        )
         # Without a PReLU, which would halve the angles on one side.
         self.last = nn.Conv1d(self.config.up_widths[-1], POSE_ROWS, 3, padding=1)
         self.kinematics = RangeConstrainedKinematics()
@@ -133,11 +139,17 @@ class GeneratorNetwork(nn.Module):
         frames, hidden = rows.shape[-1], pad(rows, (0, -rows.shape[-1] % _STRIDE))
         responses: list[Tensor] = []
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            levels = []
             for layer in self.encoder:
+                levels.append(hidden)
                 hidden = layer(hidden, responses)
             hidden = torch.cat([hidden, style[..., None].expand(-1, -1, hidden.shape[-1]).to(hidden)], dim=1)
-            for layer in self.decoder:
-                hidden = layer(hidden, responses)
+            hidden = self.decoder[0](hidden, responses)
+            for stage in range(_STAGES):
+                for layer in self.decoder[1 + 2 * stage : 3 + 2 * stage]:
+                    hidden = layer(hidden, responses)
+                if self.config.skips:
+                    hidden = (hidden + self.skips[stage](levels[_STAGES - 1 - stage])) / math.sqrt(2)
             made = self.last(hidden)[..., :frames]
         return made.to(rows.dtype), tuple(responses)
 

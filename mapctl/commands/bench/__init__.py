@@ -142,7 +142,8 @@ class Tween(MocapTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Tweener(Table):
-    """The tables of Zhou et al. 2020 over clips that training did not see: how well the hips' trajectory is told."""
+    """The tables of Zhou et al. 2020 over clips that training did not see: how well the hips' trajectory is told, and
+    long gaps between two whole poses."""
 
     work = "mapctl.commands.bench.tweener.run"
 
@@ -152,6 +153,15 @@ class Tweener(Table):
     """Clips, spread over the kinds."""
     path: options.Name = "path"
     """The bundled path predictor, or the file or run folder of a trained one."""
+    tweener: options.MaybeName = None
+    """For long gaps: the bundled tweener, or the file or run folder of a trained one; without one the table is that of
+    the path predictor."""
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
+    """Other in-betweeners to compare in long gaps, bundled or trained."""
+    seconds: Annotated[str, arg(metavar="S,S,...")] = "6.4"
+    """Long gaps, seconds."""
+    raw: bool = False
+    """Leave out the rows that a MAP stage finishes."""
 
 
 @dataclass(frozen=True, kw_only=True)
