@@ -53,10 +53,10 @@ def load_infiller(name: str) -> ConvInfiller:
 def load_inbetweener(name: str = "transformer", path: str = "path") -> ConvInfiller | PoseTransformer | Tweener:
     """The bundled pose transformer or tweener, or a trained transformer, infiller or tweener by its file or run folder;
     CheckpointError for anything else. A tweener goes by the path predictor `path`."""
-    path = checkpoints.locate(name)
-    kind = checkpoints.read_card(path.with_suffix(".json")).kind
+    found = checkpoints.locate(name)
+    kind = checkpoints.read_card(found.with_suffix(".json")).kind
     if kind not in (*_INBETWEENERS, "tweener"):
-        raise CheckpointError(f"{path}: a {kind} is no in-betweener")
+        raise CheckpointError(f"{found}: a {kind} is no in-betweener")
     return load_tweener(name, path) if kind == "tweener" else _INBETWEENERS[kind](name)
 
 

@@ -8,6 +8,7 @@ from linear_inbetweener import LinearInbetweener
 from tiny_infiller import tiny_infiller
 from tiny_refiner import refiner_of
 from tiny_transformer import tiny_transformer
+from tiny_tweener import tiny_tweener
 from toy_density import toy_density
 
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
@@ -159,6 +160,8 @@ INBETWEENERS: dict[str, Inbetweener] = {
     "rollouts": RolloutInbetweener([tiny_density()], SlerpInbetweener(), _QUICK),
     "auto": AutoInbetweener(tiny_infiller(drawn=0.02), [tiny_density()]),
     "auto with the transformer": AutoInbetweener(tiny_transformer(drawn=0.05), [tiny_density()]),
+    "tweener": tiny_tweener(),
+    "auto with the tweener": AutoInbetweener(tiny_transformer(drawn=0.05), [tiny_density()], tweener=tiny_tweener()),
     "linear": LinearInbetweener(),
 }
 """One of each method, and one that knows only `mapctl.protocols`."""

@@ -1,9 +1,15 @@
 """A generator of long in-betweens of a few kilobytes, with drawn weights."""
 
+from pathlib import Path
+
+import tiny_path
 import torch
 
+from mapctl.protocols import PathPredictor
 from priors import checkpoints
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
+from priors.tweening.inbetweener import Tweener
+from priors.tweening.path import compute_hash
 
 CONFIG = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
 
@@ -26,3 +32,15 @@ def card(path: str = "") -> checkpoints.Card:
         data={"path": path},
         **checkpoints.Card.layout_fields(),
     )
+
+
+def tiny_tweener(*, seed: int = 0, path: PathPredictor | None = None) -> Tweener:
+    """As the controllers take it."""
+    return Tweener("tiny", network(seed=seed), path or tiny_path.tiny_path(), card())
+
+
+def save_tiny_tweener(path: Path, predictor: str) -> Path:
+    """Write the weights and the card, for this file of a path predictor; returns the path for --inbetweener."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    checkpoints.save(network().state_dict(), card(compute_hash(predictor)), path)
+    return path

@@ -11,6 +11,7 @@ import pytest
 import tiny_denoiser
 import tiny_infiller
 import tiny_transformer
+import tiny_tweener
 from helpers import killing, run
 
 import priors
@@ -29,7 +30,9 @@ from priors.training.recipes.pose_transformer import (
     PoseTransformerSettings,
     PoseTransformerTrainer,
 )
+from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings, TweenerTrainer
 from priors.training.run import train
+from priors.tweening.generator import GeneratorConfig
 from priors.tweening.path import PathConfig
 
 
@@ -98,6 +101,15 @@ MODELS = (
         PathConfig(width=5),
         PathSettings(),
         (("--width", "12"), PathConfig(width=12)),
+    ),
+    Model(
+        TweenerRecipe,
+        TweenerTrainer,
+        priors.load_tweener,
+        tiny_tweener.CONFIG,
+        replace(tiny_tweener.CONFIG, style=6),
+        TweenerSettings(),
+        (("--plain",), GeneratorConfig(skips=False)),
     ),
 )
 

@@ -23,7 +23,7 @@ from priors.training.recipes.tweener import (
 from priors.tweening.generator import GeneratedPoses, GeneratorNetwork
 from priors.tweening.range_constrained import ConstrainedPose
 
-SETTINGS = TweenerSettings(steps=40, batch=512, learning_rate=3e-3, layout=KeySettings(longest=60.0))
+SETTINGS = TweenerSettings(steps=30, batch=96, learning_rate=1e-2, layout=KeySettings(longest=60.0))
 ERRORS = ("places_cm", "pace_cm", "feet_cm", "keys_cm", "turns")
 
 

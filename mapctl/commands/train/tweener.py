@@ -20,19 +20,18 @@ class TrainTweener(ParallelOptions):
 
     path: Annotated[str, arg(metavar="NAME")] = "path"
     """Path predictor, bundled or trained, that tells where the hips go in what is made."""
+    plain: bool = False
+    """The network without the connections past its narrow middle, as in the paper, to compare."""
 
     def recipe(self) -> "TweenerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
-        from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings
+        from priors.training.recipes.tweener import GeneratorConfig, TweenerRecipe, TweenerSettings
 
         common = self.common()
-        given = self.select_given("steps", "batch", "seed", "learning_rate")
-        if self.window is not None:
-            from mapctl.errors import RequestError
-
-            raise RequestError("a tweener's windows are as long as their keys are apart: it takes no --window")
+        given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
         return TweenerRecipe(
             **common,
+            config=replace(GeneratorConfig(), skips=not self.plain),
             settings=replace(TweenerSettings(), bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,

@@ -38,7 +38,7 @@ VALIDATED_FRAMES = 192
 """Frames of the gap that is validated, 6.4 s; of shorter clips all but the ends."""
 _SHORTEST_VALIDATED = 90
 _VALIDATED_OF_KIND = 24
-_SHORTEST_WINDOW, _LONGEST_WINDOW = 48, 330  # frames
+_SHORTEST_WINDOW, _LEAST_WINDOW = 48, 32  # frames
 _SHORTEST_SPLICE, _LONGEST_SPLICE = 192, 1024  # frames
 _HALF_WEIGHT_FRAMES = 60.0  # away from the nearest key
 _MIN_STD = 0.05  # metres
@@ -57,6 +57,8 @@ class TweenerSettings:
     """Frames an update."""
     spliced: float = 0.3
     """Share of them in sequences that are spliced of several clips; the others are in windows of one."""
+    window: int = 330
+    """Frames of the longest window of one clip; of those the shortest have 48."""
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
     places: float = 10.0
@@ -96,6 +98,7 @@ class TweenerSettings:
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch")
+        require_at_least(self, _LEAST_WINDOW, "window")
 
 
 class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
@@ -105,7 +108,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         self.settings, self.path = settings, path
         self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         fits = int(int(self.windows.lengths.max()) / (1 + settings.tempo)) - 1
-        self.longest = min(_LONGEST_WINDOW, fits)
+        self.longest = min(settings.window, fits)
         super().__init__(
             lambda: GeneratorNetwork(config, bfloat16=settings.bfloat16),
             steps=settings.steps,
@@ -123,7 +126,8 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         settings = self.settings
         progress = self.step / settings.steps
         reach = round(1.25 * settings.layout.longest_at(progress))
-        frames = self._draw_frames(_SHORTEST_WINDOW, min(self.longest, _SHORTEST_WINDOW + reach))
+        shortest = min(_SHORTEST_WINDOW, self.longest)
+        frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
         one = draw_windows(
             self.windows,
             max(1, round((1 - settings.spliced) * settings.batch / frames)),
@@ -211,6 +215,10 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
         """What is written at the end: the card tells the path predictor it was trained with."""
         done = super().export(trainer, gathered, curve)
         return replace(done, data={**done.data, "path": path_predictor.compute_hash(self.path)})
+
+    def format_shape(self) -> list[str]:
+        """Whether it is the paper's plain network."""
+        return [] if self.config.skips else ["--plain"]
 
     def format_command(self) -> str:
         """What to type for the same run, for the card."""
@@ -306,7 +314,7 @@ def _compute_path_terms(trajectory: RootTrajectory, heading: Tensor, sequences: 
     made = trajectory.integrate(heading)
     steps = truthful.float()
     errors = []
-    for span in _PATH_SPANS:
+    for span in [span for span in _PATH_SPANS if span < steps.shape[1]]:
         whole = steps.unfold(1, span + 1, 1).amin(dim=-1)
         errors.append(_average(compute_displacement_errors(made[..., ::2], hips[..., ::2], span), whole))
     height = _average((made[..., 1] - hips[..., 1]).abs(), steps)
