@@ -16,6 +16,7 @@ from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import LocalMotion
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
+from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.protocols import Inbetweener, PathPredictor
@@ -44,6 +45,11 @@ class Tweener(Inbetweener):
     """Card of the weights."""
     style: Float[Tensor, " style"] | None = field(default=None)
     """What the network's style encoder makes of a motion's poses; None leaves the style to the keys."""
+
+    @torch.no_grad()
+    def styled(self, dna: MotionDna) -> "Tweener":
+        """Return the in-betweener that moves as a motion of which these are poses."""
+        return replace(self, style=self.network.style(dna.poses[None])[0])
 
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:

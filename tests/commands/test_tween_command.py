@@ -8,7 +8,9 @@ from captures import on_rig
 from helpers import run
 from methods import words_of
 from tiny_infiller import save_tiny_infiller
+from tiny_path import save_tiny_path
 from tiny_prior import save_tiny_prior
+from tiny_tweener import save_tiny_tweener
 
 import mapctl
 
@@ -47,6 +49,21 @@ def test_keys_are_met_in_the_file(tween, source, tmp_path, method):
     assert mapctl.load(out).num_frames == FRAMES
     assert away_cm(source, out, (0, 17, 30, 44)) < 1e-4
     assert away_cm(source, out, range(FRAMES)) > 1
+
+
+def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path):
+    predictor = save_tiny_path(tmp_path / "path.safetensors")
+    trained = save_tiny_tweener(tmp_path / "tweener.safetensors", str(predictor))
+    on_rig("daz", 60).save(tmp_path / "style.bvh")
+    made = []
+    for name, words in (("plain", []), ("styled", ["--dna", tmp_path / "style.bvh"])):
+        out = tmp_path / f"{name}.bvh"
+        models = ["--inbetweener", trained, "--path", predictor]
+        given = [source, "-o", out, "--keyframes", "0,44", "--method", "tweener", "--no-finish", "--quiet"]
+        assert run("tween", *given, *models, *words) == 0
+        assert away_cm(source, out, (0, 44)) < 1e-4
+        made.append(out.read_bytes())
+    assert made[0] != made[1]
 
 
 def test_keys_may_be_seconds(tween, source, tmp_path):
@@ -124,6 +141,10 @@ def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_pat
             ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--no-finish", "--prior", "general"],
             "leave --prior out",
         ),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--dna", "in.bvh"], "leave --dna out"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "tweener", "--dna", "no.bvh"], "no.bvh"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "tweener"], "--method tweener takes no infiller"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--path", "x"], "--path predicts where the hips go"),
         (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

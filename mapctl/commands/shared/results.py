@@ -15,9 +15,11 @@ from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
+from mapctl.motion_dna import MotionDna
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
+from priors.tweening.inbetweener import Tweener
 from scenes.plots.denoising import film_side_by_side
 
 _SIZE = (1280, 720)
@@ -42,7 +44,9 @@ def check_method(method: str, *, finish: bool, prior: str | None = None, inbetwe
         raise RequestError("--method slerp knows no network; leave --inbetweener out")
 
 
-def load_models(inbetweener: str | None, prior: str | None, path: str | None = None) -> ModelLoaders:
+def load_models(
+    inbetweener: str | None, prior: str | None, path: str | None = None, dna: MotionDna | None = None
+) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones; RequestError for a network that is not of the
     kind that the method asks for.
     """
@@ -58,9 +62,15 @@ def load_models(inbetweener: str | None, prior: str | None, path: str | None = N
         wanted = kinds.get(method, network.card.kind)
         if network.card.kind != wanted:
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
-        return network
+        return network if dna is None or not isinstance(network, Tweener) else network.styled(dna)
 
-    return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"), priors.load_tweener)
+    def load_tweener() -> Inbetweener | None:
+        if "tweener" not in priors.list_bundled():
+            return None
+        tweener = priors.load_tweener()
+        return tweener if dna is None else tweener.styled(dna)
+
+    return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"), load_tweener)
 
 
 def conclude(status: Status, *, strict: bool) -> int:

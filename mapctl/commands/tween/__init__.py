@@ -37,6 +37,9 @@ class Tween(Command):
     pose where the body stands still, the tweener through gaps of seconds; a note on each gap names it. transformer,
     infiller, tweener: that network alone. rollouts: a density's rollouts, wherever nothing is known. slerp:
     interpolation."""
+    dna: Annotated[str | None, arg(metavar="CLIP,CLIP")] = None
+    """Motion files of any known rig whose poses tell the tweener its style: in all gaps with --method tweener, in those
+    that auto leaves to it."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     rig: options.MaybeRig = None

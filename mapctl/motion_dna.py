@@ -1,0 +1,70 @@
+"""Motion DNA: representative poses of a motion, which tell a generator its style (Zhou et al. 2020, section 3.5.1 and
+appendix D).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mapctl import retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL
+
+POSES = 8
+"""Poses that are taken of a motion unless another number is asked for."""
+_APART = PRIOR_FPS // 2  # frames between two of them, in a motion that is long enough
+
+
+@dataclass(frozen=True, eq=False)
+class MotionDna:
+    """Representative poses, in no order."""
+
+    poses: Float[Tensor, "poses joints 3"]
+    """Places of canonical joints from the hips without the hips' rotation, metres, on canonical bones."""
+
+
+def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> MotionDna:
+    """Take poses of a motion on any known rig: frames in which joints turn fastest, apart in time (appendix D).
+
+    RequestError for less than one pose, for a motion without frames, and for a rig that nobody knows.
+    """
+    if count < 1:
+        raise RequestError(f"motion DNA needs at least one pose, got {count}")
+    if motion.num_frames < 1:
+        raise RequestError("motion DNA needs a motion with frames")
+    canonical = retarget.to_canonical(motion, rig)[0].resample(PRIOR_FPS)
+    upright = canonical.local_quat_xyzw.clone()
+    upright[:, 0] = upright.new_tensor([0.0, 0.0, 0.0, 1.0])
+    bare = replace(
+        canonical, skeleton=CANONICAL, root_position=torch.zeros_like(canonical.root_position), local_quat_xyzw=upright
+    )
+    chosen = choose_frames(upright, count)
+    return MotionDna(bare.joint_positions()[chosen].float())
+
+
+def choose_frames(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int) -> Int[Tensor, " chosen"]:
+    """Choose up to so many frames in which joints turn fastest, as far apart as half a second where there is room."""
+    frames = len(local_quat_xyzw)
+    change = rotations.multiply(rotations.inverse(local_quat_xyzw[:-1]), local_quat_xyzw[1:])
+    turned = rotations.to_rotation_vector(change).norm(dim=-1).mean(dim=-1)
+    none = turned.new_zeros(1)
+    speed = torch.maximum(torch.cat([turned, none]), torch.cat([none, turned]))
+    apart = min(_APART, max(1, frames // count))
+    chosen: list[int] = []
+    for frame in speed.argsort(descending=True, stable=True).tolist():
+        if len(chosen) < count and all(abs(frame - other) >= apart for other in chosen):
+            chosen.append(frame)
+    return torch.tensor(sorted(chosen))
+
+
+def join(parts: Sequence[MotionDna]) -> MotionDna:
+    """Return the poses of several motions; RequestError for none."""
+    if not parts:
+        raise RequestError("motion DNA needs at least one motion")
+    return MotionDna(torch.cat([part.poses for part in parts]))

@@ -1,0 +1,59 @@
+"""Motion DNA: poses apart in time, of any rig, without where the hips are and face."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import on_rig
+from helpers import walk
+
+from mapctl import motion_dna, rotations
+from mapctl.errors import RequestError
+
+
+def test_poses_are_those_of_the_motion_apart_in_time():
+    motion = walk(120)
+    chosen = motion_dna.choose_frames(motion.local_quat_xyzw, 6)
+    assert len(chosen) == 6
+    assert int(torch.diff(chosen).min()) >= 15
+    dna = motion_dna.of(motion, 6)
+    assert dna.poses.shape == (6, 21, 3)
+    assert float(dna.poses[:, 0].abs().max()) == 0
+    bare = motion.local_quat_xyzw.clone()
+    bare[:, 0] = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
+    still = replace(motion, root_position=motion.root_position * 0, local_quat_xyzw=bare)
+    torch.testing.assert_close(dna.poses, still.joint_positions()[chosen].float())
+
+
+def test_the_fastest_frames_come_first():
+    motion = walk(100)
+    quats = motion.local_quat_xyzw[:1].repeat(100, 1, 1)
+    quats[60:] = rotations.multiply(quats[60:], rotations.about_y(torch.tensor(0.5).double()).expand(40, 21, 4))
+    assert int(motion_dna.choose_frames(quats, 1)) in (59, 60)
+
+
+def test_where_the_hips_are_and_face_does_not_matter():
+    motion = walk(60)
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, 0] = rotations.multiply(rotations.about_y(torch.tensor(1.0).double()).expand(60, 4), quats[:, 0])
+    moved = replace(motion, local_quat_xyzw=quats, root_position=motion.root_position + 7)
+    torch.testing.assert_close(motion_dna.of(motion).poses, motion_dna.of(moved).poses)
+
+
+def test_another_rig_s_poses_are_of_the_canonical_size():
+    own, other = (motion_dna.of(on_rig(rig, 60), 4).poses for rig in ("canonical", "daz"))
+    assert own.shape == other.shape
+    assert float((own - other).norm(dim=-1).max()) < 0.25
+
+
+def test_a_short_motion_has_as_many_poses_as_frames_at_most():
+    assert len(motion_dna.of(walk(3), 8).poses) == 3
+    both = motion_dna.join([motion_dna.of(walk(60), 3), motion_dna.of(walk(60), 2)])
+    assert len(both.poses) == 5
+
+
+def test_nothing_is_no_style():
+    with pytest.raises(RequestError, match="at least one pose"):
+        motion_dna.of(walk(20), 0)
+    with pytest.raises(RequestError, match="at least one motion"):
+        motion_dna.join([])
