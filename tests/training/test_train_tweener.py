@@ -13,13 +13,8 @@ from mapctl.metrics.liveliness import measure_liveliness, see_from_hips
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
-from priors.training.recipes.tweener import (
-    TweenerSettings,
-    TweenerTrainer,
-    compute_tweener_losses,
-    draw_style_poses,
-    measure_gap,
-)
+from priors.training.recipes.tweener import TweenerSettings, TweenerTrainer, draw_style_poses, measure_gap
+from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
 from priors.tweening.generator import GeneratedPoses, GeneratorNetwork
 from priors.tweening.range_constrained import ConstrainedPose
 
@@ -47,11 +42,11 @@ class Told(GeneratorNetwork):
         return GeneratedPoses(ConstrainedPose(local, places), ())
 
 
-def losses_of(sequences, windows, turned=0.0, settings=SETTINGS):
+def losses_of(sequences, windows, turned=0.0):
     poses = draw_style_poses(windows, sequences, generator())
     styled = torch.ones(len(poses), dtype=torch.bool)
     made = Told(sequences.motion, turned)
-    return compute_tweener_losses(made, tiny_path.network(), sequences, poses, styled, settings)
+    return compute_tweener_losses(made, tiny_path.network(), sequences, poses, styled, LossWeights())
 
 
 def one_window(windows, frames=100):
@@ -80,7 +75,7 @@ def test_between_keys_of_different_clips_only_keys_and_style_count(windows):
     quats = torch.where(hidden[..., None, None], sequences.motion.quats.roll(7, dims=1), sequences.motion.quats)
     root = torch.where(hidden[..., None], 3.0, sequences.motion.root_position)
     other = replace(sequences, motion=replace(sequences.motion, quats=quats, root_position=root))
-    generous = replace(SETTINGS, style=0.0)
+    generous = LossWeights(style=0.0)
     made = Told(sequences.motion)
     poses = draw_style_poses(windows, sequences, generator())
     styled = torch.zeros(2, dtype=torch.bool)
