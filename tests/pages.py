@@ -87,6 +87,8 @@ def shorten(line: str) -> list[str]:
         elif word in _SMALL:
             words[place + 1] = _SMALL[word]
         tiny.pop(word, None)
+        if word == "--method" and words[place + 1] == "tweener":
+            tiny.pop("--inbetweener")  # the bundled one, which is small
     if name == "measure" and "--curve" not in words:
         tiny.clear()
     return [*words, *(part for option in tiny.items() for part in option)]
