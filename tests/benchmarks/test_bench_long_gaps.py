@@ -1,0 +1,80 @@
+"""The bench of long gaps: ratios of sums beside mocap, of clips that are long enough."""
+
+import json
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from helpers import run, walk
+from tiny_path import save_tiny_path
+from tiny_tweener import card, network
+
+from controllers.benchmarks.tweener.long_gaps import Method, benchmark_long_gaps, cut_middle
+from controllers.inbetweening.pipeline import InfillSettings
+from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.query import estimate_contact_logits
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from priors import checkpoints
+from priors.tweening.path import compute_hash
+
+RAW = InfillSettings(finish=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Told(Inbetweener):
+    """Answers with a motion, or with its frames from the middle away from it at half the pace."""
+
+    truth: Motion
+    slow: bool = False
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        frame = torch.arange(query.motion.num_frames)
+        quats = self.truth.local_quat_xyzw[frame // 2 if self.slow else frame]
+        made = replace(query.motion, root_position=self.truth.root_position, local_quat_xyzw=quats)
+        return Proposal(made, estimate_contact_logits(made), "told")
+
+
+def test_who_knows_the_motion_is_as_alive_as_mocap_and_slerp_is_not():
+    motion = walk(110)
+    methods = [Method("told", Told(motion), RAW), Method("slow", Told(motion, slow=True), RAW)]
+    slerp, told, slow = benchmark_long_gaps({"walks": [motion]}, methods, frames=108)
+    assert [row["by"] for row in (slerp, told, slow)] == ["slerp", "told", "slow"]
+    assert told["error_cm"] < 0.1
+    assert told["hips_cm"] < 0.1
+    assert all(told[name] == pytest.approx(1, abs=0.01) for name in ("speed", "spread", "planted"))
+    assert told["jerk"] == pytest.approx(1, abs=0.05)
+    assert slerp["speed"] < 0.2
+    assert slerp["error_cm"] > 2
+    assert 0.4 < slow["speed"] < 0.75
+    assert slow["jerk"] > slerp["jerk"]
+
+
+def test_gaps_lie_in_the_middle_and_shorter_clips_are_taken_whole():
+    motion = walk(100)
+    part = cut_middle(motion, 50)
+    assert part is not None
+    assert part.num_frames == 52
+    assert torch.equal(part.root_position[0], motion.root_position[24])
+    whole = cut_middle(motion, 140)
+    assert whole is not None
+    assert whole.num_frames == 100
+    assert cut_middle(motion, 200) is None
+
+
+def test_the_command_compares_in_betweeners_on_held_out_clips(tmp_path, capsys):
+    data = tmp_path / "data"
+    (data / "bandai").mkdir(parents=True)
+    walk(70).save(data / "bandai" / "a_walk_1.bvh")
+    predictor = str(save_tiny_path(tmp_path / "path.safetensors"))
+    held = {"path": compute_hash(predictor), "held_out": {"validation": ["bandai/a_walk_1.bvh"], "test": []}}
+    saved = tmp_path / "tweener.safetensors"
+    checkpoints.save(network().state_dict(), replace(card(), data=held), saved)
+    words = ["--tweener", saved, "--path", predictor, "--seconds", "1,2", "--raw", "--json"]
+    assert run("bench", "tweener", "--data", data, *words) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["seconds"], row["by"]) for row in rows] == [
+        (seconds, by) for seconds in (1, 2) for by in ("slerp", str(saved))
+    ]
+    assert run("bench", "tweener", "--data", data, *words[:4], "--seconds", "long") == 2
+    assert "--seconds takes numbers" in capsys.readouterr().err
