@@ -12,6 +12,7 @@ from tiny_tweener import save_tiny_tweener, tiny_tweener
 import priors
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
+from controllers.inbetweening.proposers.auto import ChoiceSettings
 from mapctl import motion_dna, rotations
 from mapctl.errors import CheckpointError
 from mapctl.inbetweening.missing import MissingMask
@@ -100,7 +101,7 @@ def test_gaps_beyond_what_the_network_sees_are_named():
 
 def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     query = query_of(walk(200), (1, 30), (31, 190))
-    auto = AutoInbetweener(SlerpInbetweener(), tweener=tiny_tweener())
+    auto = AutoInbetweener(SlerpInbetweener(), settings=ChoiceSettings(long=75), tweener=tiny_tweener())
     assert [source.by for source in auto.propose(query).attribute(query)] == ["slerp", "tweener"]
     plain = AutoInbetweener(SlerpInbetweener())
     assert {source.by for source in plain.propose(query).attribute(query)} == {"slerp"}

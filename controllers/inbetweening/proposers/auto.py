@@ -46,7 +46,7 @@ class ChoiceSettings:
     """Known frames on both sides of a gap that are enough context for the network."""
     known: int = 60
     """Frames of the longest gap with enough context in which only the network is tried."""
-    long: int = 75
+    long: int = 181
     """Frames of the shortest gap between whole poses that is a tweener's."""
     acceptable_cost: float = 0.2
     """Cost, m/s, of a proposal below which no other one is tried."""

@@ -28,7 +28,7 @@ class KeySettings:
     """Frames of the longest gap when training begins."""
     longest: float = 480.0
     """And when it has grown up (paper: 600 at 60 fps)."""
-    shortest: float = 8.0
+    shortest: float = 30.0
     """Frames of the shortest that a sequence's longest gap may be; the logarithm is drawn evenly."""
     grown: float = 0.5
     """Share of training after which gaps grow no more."""

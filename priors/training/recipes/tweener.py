@@ -33,7 +33,7 @@ VALIDATED_FRAMES = 192
 """Frames of the gap that is validated, 6.4 s; of shorter clips all but the ends."""
 _SHORTEST_VALIDATED = 90
 _VALIDATED_OF_KIND = 24
-_SHORTEST_WINDOW, _LEAST_WINDOW = 48, 32  # frames
+_SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
 _SHORTEST_SPLICE, _LONGEST_SPLICE = 192, 1024  # frames
 _MIN_STD = 0.05  # metres
 _STYLE_POSES = 6
@@ -47,10 +47,10 @@ class TweenerSettings:
     """Updates."""
     batch: int = 8192
     """Frames an update."""
-    spliced: float = 0.3
+    spliced: float = 0.2
     """Share of them in sequences that are spliced of several clips; the others are in windows of one."""
     window: int = 330
-    """Frames of the longest window of one clip; of those the shortest have 48."""
+    """Frames of the longest window of one clip; of those the shortest have 64."""
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
     weights: LossWeights = field(default_factory=LossWeights)
@@ -80,6 +80,8 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
 
     def __init__(self, config: GeneratorConfig, settings: TweenerSettings, corpus: Corpus, path: PathNetwork):
         self.settings, self.path = settings, path
+        self.grown = False
+        """Whether gaps are as long as they get from the first step on."""
         self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         fits = int(int(self.windows.lengths.max()) / (1 + settings.tempo)) - 1
         self.longest = min(settings.window, fits)
@@ -98,7 +100,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         settings = self.settings
-        progress = self.step / settings.steps
+        progress = 1.0 if self.grown else self.step / settings.steps
         reach = round(1.25 * settings.layout.longest_at(progress))
         shortest = min(_SHORTEST_WINDOW, self.longest)
         frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
@@ -179,7 +181,10 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
         """The trainer, its weights drawn."""
         network = path_predictor.load(self.path).network
         network.reduced_precision = self.settings.bfloat16
-        return TweenerTrainer(self.config, self.settings, parts.train, network)
+        trainer = TweenerTrainer(self.config, self.settings, parts.train, network)
+        # Who begins with weights of a run has seen them grow.
+        trainer.grown = self.init is not None
+        return trainer
 
     def pin(self, trainer: TweenerTrainer, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""
