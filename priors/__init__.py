@@ -23,11 +23,6 @@ AUTO = ("locomotion", "general")
 """Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection)."""
 
 
-def list_bundled() -> list[str]:
-    """Names of the models that come with the package."""
-    return checkpoints.list_bundled()
-
-
 def load(name: str) -> LstmGmmDensity:
     """A bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
     return density.load(name)

@@ -28,8 +28,8 @@ class ModelLoaders:
     """Loader of the network that a method asks for by its own name; of whichever is given for `auto`."""
     densities: Callable[[], Sequence[Density]]
     """Loader of the densities for rollouts."""
-    tweener: Callable[[], Inbetweener | None]
-    """Loader of the network for long gaps that `auto` takes beside the other; None without one."""
+    tweener: Callable[[], Inbetweener]
+    """Loader of the network for long gaps that `auto` takes beside the other."""
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {

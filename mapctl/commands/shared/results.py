@@ -64,9 +64,7 @@ def load_models(
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
         return network if dna is None or not isinstance(network, Tweener) else network.styled(dna)
 
-    def load_tweener() -> Inbetweener | None:
-        if "tweener" not in priors.list_bundled():
-            return None
+    def load_tweener() -> Inbetweener:
         tweener = priors.load_tweener()
         return tweener if dna is None else tweener.styled(dna)
 
