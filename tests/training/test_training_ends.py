@@ -18,6 +18,7 @@ import tiny_denoiser
 import tiny_infiller
 import tiny_path
 import tiny_transformer
+import tiny_tweener
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
@@ -30,7 +31,7 @@ from priors import checkpoints, tensor_files
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus, density_quality, run, run_files
-from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, path, pose_transformer, refiner
+from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, path, pose_transformer, refiner, tweener
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ MODELS = {
     "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
     "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
     "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
+    "tweener": Model(tweener.TweenerTrainer, _windowed(tweener.TweenerRecipe, tiny_tweener.CONFIG)),
 }
 
 
