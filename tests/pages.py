@@ -88,7 +88,7 @@ def shorten(line: str) -> list[str]:
             words[place + 1] = _SMALL[word]
         tiny.pop(word, None)
         if word == "--method" and words[place + 1] == "tweener":
-            tiny.pop("--inbetweener")  # the bundled one, which is small
+            tiny.clear()  # the bundled one is small, and without the MAP stage no density is asked
     if name == "measure" and "--curve" not in words:
         tiny.clear()
     return [*words, *(part for option in tiny.items() for part in option)]
