@@ -19,7 +19,7 @@ FLOORS = {
         "joint_ranges mesh numerics solver",
         "formats kinematics",
         "curves retarget",
-        "intent recording terms",
+        "intent motion_dna recording terms",
         "inbetweening problem runtime",
         "metrics",
         "commands",

@@ -170,9 +170,9 @@ def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_pa
     killed_in(model, request_in(out), 2)
     with pytest.raises(RequestError, match="already holds a run; pass --resume"):
         train(request_in(out))
-    with pytest.raises(CheckpointError, match=r"other settings \(contacts: .* then, 3\.0 now\)"):
-        train(request_in(out, resume=True, settings={"contacts": 3.0}))
-    with pytest.raises(CheckpointError, match=r"other network \((width|kernel): \d then, \d now\)"):
+    with pytest.raises(CheckpointError, match=r"other settings \(learning_rate: .* then, 0\.3 now\)"):
+        train(request_in(out, resume=True, settings={"learning_rate": 0.3}))
+    with pytest.raises(CheckpointError, match=r"other network \((width|kernel|style): \d then, \d now\)"):
         train(request_in(out, resume=True, config=model.other))
     with pytest.raises(CheckpointError, match="other data"):
         train(request_in(out, resume=True, match="walk-[0-3]"))

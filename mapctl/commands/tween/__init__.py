@@ -39,7 +39,7 @@ class Tween(Command):
     interpolation."""
     dna: Annotated[str | None, arg(metavar="CLIP,CLIP")] = None
     """Motion files of any known rig whose poses tell the tweener its style: in all gaps with --method tweener, in those
-    that auto leaves to it."""
+    that auto leaves to it. The bundled one hardly heeds it so far (docs/tweening.md)."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     rig: options.MaybeRig = None
