@@ -31,7 +31,16 @@ from priors import checkpoints, tensor_files
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus, density_quality, run, run_files
-from priors.training.recipes import denoiser, infiller, keyframe_timing, lstm_gmm, path, pose_transformer, refiner, tweener
+from priors.training.recipes import (
+    denoiser,
+    infiller,
+    keyframe_timing,
+    lstm_gmm,
+    path,
+    pose_transformer,
+    refiner,
+    tweener,
+)
 
 
 @dataclass(frozen=True)
