@@ -7,18 +7,11 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import pytest
-import tiny_denoiser
-import tiny_infiller
-import tiny_path
-import tiny_transformer
-import tiny_tweener
+from ended_models import MODELS
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
@@ -28,96 +21,8 @@ from mapctl.commands.train.options import TrainOptions
 from mapctl.runtime import interruption
 from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
-from priors.lstm_gmm.network import LstmGmmConfig
-from priors.refiner.network import RefinerConfig
 from priors.training import corpus, density_quality, run, run_files
-from priors.training.recipes import (
-    denoiser,
-    infiller,
-    keyframe_timing,
-    lstm_gmm,
-    path,
-    pose_transformer,
-    refiner,
-    tweener,
-)
-
-
-@dataclass(frozen=True)
-class Model:
-    """A model, and a recipe of six steps that are judged at every other."""
-
-    trainer: type
-    recipe: Callable[[Path, Path, str], Any]
-    """Of data, run folder and density."""
-
-
-def _density(data, out, prior):
-    settings = lstm_gmm.TrainingSettings(steps=6, batch=4, window=20)
-    return lstm_gmm.DensityRecipe(
-        data,
-        out,
-        config=LstmGmmConfig(width=8, components=2),
-        settings=settings,
-        device="cpu",
-        validate_steps=2,
-        starts=4,
-    )
-
-
-def _refiner(data, out, prior):
-    settings = refiner.AdversarialSettings(
-        rounds=6,
-        window=10,
-        batch=4,
-        warm_up=1,
-        head_start=1,
-        critic_updates=1,
-        history=8,
-        critic_width=6,
-        critic_around=1,
-    )
-    config = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
-    return refiner.RefinerRecipe(
-        data,
-        out,
-        density=prior,
-        config=config,
-        settings=settings,
-        samples=6,
-        judged=2,
-        seconds=1.2,
-        report_steps=2,
-        validate_steps=2,
-    )
-
-
-def _windowed(recipe, config):
-    def made(data, out, prior):
-        usual = recipe(data, out, config=config, validate_steps=2)
-        return replace(usual, settings=replace(usual.settings, steps=6, batch=3, window=32))
-
-    return made
-
-
-def _timing(data, out, prior):
-    settings = keyframe_timing.KeyframeTimingSettings(steps=6)
-    return keyframe_timing.KeyframeTimingRecipe(data, out, settings=settings, validate_steps=2)
-
-
-MODELS = {
-    "lstm-gmm": Model(lstm_gmm.DensityTrainer, _density),
-    "refiner": Model(refiner.AdversarialTrainer, _refiner),
-    "denoiser": Model(denoiser.DenoiserTrainer, _windowed(denoiser.DenoiserRecipe, tiny_denoiser.CONFIG)),
-    "pose-transformer": Model(
-        pose_transformer.PoseTransformerTrainer,
-        _windowed(pose_transformer.PoseTransformerRecipe, tiny_transformer.CONFIG),
-    ),
-    "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
-    "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
-    "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
-    "tweener": Model(tweener.TweenerTrainer, _windowed(tweener.TweenerRecipe, tiny_tweener.CONFIG)),
-}
+from priors.training.recipes import lstm_gmm
 
 
 def test_whatever_can_be_trained_is_ended_here():
