@@ -6,7 +6,7 @@ step, and trunk and limbs that reach, with the MAP stage of all in-betweening be
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -16,7 +16,7 @@ from controllers.following.follow import FollowSettings
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.clips.arrival import arrive
 from controllers.shots.clips.lead import go_on
-from controllers.shots.joining import JoinSettings, join_pieces
+from controllers.shots.joining import JoinSettings, Piece, join_pieces
 from controllers.shots.keys.approaching import check_reaches, go_down, lean_way
 from controllers.shots.keys.looking import look_where_hands_reach, turn_heads
 from controllers.shots.keys.posing import MetPose, as_reaches, meet_poses, pose_frames
@@ -30,6 +30,7 @@ from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.walking import walk_pieces
 from controllers.shots.wishes import Wish, check_wishes, describe_fights
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
@@ -91,7 +92,6 @@ def solve_shot(
     request = replace(request, reaches=(*request.reaches, *told), poses=poses)
     check_reaches(request.reaches, way, rest)
     way = lean_way(way, request, rest)
-    frames = len(way.speeds)
     walked_way = way.walked_on(OVERLAP) if request.loop else way
     pieces, walked = walk_pieces(
         prior,
@@ -103,28 +103,8 @@ def solve_shot(
         generator=generator,
         progress=progress,
     )
-    motion, missing = join_pieces(pieces, inbetweener, settings.join)
-    if request.lead is not None:
-        motion = go_on(motion, missing, request.lead, inbetweener)
-    elif bool(missing.any()):
-        motion = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
-    past = request.lead.past if request.lead is not None else None
-    motion = repair_jumps(motion, inbetweener, past=past)
-    if request.loop:
-        motion = close_loop(motion, frames, inbetweener)
-    if request.arrival is not None:
-        arrival = request.arrival.bring_to(way.curve, float(way.arcs[-1]))
-        motion = arrive(motion, arrival, inbetweener)
-    motion, met = meet_poses(motion, request.poses, way, inbetweener)
-    reaches = settle_reaches(request.reaches, motion)
-    posed = pose_frames(met, frames)
-    motion = go_down(motion, reaches, posed)
-    if reaches:
-        reach = ReachTargets.of(reaches, frames).relaxed(motion).within_reach(motion)
-        free = reach.free_limbs(motion.num_joints, posed)
-        motion = fill(motion, free, inbetweener, targets=reach.led_there(motion).targets).motion
-    motion = look_where_hands_reach(motion, reaches, request.looks, posed)
-    motion = turn_heads(motion, request.looks)
+    motion = _join_walks(pieces, request, way, inbetweener, settings.join)
+    motion, reaches, met = _meet_keys(motion, request, way, inbetweener)
     wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)
     notes = [way.note] if way.note else []
     notes += describe_fights(wishes, way, motion)
@@ -139,6 +119,41 @@ def solve_shot(
         reaches=reaches,
         met=met,
     )
+
+
+def _join_walks(
+    pieces: Sequence[Piece], request: ShotRequest, way: Way, inbetweener: Inbetweener, settings: JoinSettings
+) -> Motion:
+    """Join stands and walks into one motion that goes on from, ends in, or comes round to what is asked for."""
+    motion, missing = join_pieces(pieces, inbetweener, settings)
+    if request.lead is not None:
+        motion = go_on(motion, missing, request.lead, inbetweener)
+    elif bool(missing.any()):
+        motion = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    past = request.lead.past if request.lead is not None else None
+    motion = repair_jumps(motion, inbetweener, past=past)
+    if request.loop:
+        motion = close_loop(motion, len(way.speeds), inbetweener)
+    if request.arrival is not None:
+        arrival = request.arrival.bring_to(way.curve, float(way.arcs[-1]))
+        motion = arrive(motion, arrival, inbetweener)
+    return motion
+
+
+def _meet_keys(
+    motion: Motion, request: ShotRequest, way: Way, inbetweener: Inbetweener
+) -> tuple[Motion, tuple[Reach, ...], tuple[MetPose, ...]]:
+    """Let a walked motion meet poses, then reaches, then looks; also return reaches and poses as they were met."""
+    motion, met = meet_poses(motion, request.poses, way, inbetweener)
+    reaches = settle_reaches(request.reaches, motion)
+    posed = pose_frames(met, len(way.speeds))
+    motion = go_down(motion, reaches, posed)
+    if reaches:
+        reach = ReachTargets.of(reaches, len(way.speeds)).relaxed(motion).within_reach(motion)
+        free = reach.free_limbs(motion.num_joints, posed)
+        motion = fill(motion, free, inbetweener, targets=reach.led_there(motion).targets).motion
+    motion = look_where_hands_reach(motion, reaches, request.looks, posed)
+    return turn_heads(motion, request.looks), reaches, tuple(met)
 
 
 def _join_ledgers(ledgers) -> Ledger:
