@@ -115,8 +115,18 @@ def euler_axes(orders: Sequence[str]) -> Int[Tensor, "joints 3"]:
 def from_euler(angles: Float[Tensor, "*#batch 3"], axes: Int[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation matrices of intrinsic Tait-Bryan angles, radians: the product of the turns about the axes in
     their order. Each joint of a batch may have axes of its own."""
-    first, middle, last = _about_axes(angles, axes).unbind(dim=-3)
-    return first @ middle @ last
+    i, j, _ = axes.unbind(dim=-1)
+    # A left-handed order is the mirror image of a right-handed one, in which all turns go the other way.
+    sines = torch.sin(angles) * _handedness(i, j)[..., None]
+    (sa, sb, sc), (ca, cb, cc) = sines.unbind(dim=-1), torch.cos(angles).unbind(dim=-1)
+    sa_sb, ca_sb = sa * sb, ca * sb
+    row_i = (cb * cc, -cb * sc, sb)
+    row_j = (sa_sb * cc + ca * sc, ca * cc - sa_sb * sc, -sa * cb)
+    row_k = (sa * sc - ca_sb * cc, ca_sb * sc + sa * cc, ca * cb)
+    along_order = torch.stack([*row_i, *row_j, *row_k], dim=-1)
+    place = axes.argsort(dim=-1)
+    flat, at = torch.broadcast_tensors(along_order, (3 * place[..., :, None] + place[..., None, :]).flatten(-2))
+    return flat.gather(-1, at).unflatten(-1, (3, 3))
 
 
 def to_euler(matrix: Float[Tensor, "*#batch 3 3"], axes: Int[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -138,14 +148,6 @@ def to_euler(matrix: Float[Tensor, "*#batch 3 3"], axes: Int[Tensor, "*#batch 3"
 def _handedness(first: Int[Tensor, "*batch"], second: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
     """Return 1 where the third axis is the first times the second, else -1."""
     return torch.where((second - first) % 3 == 1, 1, -1)
-
-
-def _about_axes(angles: Float[Tensor, "*#batch"], axes: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the matrices of turns about coordinate axes (Rodrigues' formula)."""
-    unit = torch.eye(3, dtype=angles.dtype, device=angles.device)
-    cross = torch.linalg.cross(unit[:, None, :].expand(3, 3, 3), unit[None].expand(3, 3, 3)).transpose(-1, -2)[axes]
-    angles = angles[..., None, None]
-    return unit + torch.sin(angles) * cross + (1 - torch.cos(angles)) * (cross @ cross)
 
 
 def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[Tensor, "frames *joints 4"]:

@@ -150,8 +150,8 @@ class GeneratorNetwork(nn.Module):
                     hidden = layer(hidden, responses)
                 if self.config.skips:
                     hidden = (hidden + self.skips[stage](levels[_STAGES - 1 - stage])) / math.sqrt(2)
-            made = self.last(hidden)[..., :frames]
-        return made.to(rows.dtype), tuple(responses)
+        # Angles need more than the eight bits of bfloat16, or who stands trembles.
+        return self.last(hidden.to(rows.dtype))[..., :frames], tuple(responses)
 
     def encode_rows(self, image: PositionImage) -> Float[Tensor, "batch frames rows"]:
         """Encode the dense input of section 3.5, seen from the reference, in about unit size."""

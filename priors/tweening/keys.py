@@ -1,27 +1,77 @@
-"""What the generator is told: whole poses at keys, seen from a reference that leads straight from key to key."""
+"""What the generator is told: poses or parts of them at keys, seen from a reference that leads straight from key to
+key."""
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl import rotations
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
 
-def make_key_image(motion: PartialMotion, known: Bool[Tensor, "batch frames"]) -> PositionImage:
-    """Make the image of whole poses in some frames; elsewhere the motion may hold anything finite."""
+@dataclass(frozen=True, eq=False)
+class ToldParts:
+    """What keys tell; a frame that tells nothing is none."""
+
+    axes: Bool[Tensor, "batch frames joints 3"]
+    """Which coordinates of joints are told, in the reference's axes. Of the hips x and z are their place on the ground;
+    coordinates of the others are seen from there, heights from the floor."""
+    heading: Bool[Tensor, "batch frames"]
+    """Whether the hips' heading is told."""
+    view: Float[Tensor, " batch"]
+    """Heading of a reference that does not turn, radians, for what is drawn from one side; NaN where it leads from key
+    to key."""
+
+    @staticmethod
+    def whole(known: Bool[Tensor, "batch frames"]) -> "ToldParts":
+        """Tell the whole poses of some frames."""
+        axes = known[..., None, None].expand(*known.shape, CANONICAL.num_joints, 3)
+        return ToldParts(axes, known, torch.full((len(known),), torch.nan))
+
+    @property
+    def known(self) -> Bool[Tensor, "batch frames"]:
+        """Frames in which anything is told."""
+        return self.axes.flatten(2).any(dim=-1)
+
+    @property
+    def placed(self) -> Bool[Tensor, "batch frames"]:
+        """Frames in which the hips' place on the ground is told."""
+        return self.axes[..., 0, 0] & self.axes[..., 0, 2]
+
+
+def make_key_image(motion: PartialMotion, told: ToldParts) -> PositionImage:
+    """Make the image of what is told of some frames; the rest of the motion may hold anything finite."""
     places = motion.world_poses()[0]
-    root = fill_missing(motion.root_position, known)
+    ground, heading = lead_reference(motion.root_position[..., ::2], motion.heading, told)
+    shift = rotations.lift_ground(ground - motion.root_position[..., ::2])
     return PositionImage.of_world(
-        places - motion.root_position[:, :, None] + root[:, :, None],
-        fill_missing_angle(motion.heading, known),
-        see_contacts(motion.contacts, known),
-        known=known[..., None].expand(*known.shape, CANONICAL.num_joints),
-        present=torch.ones_like(known),
+        places + shift[:, :, None],
+        heading,
+        see_contacts(motion.contacts, told.known),
+        known=told.axes.all(dim=-1),
+        present=torch.ones_like(told.heading),
         toes=TOE_JOINTS,
+        known_axes=told.axes,
     )
+
+
+def lead_reference(
+    ground: Float[Tensor, "batch frames 2"], heading: Float[Tensor, "batch frames"], told: ToldParts
+) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
+    """Lead the reference (ground, metres; heading, radians) straight from told place to told place, and from told
+    heading to told heading. Where a sequence tells no heading, it looks along its way."""
+    # What is drawn stands where its hips are, also if only one axis of these is told.
+    shown = told.axes[..., 0, :].any(dim=-1)
+    way = fill_missing(ground, shown)
+    facing = fill_missing_angle(heading, told.heading)
+    facing = torch.where(told.heading.any(dim=1, keepdim=True), facing, _look_along(way, shown))
+    drawn = torch.isfinite(told.view)[:, None]
+    return way, torch.where(drawn, torch.nan_to_num(told.view)[:, None], facing)
 
 
 def see_contacts(
@@ -31,3 +81,13 @@ def see_contacts(
     off = torch.zeros_like(known[:, :1])
     beside = torch.cat([off, known[:, :-1]], dim=1) | torch.cat([known[:, 1:], off], dim=1)
     return torch.where((known & beside)[..., None], contacts, 0.5)
+
+
+def _look_along(way: Float[Tensor, "batch frames 2"], shown: Bool[Tensor, "batch frames"]) -> Tensor:
+    """Return headings along a way of straight lines: at a corner that between both, from corner to corner evenly."""
+    line = torch.nn.functional.normalize(torch.diff(way, dim=1), dim=-1)
+    none = torch.zeros_like(way[:, :1])
+    along = torch.cat([none, line], dim=1) + torch.cat([line, none], dim=1)
+    moves = along.norm(dim=-1) > 1e-3
+    at = shown & moves
+    return fill_missing_angle(torch.atan2(along[..., 0], along[..., 1]), at) * moves.any(dim=1, keepdim=True)

@@ -8,9 +8,11 @@ from helpers import corpus, generator
 
 from mapctl import rotations
 from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
+from priors.training.augmentation.key_parts import PartSettings
 from priors.training.augmentation.pose_windows import PoseWindows
 
-SETTINGS = KeySettings(longest=200.0, open_ends=0.0)
+WHOLE = PartSettings(halves=0.0, places=0.0, drawings=0.0)
+SETTINGS = KeySettings(longest=200.0, open_ends=0.0, parts=WHOLE)
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +30,8 @@ def draw(windows, seed, progress=1.0, settings=SETTINGS):
     return draw_splices(windows, 3, 700, settings, progress=progress, generator=generator(seed))
 
 
-def test_gaps_grow_in_the_first_half_of_training(windows):
-    for progress, most in ((0.0, 30), (0.25, 78), (0.5, 200), (1.0, 200)):
+def test_gaps_grow_in_the_first_quarter_of_training(windows):
+    for progress, most in ((0.0, 30), (0.125, 78), (0.25, 200), (1.0, 200)):
         drawn = [
             draw_windows(windows, 40, 130, SETTINGS, progress=progress, tempo=0.1, generator=generator(seed))
             for seed in range(4)
@@ -70,7 +72,7 @@ def test_between_keys_of_one_clip_is_what_its_performer_did(windows):
 
 
 def test_who_is_farther_away_in_time_may_be_so_in_space(windows):
-    slow = KeySettings(longest=200.0, speed=0.2)
+    slow = KeySettings(longest=200.0, speed=0.2, parts=WHOLE)
     for seed in range(5):
         drawn = draw(windows, seed, settings=slow)
         for row, known in enumerate(drawn.known):

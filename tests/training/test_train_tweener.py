@@ -42,8 +42,8 @@ class Told(GeneratorNetwork):
         return GeneratedPoses(ConstrainedPose(local, places), ())
 
 
-def losses_of(sequences, windows, turned=0.0):
-    poses = draw_style_poses(windows, sequences, generator())
+def losses_of(sequences, windows, turned=0.0, foreign=0.0):
+    poses = draw_style_poses(windows, sequences, foreign, generator())
     styled = torch.ones(len(poses), dtype=torch.bool)
     made = Told(sequences.motion, turned)
     return compute_tweener_losses(made, tiny_path.network(), sequences, poses, styled, LossWeights())
@@ -77,7 +77,7 @@ def test_between_keys_of_different_clips_only_keys_and_style_count(windows):
     other = replace(sequences, motion=replace(sequences.motion, quats=quats, root_position=root))
     generous = LossWeights(style=0.0)
     made = Told(sequences.motion)
-    poses = draw_style_poses(windows, sequences, generator())
+    poses = draw_style_poses(windows, sequences, 0.0, generator())
     styled = torch.zeros(2, dtype=torch.bool)
     one, two = (
         compute_tweener_losses(made, tiny_path.network(), each, poses, styled, generous) for each in (sequences, other)
@@ -88,8 +88,38 @@ def test_between_keys_of_different_clips_only_keys_and_style_count(windows):
 def test_a_style_s_poses_must_be_made_somewhere_and_kept(windows):
     layout = KeySettings(longest=200.0)
     sequences = draw_splices(windows, 2, 600, layout, progress=1.0, generator=generator())
-    assert 0.01 < float(losses_of(sequences, windows)["style_cm"]) < 15
-    assert float(losses_of(one_window(windows), windows)["style_cm"]) == 0
+    foreign = losses_of(sequences, windows, foreign=1.0)
+    assert 0.01 < float(losses_of(sequences, windows)["style_cm"]) < 0.8 * float(foreign["style_cm"]) < 15
+    assert 0.01 < float(foreign["dwell_cm"]) < float(foreign["style_cm"])
+
+
+def test_who_moves_less_than_a_performer_is_not_active_whatever_the_phase(windows):
+    sequences = one_window(windows)
+    later = replace(sequences.motion, quats=sequences.motion.quats.roll(2, dims=1))
+    frozen = replace(sequences.motion, quats=sequences.motion.quats[:, 50:51].expand_as(sequences.motion.quats))
+    shifted, still = (
+        compute_tweener_losses(
+            Told(each),
+            tiny_path.network(),
+            sequences,
+            draw_style_poses(windows, sequences, 0.0, generator()),
+            torch.zeros(3, dtype=torch.bool),
+            LossWeights(),
+        )
+        for each in (later, frozen)
+    )
+    assert float(shifted["activity_cm"]) < 0.3 * float(still["activity_cm"])
+    assert float(shifted["pace_cm"]) > 0.3 * float(still["pace_cm"])
+
+
+def test_keys_that_tell_less_ask_for_less(windows):
+    sequences = one_window(windows)
+    none = torch.zeros(21, 3, dtype=torch.bool)
+    none[0, ::2] = True
+    axes = sequences.told.axes & none
+    placed = replace(sequences, told=replace(sequences.told, axes=axes))
+    assert float(losses_of(sequences, windows, turned=0.3)["keys_cm"]) > 1
+    assert float(losses_of(placed, windows, turned=0.3)["keys_cm"]) < 1e-3
 
 
 def test_training_brings_poses_nearer():

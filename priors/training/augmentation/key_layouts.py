@@ -6,7 +6,7 @@ Gaps grow in the course of training.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +14,9 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.inbetweening.partial_motion import PartialMotion
+from priors.training.augmentation.key_parts import PartSettings, tell_parts
 from priors.training.augmentation.pose_windows import PoseWindows, choose_rows
+from priors.tweening.keys import ToldParts
 
 _SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
 _ROLLS = 4096  # random numbers drawn at once
@@ -30,7 +32,7 @@ class KeySettings:
     """And when it has grown up (paper: 600 at 60 fps)."""
     shortest: float = 30.0
     """Frames of the shortest that a sequence's longest gap may be; the logarithm is drawn evenly."""
-    grown: float = 0.5
+    grown: float = 0.25
     """Share of training after which gaps grow no more."""
     runs: float = 0.4
     """Share of keys that are several frames: a pose and its pace."""
@@ -40,6 +42,8 @@ class KeySettings:
     """Share of sequences that begin, and as many that end, without a key."""
     speed: float = 1.5
     """Speed, m/s, below which the hips travel where clips are spliced: distances are proportional to the time."""
+    parts: PartSettings = field(default_factory=PartSettings)
+    """How much keys tell."""
 
     def longest_at(self, progress: float) -> float:
         """Return the frames of the longest gap at a `progress` of training from 0 to 1."""
@@ -53,14 +57,19 @@ class KeySequences:
 
     motion: PartialMotion
     """Poses by frame; between keys of different clips they are anything finite."""
-    known: Bool[Tensor, "batch frames"]
-    """Whether a frame is a key."""
+    told: ToldParts
+    """What is told of the frames that are keys."""
     truthful: Bool[Tensor, "batch frames"]
     """Whether the poses between the keys are a performer's."""
     clip: Int[Tensor, "batch frames"]
     """Number of the clip that a frame is of."""
     mirrored: Bool[Tensor, " batch"]
     """Whether left and right are exchanged."""
+
+    @property
+    def known(self) -> Bool[Tensor, "batch frames"]:
+        """Whether a frame is a key."""
+        return self.told.known
 
 
 def draw_windows(
@@ -84,7 +93,8 @@ def draw_windows(
         for start, stop in _lay_keys(frames, settings, settings.longest_at(progress), rolls):
             row[start:stop] = True
     everywhere = torch.ones_like(known)
-    return _mirror_half(motion, known, everywhere, clip[:, None].expand_as(known), generator)
+    clip = clip[:, None].expand_as(known)
+    return _finish(motion, known, everywhere, clip, settings.parts, rolls, generator)
 
 
 def draw_splices(
@@ -105,7 +115,7 @@ def draw_splices(
             known[row, key] = True
             truthful[row, part.truthful_from : part.stop] = True
     motion = _place(windows.gather(clip, time.double()), turn, shift)
-    return _mirror_half(motion, known, truthful, clip, generator)
+    return _finish(motion, known, truthful, clip, settings.parts, rolls, generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +224,16 @@ def _place(motion: PartialMotion, turn: Float[Tensor, "batch frames"], shift: Te
     return replace(motion, root_position=root, heading=motion.heading + turn)
 
 
-def _mirror_half(
-    motion: PartialMotion, known: Tensor, truthful: Tensor, clip: Tensor, generator: torch.Generator
+def _finish(
+    motion: PartialMotion,
+    known: Tensor,
+    truthful: Tensor,
+    clip: Tensor,
+    parts: PartSettings,
+    rolls: Iterator[float],
+    generator: torch.Generator,
 ) -> KeySequences:
+    """Mirror half of the sequences, and choose what keys tell."""
     mirrored = torch.rand(len(known), generator=generator) < 0.5
-    return KeySequences(choose_rows(mirrored, motion.mirrored(), motion), known, truthful, clip, mirrored)
+    motion = choose_rows(mirrored, motion.mirrored(), motion)
+    return KeySequences(motion, tell_parts(known, motion.heading, parts, rolls), truthful, clip, mirrored)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import kinematics
+from mapctl import kinematics, rotations
 from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.metrics.liveliness import NOTHING, Liveliness, measure_liveliness, see_from_hips
@@ -22,11 +22,11 @@ from priors.training.augmentation.key_layouts import KeySequences, KeySettings, 
 from priors.training.augmentation.pose_windows import PoseWindows, find_kind
 from priors.training.corpus import Corpus, Split
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
-from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses, see_without_root
+from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
 from priors.training.trainer import GradientTrainer
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
-from priors.tweening.keys import make_key_image
+from priors.tweening.keys import ToldParts, make_key_image
 from priors.tweening.path import PathNetwork
 
 VALIDATED_FRAMES = 192
@@ -36,7 +36,8 @@ _VALIDATED_OF_KIND = 24
 _SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
 _SHORTEST_SPLICE, _LONGEST_SPLICE = 192, 1024  # frames
 _MIN_STD = 0.05  # metres
-_STYLE_POSES = 6
+_STYLE_POSES = 2, 8
+_FOREIGN_STYLES = 0.7  # share of styles of spliced sequences that are of another clip
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class TweenerSettings:
     """Updates."""
     batch: int = 8192
     """Frames an update."""
-    spliced: float = 0.2
+    spliced: float = 0.25
     """Share of them in sequences that are spliced of several clips; the others are in windows of one."""
     window: int = 330
     """Frames of the longest window of one clip; of those the shortest have 64."""
@@ -56,8 +57,9 @@ class TweenerSettings:
     weights: LossWeights = field(default_factory=LossWeights)
     """What each error counts."""
     styled: float = 0.35
-    """Share of sequences that are given a style."""
-    tempo: float = 0.1
+    """Share of sequences that are given a style: of windows poses that are in them, of what is spliced poses in it or,
+    more often, of another clip altogether."""
+    tempo: float = 0.15
     """Largest change of tempo of windows of one clip, as a share."""
     layout: KeySettings = field(default_factory=KeySettings)
     """Where keys lie."""
@@ -116,16 +118,16 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         frames = self._draw_frames(_SHORTEST_SPLICE, _LONGEST_SPLICE)
         batch = max(1, round(settings.spliced * settings.batch / frames))
         other = draw_splices(self.windows, batch, frames, settings.layout, progress=progress, generator=self.generator)
-        parts, spliced = self._compute(one), self._compute(other)
+        parts, spliced = self._compute(one, 0.0), self._compute(other, _FOREIGN_STYLES)
         parts["loss"] = parts["loss"] + spliced["loss"]
-        return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm")}
+        return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
 
     def _draw_frames(self, shortest: int, longest: int) -> int:
         share = float(torch.rand((), generator=self.generator))
         return round(shortest * (max(shortest, longest) / shortest) ** share)
 
-    def _compute(self, sequences: KeySequences) -> dict[str, Tensor]:
-        poses = draw_style_poses(self.windows, sequences, self.generator)
+    def _compute(self, sequences: KeySequences, foreign: float) -> dict[str, Tensor]:
+        poses = draw_style_poses(self.windows, sequences, foreign, self.generator)
         styled = torch.rand(len(poses), generator=self.generator) < self.settings.styled
         return compute_tweener_losses(self.network, self.path, sequences, poses, styled, self.settings.weights)
 
@@ -205,16 +207,22 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
 
 
 def draw_style_poses(
-    windows: PoseWindows, sequences: KeySequences, generator: torch.Generator
+    windows: PoseWindows, sequences: KeySequences, foreign: float, generator: torch.Generator
 ) -> Float[Tensor, "batch poses joints 3"]:
-    """Draw poses anywhere in a clip of each sequence: places from the hips, metres, without the hips' rotation."""
+    """Draw poses anywhere in each sequence, or, of this share of them, in another clip: places from the hips, metres,
+    without the hips' rotation."""
     batch, frames = sequences.clip.shape
-    at = (torch.rand(batch, generator=generator) * frames).long()
-    clip = sequences.clip[torch.arange(batch), at][:, None].expand(-1, _STYLE_POSES)
-    time = (torch.rand(clip.shape, generator=generator) * windows.lengths[clip]).floor().double()
-    local = windows.gather(clip, time).local_matrices()
-    places = see_without_root(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])
-    return torch.where(sequences.mirrored[:, None, None, None], mirror_positions(places), places)
+    few, many = _STYLE_POSES
+    count = int(torch.randint(few, many + 1, (), generator=generator))
+    at = torch.randint(frames, (batch, count), generator=generator)
+    own = torch.take_along_dim(sequences.motion.quats, at[..., None, None], dim=1)
+    one = torch.ones(batch, dtype=torch.long)
+    clip = windows.pick(one, generator)[0][:, None].expand(-1, count)
+    time = (torch.rand(batch, count, generator=generator) * windows.lengths[clip]).floor().double()
+    other = torch.rand(batch, generator=generator) < foreign
+    local = rotations.to_matrix(torch.where(other[:, None, None, None], windows.gather(clip, time).quats, own))
+    local[..., 0, :, :] = torch.eye(3)
+    return kinematics.positions_from_matrices(CANONICAL, local)
 
 
 @torch.no_grad()
@@ -222,7 +230,7 @@ def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, L
     """Measure what is made between the first and the last pose of one motion, beside slerp and the truth."""
     known = torch.zeros(motion.heading.shape, dtype=torch.bool)
     known[:, [0, -1]] = True
-    image = make_key_image(motion, known)
+    image = make_key_image(motion, ToldParts.whole(known))
     made = network(image, torch.zeros(1, network.config.style)).turn_to_world(image)
     local = motion.local_matrices()
     true = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])[0]

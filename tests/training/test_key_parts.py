@@ -1,0 +1,120 @@
+"""Keys that tell less than whole poses, and the reference that they are seen from."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import corpus, generator
+
+from mapctl.skeleton import CANONICAL
+from priors.training.augmentation.key_layouts import KeySettings, draw_windows
+from priors.training.augmentation.key_parts import PartSettings, tell_parts
+from priors.training.augmentation.pose_windows import PoseWindows
+from priors.tweening.keys import ToldParts, lead_reference, make_key_image
+
+BATCH, FRAMES = 60, 90
+LEGS = CANONICAL.indices(("leftLowerLeg", "rightLowerLeg", "leftFoot", "rightFoot", "leftToes", "rightToes"))
+ARMS = CANONICAL.indices(("leftHand", "rightHand", "head", "leftLowerArm", "rightLowerArm"))
+WHOLE = PartSettings(halves=0.0, places=0.0, drawings=0.0)
+
+
+def rolls(seed=0):
+    found = generator(seed)
+    while True:
+        yield float(torch.rand((), generator=found))
+
+
+def told(**shares):
+    known = torch.zeros(BATCH, FRAMES, dtype=torch.bool)
+    known[:, [0, 30, 60, 61, 62, -1]] = True
+    return tell_parts(known, torch.zeros(BATCH, FRAMES), replace(WHOLE, **shares), rolls()), known
+
+
+def test_whole_keys_tell_everything():
+    found, known = told()
+    assert torch.equal(found.axes, known[..., None, None].expand_as(found.axes))
+    assert torch.equal(found.heading, known)
+    assert bool(found.view.isnan().all())
+
+
+def test_halves_tell_the_hips_and_what_hangs_on_them():
+    found, known = told(halves=1.0)
+    axes = found.axes[known]
+    assert bool(axes[:, 0].all())
+    assert bool(found.heading[known].all())
+    legs, arms = axes[:, LEGS].all(dim=-1).all(dim=-1), axes[:, ARMS].all(dim=-1).all(dim=-1)
+    for some in (legs & arms, legs & ~arms, arms & ~legs, ~arms & ~legs):
+        assert 0.05 < float(some.float().mean()) < 0.6
+    parent = torch.tensor(CANONICAL.parents[1:])
+    assert not bool((axes[:, 1:].any(dim=-1) & ~axes[:, parent].any(dim=-1)).any())
+
+
+def test_places_tell_where_the_hips_are_over_the_ground_and_no_heading():
+    found, known = told(places=1.0)
+    bare = known & ~found.heading
+    assert 0.4 < float(bare.sum() / known.sum()) < 1
+    assert bool(found.axes[bare][:, 0, ::2].all())
+    assert int(found.axes[bare].sum()) == 2 * int(bare.sum())
+    assert bool(found.axes[known & found.heading].all())
+
+
+def test_drawings_tell_no_depth_and_are_seen_from_one_side():
+    found, known = told(drawings=1.0)
+    drawn = found.known & ~found.heading
+    assert bool(found.view.isfinite().all())
+    assert not bool(found.axes[drawn][:, 1:, 2].any())
+    assert 0.5 < float(found.axes[drawn][:, 1:, :2].float().mean()) < 1
+    assert bool((found.known <= known).all())
+
+
+def straight(heading, told_parts):
+    ground = torch.stack([torch.linspace(0, 2, FRAMES), torch.zeros(FRAMES)], dim=-1).expand(1, -1, -1)
+    return lead_reference(ground, torch.full((1, FRAMES), heading), told_parts)
+
+
+def places_only(frames):
+    axes = torch.zeros(1, FRAMES, CANONICAL.num_joints, 3, dtype=torch.bool)
+    axes[:, frames, 0, 0] = axes[:, frames, 0, 2] = True
+    return ToldParts(axes, torch.zeros(1, FRAMES, dtype=torch.bool), torch.full((1,), torch.nan))
+
+
+def test_a_reference_looks_along_its_way_where_no_heading_is_told():
+    way, facing = straight(0.3, places_only([0, 40, FRAMES - 1]))
+    assert facing[0].tolist() == pytest.approx([math.pi / 2] * FRAMES, abs=1e-5)
+    assert way[0, 20, 0] == pytest.approx(float(way[0, 40, 0]) / 2, abs=1e-5)
+
+
+def test_a_reference_takes_the_mean_direction_at_a_corner():
+    ground = torch.zeros(1, FRAMES, 2)
+    ground[0, 40:, 0], ground[0, FRAMES - 1] = 1.0, torch.tensor([1.0, 1.0])
+    _, facing = lead_reference(ground, torch.zeros(1, FRAMES), places_only([0, 40, FRAMES - 1]))
+    assert facing[0, [0, 40, -1]].tolist() == pytest.approx([math.pi / 2, math.pi / 4, 0.0], abs=1e-5)
+
+
+def test_who_stays_in_one_place_looks_ahead():
+    _, facing = lead_reference(torch.ones(1, FRAMES, 2), torch.ones(1, FRAMES), places_only([0, 40]))
+    assert bool((facing == 0).all())
+
+
+def test_headings_that_are_told_lead_and_a_view_does_not_turn():
+    some = places_only([0, 40, FRAMES - 1])
+    some.heading[0, 40] = True
+    assert bool(straight(0.3, some)[1] == pytest.approx(0.3))
+    assert bool(straight(0.3, replace(some, view=torch.tensor([1.2])))[1] == pytest.approx(1.2))
+
+
+def test_an_image_of_a_drawing_holds_the_drawn_coordinates():
+    windows = PoseWindows(corpus(3, 140), kinds=(), evenness=1.0)
+    layout = KeySettings(longest=60.0, parts=replace(WHOLE, drawings=1.0))
+    drawn = draw_windows(windows, 4, 80, layout, progress=1.0, tempo=0.0, generator=generator())
+    image = make_key_image(drawn.motion, drawn.told)
+    assert torch.equal(image.known_axes, drawn.told.axes)
+    assert torch.equal(image.heading, drawn.told.view[:, None].expand(-1, 80))
+    places = drawn.motion.world_poses()[0]
+    right = torch.stack([drawn.told.view.cos(), torch.zeros(4), -drawn.told.view.sin()], dim=-1)
+    across = ((places - places[..., :1, :]) * right[:, None, None]).sum(dim=-1)
+    mask = drawn.told.axes[..., 0] & drawn.told.known[..., None]
+    seen = image.places[..., 0] - image.places[..., :1, 0]
+    assert torch.allclose(seen[mask], across[mask], atol=1e-5)
+    assert torch.allclose(image.places[..., 1][mask], places[..., 1][mask], atol=1e-5)
