@@ -14,7 +14,8 @@ from mapctl.features import LAYOUT, GroundPose, encode, mirror_features
 from mapctl.pose import decode
 from priors.refiner.end_effectors import count_channels
 from priors.refiner.network import RefinerConfig
-from priors.training.adversarial import Critic, HistoryBuffer
+from priors.training.adversaries.end_effectors import Critic
+from priors.training.adversaries.history import HistoryBuffer
 from priors.training.corpus import Corpus
 from priors.training.moment_matching import moment_loss
 from priors.training.recipes import refiner as training

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import arg
 
 from mapctl.commands.train.options import ParallelOptions
+from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from priors.training.recipes.tweener import TweenerRecipe
@@ -20,6 +21,8 @@ class TrainTweener(ParallelOptions):
 
     path: Annotated[str, arg(metavar="NAME")] = "path"
     """Path predictor, bundled or trained, that tells where the hips go in what is made."""
+    critic_from: Annotated[str, arg(metavar="STEP|never")] = "never"
+    """Step at which a critic joins, which tells made motion from captured; the best weights of all are exported."""
     plain: bool = False
     """The network without the connections past its narrow middle, as in the paper, to compare."""
 
@@ -27,14 +30,27 @@ class TrainTweener(ParallelOptions):
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.training.recipes.tweener import GeneratorConfig, TweenerRecipe, TweenerSettings
 
-        common = self.common()
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
-        return TweenerRecipe(
-            **common,
-            config=replace(GeneratorConfig(), skips=not self.plain),
-            settings=replace(TweenerSettings(), bfloat16=self.bfloat16, **given),
-            skip_first=self.skip_first,
-            init=self.init,
-            processes=self.processes,
-            path=self.path,
-        )
+        everything = {
+            **self.common(),
+            "config": replace(GeneratorConfig(), skips=not self.plain),
+            "settings": (settings := replace(TweenerSettings(), bfloat16=self.bfloat16, **given)),
+            "skip_first": self.skip_first,
+            "init": self.init,
+            "processes": self.processes,
+            "path": self.path,
+        }
+        if self.critic_from == "never":
+            return TweenerRecipe(**everything)
+        from priors.training.recipes.tweener_critic import CriticisedTweenerRecipe, CriticSettings
+
+        begin = _parse_step(self.critic_from, settings.steps)
+        return CriticisedTweenerRecipe(**everything, critic=CriticSettings(begin))
+
+
+def _parse_step(text: str, steps: int) -> int:
+    if not text.isdecimal():
+        raise RequestError(f"--critic-from is a step or never, got {text!r}")
+    if int(text) >= steps:
+        raise RequestError(f"--critic-from must be one of the {steps} steps from 0 on, got {text}")
+    return int(text)

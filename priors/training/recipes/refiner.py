@@ -1,6 +1,5 @@
 """Adversarial training of the refiner: Wang et al. 2019, sections 4.2.1 and 4.2.2, with departures kept as settings."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,9 @@ from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.end_effectors import compute_end_effectors
 from priors.refiner.network import RefinerConfig, RefinerNetwork
-from priors.training.adversarial import Critic, HistoryBuffer
+from priors.training.adversaries.end_effectors import Critic
+from priors.training.adversaries.guard import find_winner
+from priors.training.adversaries.history import HistoryBuffer
 from priors.training.corpus import Corpus, Split, find_window_starts
 from priors.training.gathering import DataSource, describe_skipped
 from priors.training.moment_matching import MatchingSettings, moment_loss
@@ -30,7 +31,6 @@ from priors.training.windows import FeatureWindows
 
 REFINER_MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)
 """That a refiner is held to, as pieces of a window show them."""
-_CRITIC_WON = 0.98  # share that the critic tells apart, over a report, from which it has won
 _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
 
 
@@ -317,11 +317,8 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
 
     def find_stop_reason(self, trainer: AdversarialTrainer, rows: Sequence[Row]) -> str | None:
         """Why to stop after these losses since the last line of news, if there is a reason."""
-        if not all(math.isfinite(rows[-1][name]) for name in ("refiner", "critic")):
-            return f"training diverged at round {trainer.step}"
-        if len(rows) >= self.report_steps and average(rows, "told") > _CRITIC_WON:
-            return "the critic has won"
-        return None
+        where = f"{self.counter} {trainer.step}"
+        return find_winner(rows, losses=("refiner", "critic"), least=self.report_steps, step=where)
 
     def score(self, row: Row) -> float:
         """Measure how far foot speed, jitter and classifier accuracy are from mocap's."""

@@ -22,7 +22,7 @@ from priors.training.augmentation.key_layouts import KeySequences, KeySettings, 
 from priors.training.augmentation.pose_windows import PoseWindows, find_kind
 from priors.training.corpus import Corpus, Split
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
-from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
+from priors.training.recipes.tweener_losses import Judge, LossWeights, compute_tweener_losses
 from priors.training.trainer import GradientTrainer
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
@@ -84,6 +84,8 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         self.settings, self.path = settings, path
         self.grown = False
         """Whether gaps are as long as they get from the first step on."""
+        self.shortest = _SHORTEST_WINDOW
+        """Frames of the shortest window of one clip."""
         self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         fits = int(int(self.windows.lengths.max()) / (1 + settings.tempo)) - 1
         self.longest = min(settings.window, fits)
@@ -101,10 +103,14 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
+        return self.compute_losses(self.settings.weights)
+
+    def compute_losses(self, weights: LossWeights, judge: Judge | None = None) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch at these weights; a `judge` adds to both its halves'."""
         settings = self.settings
         progress = 1.0 if self.grown else self.step / settings.steps
         reach = round(1.25 * settings.layout.longest_at(progress))
-        shortest = min(_SHORTEST_WINDOW, self.longest)
+        shortest = min(self.shortest, self.longest)
         frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
         one = draw_windows(
             self.windows,
@@ -118,7 +124,10 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         frames = self._draw_frames(_SHORTEST_SPLICE, _LONGEST_SPLICE)
         batch = max(1, round(settings.spliced * settings.batch / frames))
         other = draw_splices(self.windows, batch, frames, settings.layout, progress=progress, generator=self.generator)
-        parts, spliced = self._compute(one, 0.0), self._compute(other, _FOREIGN_STYLES)
+        parts, spliced = (
+            self._compare(sequences, foreign, weights, judge)
+            for sequences, foreign in ((one, 0.0), (other, _FOREIGN_STYLES))
+        )
         parts["loss"] = parts["loss"] + spliced["loss"]
         return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
 
@@ -126,40 +135,16 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         share = float(torch.rand((), generator=self.generator))
         return round(shortest * (max(shortest, longest) / shortest) ** share)
 
-    def _compute(self, sequences: KeySequences, foreign: float) -> dict[str, Tensor]:
+    def _compare(
+        self, sequences: KeySequences, foreign: float, weights: LossWeights, judge: Judge | None
+    ) -> dict[str, Tensor]:
         poses = draw_style_poses(self.windows, sequences, foreign, self.generator)
         styled = torch.rand(len(poses), generator=self.generator) < self.settings.styled
-        return compute_tweener_losses(self.network, self.path, sequences, poses, styled, self.settings.weights)
+        return compute_tweener_losses(self.network, self.path, sequences, poses, styled, weights, judge)
 
-    @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """By kind of unseen clips with one long gap between two poses: error beside slerp's, and speed, spread and jerk
-        over mocap's, of sums."""
-        windows = PoseWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
-        kinds = [find_kind(name, self.settings.kinds) for name in corpus.names]
-        row: dict[str, Any] = {}
-        for kind, name in enumerate([*self.settings.kinds, "other"]):
-            found = [number for number, each in enumerate(kinds) if each == kind]
-            found = [one for one in found if int(windows.lengths[one]) >= _SHORTEST_VALIDATED + 2]
-            if found:
-                row |= {f"{name}_{what}": value for what, value in self._measure(windows, found).items()}
-        return row
-
-    def _measure(self, windows: PoseWindows, clips: Sequence[int]) -> dict[str, float]:
-        sums = {"made": NOTHING, "slerp": NOTHING, "true": NOTHING}
-        for number in clips[:_VALIDATED_OF_KIND]:
-            frames = min(VALIDATED_FRAMES + 2, int(windows.lengths[number]))
-            motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
-            for name, found in measure_gap(self.network, motion).items():
-                sums[name] += found
-        made, slerp, true = (sums[name] for name in ("made", "slerp", "true"))
-        return {
-            "error_cm": made.error / made.count,
-            "slerp_cm": slerp.error / slerp.count,
-            "speed": made.speed / true.speed,
-            "spread": made.spread / true.spread,
-            "jerk": made.jerk / true.jerk,
-        }
+        """Measure gaps of unseen clips (see `measure_kinds`)."""
+        return measure_kinds(self.network, corpus, self.settings.kinds)
 
 
 @dataclass(frozen=True)
@@ -223,6 +208,38 @@ def draw_style_poses(
     local = rotations.to_matrix(torch.where(other[:, None, None, None], windows.gather(clip, time).quats, own))
     local[..., 0, :, :] = torch.eye(3)
     return kinematics.positions_from_matrices(CANONICAL, local)
+
+
+@torch.no_grad()
+def measure_kinds(network: GeneratorNetwork, corpus: Corpus, kinds: Sequence[str]) -> dict[str, Any]:
+    """By kind of clips with one long gap between two poses: error beside slerp's, cm, and speed, spread and jerk over
+    mocap's, of sums."""
+    windows = PoseWindows(corpus, kinds=kinds, evenness=1.0)
+    kind_of = [find_kind(name, kinds) for name in corpus.names]
+    row: dict[str, Any] = {}
+    for kind, name in enumerate([*kinds, "other"]):
+        found = [number for number, each in enumerate(kind_of) if each == kind]
+        found = [one for one in found if int(windows.lengths[one]) >= _SHORTEST_VALIDATED + 2]
+        if found:
+            row |= {f"{name}_{what}": value for what, value in _measure_clips(network, windows, found).items()}
+    return row
+
+
+def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Sequence[int]) -> dict[str, float]:
+    sums = {"made": NOTHING, "slerp": NOTHING, "true": NOTHING}
+    for number in clips[:_VALIDATED_OF_KIND]:
+        frames = min(VALIDATED_FRAMES + 2, int(windows.lengths[number]))
+        motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
+        for name, found in measure_gap(network, motion).items():
+            sums[name] += found
+    made, slerp, true = (sums[name] for name in ("made", "slerp", "true"))
+    return {
+        "error_cm": made.error / made.count,
+        "slerp_cm": slerp.error / slerp.count,
+        "speed": made.speed / true.speed,
+        "spread": made.spread / true.spread,
+        "jerk": made.jerk / true.jerk,
+    }
 
 
 @torch.no_grad()

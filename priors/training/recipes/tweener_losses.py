@@ -2,6 +2,7 @@
 section 3.6), from which its recipe takes one sum.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +11,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from mapctl import kinematics
+from mapctl import kinematics, rotations
+from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.metrics.root_prediction import compute_displacement_errors
@@ -21,12 +23,13 @@ from priors.tweening.generator import GeneratorNetwork, regularise_batch
 from priors.tweening.keys import ToldParts, make_key_image
 from priors.tweening.path import PathNetwork
 
-_HALF_WEIGHT_FRAMES = 60.0  # away from the nearest key
 _DWELL = 5  # frames for which a pose of the style must be near: none flashes up
 _PATH_SPANS = (1, 8, 32, 96)
 _SOME = 3  # of so many sequences one has its way predicted and its rotations compared: they cost as much as all else
 _ACTIVITY_FRAMES = 32  # over which joints' speeds and accelerations are averaged
 _DNA_GAP = 90  # frames, 3 s, for each of which a gap has a pose of the style (Eq. 12)
+Judge = Callable[[LocalMotion, RootTrajectory], Tensor]
+"""What adds to the loss of motion that was made, and of the way that the path predictor tells of it."""
 _METRES = ("places", "pace", "activity", "feet", "keys", "path", "root", "style", "dwell")
 
 
@@ -59,6 +62,10 @@ class LossWeights:
     """Weight of the distance from the style's poses of those that come nearest to one in each gap (Eq. 12), metres."""
     regularisation: float = 0.05
     """Weight of batch regularisation (Eq. 9)."""
+    half: float = 60.0
+    """Frames from the nearest key at which what a performer did counts half."""
+    far: float = 0.0
+    """What it counts at least, however far the nearest key is."""
 
 
 def see_without_root(
@@ -75,11 +82,13 @@ def compute_tweener_losses(
     style_poses: Float[Tensor, "batch poses joints 3"],
     styled: Bool[Tensor, " batch"],
     weights: LossWeights,
+    judge: Judge | None = None,
 ) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
     Where a performer's poses between keys are known they count the less the farther the nearest key is, since more and
-    more other motions would do as well.
+    more other motions would do as well. A `judge` adds what it makes of the motion, in which given keys have replaced
+    the made ones.
     """
     motion, known = sequences.motion, sequences.known
     image = make_key_image(motion, sequences.told)
@@ -87,7 +96,7 @@ def compute_tweener_losses(
     made = made_poses.turn_to_world(image)
     wanted = image.places - image.places[..., :1, :]  # seen from the hips, as what is made
     local = motion.local_matrices()
-    weight = _weigh_frames(known) * sequences.truthful
+    weight = _weigh_frames(known, weights) * sequences.truthful
     shown = _Errors(made_poses.pose.places, wanted)
     heading = kinematics.heading_of_matrix(made.local_matrix[..., 0, :, :])
     some = slice(0, -(-len(known) // _SOME))
@@ -102,13 +111,17 @@ def compute_tweener_losses(
         "keys": shown.keys(sequences.told) + 0.1 * _average(turned, whole),
     }
     trajectory = path(LocalMotion.of_world(made.places[some], heading[some]))
-    terms |= _compute_path_terms(trajectory, heading[some], sequences, some)
+    terms |= _compute_path_terms(trajectory, heading[some], sequences, some, weights)
     without_root = see_without_root(made.places, made.local_matrix[..., 0, :, :])
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
     terms["style"] = _compute_style_error(apart, styled)
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
     terms["regularisation"] = regularise_batch(tuple(each[some] for each in made_poses.responses))
     loss = torch.stack([getattr(weights, name) * value for name, value in terms.items()]).sum()
+    if judge is not None:
+        places = torch.where(whole[..., None, None] > 0, _turn_to_world(wanted, image)[some], made.places[some])
+        facing = torch.where(whole > 0, motion.heading[some], heading[some])
+        loss = loss + judge(LocalMotion.of_world(places, facing), trajectory)
     told = {f"{name}_cm": 100 * terms[name] for name in _METRES}
     return {"loss": loss, **told, **{name: terms[name] for name in ("turns", "contacts", "regularisation")}}
 
@@ -150,7 +163,7 @@ class _Errors:
 
 
 def _compute_path_terms(
-    trajectory: RootTrajectory, heading: Tensor, sequences: KeySequences, some: slice
+    trajectory: RootTrajectory, heading: Tensor, sequences: KeySequences, some: slice, weights: LossWeights
 ) -> dict[str, Tensor]:
     """Errors of where the hips of some sequences go, as the path predictor sees it, metres, and of contacts, nats."""
     motion, known, truthful = sequences.motion, sequences.known[some], sequences.truthful[some]
@@ -170,7 +183,7 @@ def _compute_path_terms(
     return {
         "path": torch.stack(errors).mean() + height,
         "root": (_length(off) * share).sum(dim=1).mean(),
-        "contacts": _average(nats, _weigh_frames(known) * truthful),
+        "contacts": _average(nats, _weigh_frames(known, weights) * truthful),
     }
 
 
@@ -196,11 +209,15 @@ def _compute_dwell_error(
     return torch.stack(found).mean() if found else apart.new_zeros(())
 
 
-def _weigh_frames(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch frames"]:
-    """1 at a key, half as much 2 s away from the nearest."""
+def _weigh_frames(known: Bool[Tensor, "batch frames"], weights: LossWeights) -> Float[Tensor, "batch frames"]:
+    """1 at a key, less the farther the nearest is."""
     frame = torch.arange(known.shape[1])
     away = torch.minimum((frame - last_observed(known)).abs(), (next_observed(known) - frame).abs())
-    return 1 / (1 + away / _HALF_WEIGHT_FRAMES)
+    return (1 / (1 + away / weights.half)).clamp_min(weights.far)
+
+
+def _turn_to_world(places: Tensor, image: PositionImage) -> Tensor:
+    return rotations.rotate_about_y(places, image.heading[..., None])
 
 
 def _average_seconds(values: Float[Tensor, "batch frames columns"]) -> Float[Tensor, "batch seconds columns"]:

@@ -1,4 +1,4 @@
-"""The refiner's critic, a bidirectional LSTM on end effectors, and its memory (Wang et al. 2019, Eq. 12 and 4.2.2)."""
+"""The refiner's critic, a bidirectional LSTM on end effectors (Wang et al. 2019, Eq. 12)."""
 
 from collections.abc import Sequence
 
@@ -48,18 +48,3 @@ class Critic(nn.Module):
         seen = torch.cat(seen, dim=-1).transpose(1, 2)
         hidden, _ = self.lstm(torch.nn.functional.leaky_relu(self.first(seen), 0.2).transpose(1, 2))
         return self.last(hidden)[..., 0]
-
-
-class HistoryBuffer:
-    """Refined windows of earlier refiners, so that the critic does not forget faults that it once knew."""
-
-    def __init__(self, windows: Float[Tensor, "size frames features"]):
-        self.windows = windows.clone()
-
-    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
-        """Half a batch of the fresh ones, half of kept ones; then the fresh half takes the place of kept ones."""
-        half = len(fresh) // 2
-        picked = torch.randperm(len(self.windows), generator=generator)
-        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
-        self.windows[picked[half : 2 * half]] = fresh[:half]
-        return mixed
