@@ -22,6 +22,7 @@ from priors.training.recipes import (
     pose_transformer,
     refiner,
     tweener,
+    tweener_critic,
 )
 
 
@@ -87,6 +88,13 @@ def _timing(data, out, prior):
     return keyframe_timing.KeyframeTimingRecipe(data, out, settings=settings, validate_steps=2)
 
 
+def _criticised(data, out, prior):
+    usual = tweener_critic.CriticisedTweenerRecipe(data, out, config=tiny_tweener.CONFIG, validate_steps=2)
+    settings = replace(usual.settings, steps=6, batch=300)
+    critic = tweener_critic.CriticSettings(begin=1, batch=2, history=4, frames=60)
+    return replace(usual, settings=settings, critic=critic, report_steps=2)
+
+
 MODELS = {
     "lstm-gmm": Model(lstm_gmm.DensityTrainer, _density),
     "refiner": Model(refiner.AdversarialTrainer, _refiner),
@@ -100,3 +108,6 @@ MODELS = {
     "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
     "tweener": Model(tweener.TweenerTrainer, _windowed(tweener.TweenerRecipe, tiny_tweener.CONFIG)),
 }
+"""By the names of their commands."""
+VARIANTS = {"tweener with a critic": Model(tweener_critic.CriticisedTrainer, _criticised)}
+"""What those commands train with other options."""

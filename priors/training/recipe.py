@@ -225,7 +225,7 @@ class NetworkRecipe(Recipe[C, S, G]):
     def read_initial_weights(self, name: str, trainer: G) -> dict[str, Tensor]:
         """Another model's weights for this trainer's network; CheckpointError if they are not of its shape."""
         tensors, card = checkpoints.load(checkpoints.locate(name))
-        if card.kind != self.kind or card.config != self.config.as_card():
+        if card.kind != self.kind or type(self.config).of_card(card.config) != self.config:
             wanted = f"{self.kind} of {self.config.as_card()}"
             raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
         return tensors

@@ -33,6 +33,11 @@ _DOWN_RATIOS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 _UP_RATIOS = ((1.4, 1.6), (2.2, 2.8), (3.6, 4.6), (5.8, 7.2), (8.8, 10.6), (12.6, 14.8))
 
 
+KEY_INPUTS, ARCHITECTURES = ("dense", "sparse"), ("two-stage", "one-stage", "upsampling")
+_ROOT_ROWS = 3  # of a generator that makes the hips' way: ahead of the reference, beside it, and height
+_ROOT_UNIT, _HIPS_HEIGHT = 0.3, 0.9  # metres
+
+
 @dataclass(frozen=True)
 class GeneratorConfig(NetworkConfig):
     """Shape of the network."""
@@ -46,7 +51,15 @@ class GeneratorConfig(NetworkConfig):
     skips: bool = True
     """Whether the decoder's stages also see what the encoder was given at their rate, which the paper's do not."""
 
+    keys: str = "dense"
+    """`dense` copies the nearest key into every frame; `sparse` tells keys in their own frames alone (figure 7)."""
+    architecture: str = "two-stage"
+    """`two-stage`, which leaves the hips' way to the path predictor; `one-stage` makes it itself, and `upsampling`
+    repeats frames instead of transposing convolutions (figure 8)."""
+
     def __post_init__(self):
+        if self.keys not in KEY_INPUTS or self.architecture not in ARCHITECTURES:
+            raise RequestError(f"a generator has keys of {KEY_INPUTS} and is one of {ARCHITECTURES}, got {self}")
         if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES or min(*self.widths, *self.up_widths) < 1:
             raise RequestError(f"a generator needs {_STAGES} positive widths down and as many up, got {self}")
         if self.style < 1:
@@ -65,6 +78,8 @@ class GeneratedPoses:
     """Rotations and places from the hips, seen along the reference's heading."""
     responses: tuple[Tensor, ...]
     """What its convolutions gave, for batch regularisation."""
+    root: Float[Tensor, "batch frames 3"] | None = None
+    """Where the hips are seen from the reference, metres, if the generator makes their way itself."""
 
     def turn_to_world(self, image: PositionImage) -> ConstrainedPose:
         """Turn the poses from along the reference of the image that they were made for to the world's axes."""
@@ -112,17 +127,19 @@ class GeneratorNetwork(nn.Module):
             ResidualConv(channels, kernel=4, stride=2, padding=1, ratio=ratio)
             for channels, ratio in zip(zip((INPUT_ROWS, *widths[:-1]), widths, strict=True), _DOWN_RATIOS, strict=True)
         )
-        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths))
+        repeated = self.config.architecture == "upsampling"
+        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths, repeated=repeated))
         seen = reversed((INPUT_ROWS, *widths[:-1]))
         self.skips = nn.ModuleList(
             nn.Conv1d(ins, outs, 1) for ins, outs in zip(seen, self.config.up_widths, strict=True) if self.config.skips
         )
         # Without a PReLU, which would halve the angles on one side.
-        self.last = nn.Conv1d(self.config.up_widths[-1], POSE_ROWS, 3, padding=1)
+        rows = POSE_ROWS + (_ROOT_ROWS if self.config.architecture == "one-stage" else 0)
+        self.last = nn.Conv1d(self.config.up_widths[-1], rows, 3, padding=1)
         self.kinematics = RangeConstrainedKinematics()
         # Hips upright and joints about the middle of their ranges, until training.
         nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * self.config.up_widths[-1]))
-        middle = torch.zeros(POSE_ROWS)
+        middle = torch.zeros(rows)
         middle[:6] = rotations.to_six(torch.eye(3))
         self.last.bias = nn.Parameter(middle)
 
@@ -130,7 +147,9 @@ class GeneratorNetwork(nn.Module):
         """Generate poses of every frame of an image, of any length; `style` is what the style encoder gives, or 0."""
         rows = self.encode_rows(image).transpose(1, 2)
         made, responses = self.generate(rows, style)
-        return GeneratedPoses(self.kinematics(made.transpose(1, 2)), responses)
+        pose, way = made.transpose(1, 2).split([POSE_ROWS, made.shape[1] - POSE_ROWS], dim=-1)
+        root = _ROOT_UNIT * way + way.new_tensor([0.0, _HIPS_HEIGHT, 0.0]) if way.shape[-1] else None
+        return GeneratedPoses(self.kinematics(pose), responses, root)
 
     def generate(
         self, rows: Float[Tensor, "batch rows frames"], style: Float[Tensor, "batch style"]
@@ -157,11 +176,14 @@ class GeneratorNetwork(nn.Module):
         """Encode the dense input of section 3.5, seen from the reference, in about unit size."""
         copied, away = image.copy_nearest()
         told = torch.isfinite(away)
-        places = torch.where(told, (copied - self.mean) / self.std, 0.0)
+        sparse = self.config.keys == "sparse"
+        places = torch.where(image.known_axes if sparse else told, (copied - self.mean) / self.std, 0.0)
+        distances = image.known_axes.to(places) if sparse else _scale_frames(away)
+        times = torch.zeros_like(_encode_times(image)) if sparse else _encode_times(image)
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
-        parts = [places.flatten(-2), _scale_frames(away).flatten(-2), step, turn, _encode_times(image)]
+        parts = [places.flatten(-2), distances.flatten(-2), step, turn, times]
         rows = torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
         return rows * image.present[..., None].to(rows)
 
@@ -188,12 +210,15 @@ def regularise_batch(responses: tuple[Tensor, ...]) -> Float[Tensor, ""]:
     return total
 
 
-def _make_decoder(inputs: int, widths: tuple[int, ...]) -> list[ResidualConv]:
+def _make_decoder(inputs: int, widths: tuple[int, ...], *, repeated: bool) -> list[ResidualConv]:
     layers = [ResidualConv((inputs, widths[0]), kernel=1, padding=0, ratio=1.0)]
     before = widths[0]
     for width, (plain, doubling) in zip(widths, _UP_RATIOS, strict=True):
         layers.append(ResidualConv((before, width), kernel=3, padding=1, ratio=plain))
-        layers.append(ResidualConv((width, width), kernel=4, stride=2, padding=1, ratio=doubling, transposed=True))
+        doubled = ResidualConv(
+            (width, width), kernel=4, stride=2, padding=1, ratio=doubling, transposed=True, repeated=repeated
+        )
+        layers.append(doubled)
         before = width
     return layers
 

@@ -8,10 +8,9 @@ from helpers import corpus, generator
 
 from mapctl import rotations
 from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
-from priors.training.augmentation.key_parts import PartSettings
+from priors.training.augmentation.key_parts import WHOLE
 from priors.training.augmentation.pose_windows import PoseWindows
 
-WHOLE = PartSettings(halves=0.0, places=0.0, drawings=0.0)
 SETTINGS = KeySettings(longest=200.0, open_ends=0.0, parts=WHOLE)
 
 

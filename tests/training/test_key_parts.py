@@ -9,14 +9,13 @@ from helpers import corpus, generator
 
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.key_layouts import KeySettings, draw_windows
-from priors.training.augmentation.key_parts import PartSettings, tell_parts
+from priors.training.augmentation.key_parts import WHOLE, tell_parts
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.tweening.keys import ToldParts, lead_reference, make_key_image
 
 BATCH, FRAMES = 60, 90
 LEGS = CANONICAL.indices(("leftLowerLeg", "rightLowerLeg", "leftFoot", "rightFoot", "leftToes", "rightToes"))
 ARMS = CANONICAL.indices(("leftHand", "rightHand", "head", "leftLowerArm", "rightLowerArm"))
-WHOLE = PartSettings(halves=0.0, places=0.0, drawings=0.0)
 
 
 def rolls(seed=0):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from ended_models import MODELS
+from ended_models import MODELS, VARIANTS
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
@@ -33,10 +33,11 @@ LONGEST = "denoiser"  # which the infiller's recipe is like; test_network_runs.p
 
 
 @pytest.fixture(
-    scope="module", params=[pytest.param(name, marks=pytest.mark.slow if name == LONGEST else ()) for name in MODELS]
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.slow if name == LONGEST else ()) for name in MODELS | VARIANTS],
 )
 def model(request):
-    return MODELS[request.param]
+    return (MODELS | VARIANTS)[request.param]
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,7 +1,7 @@
 """`mapctl train tweener`: the options of the generator of long in-betweens."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
@@ -21,30 +21,45 @@ class TrainTweener(ParallelOptions):
 
     path: Annotated[str, arg(metavar="NAME")] = "path"
     """Path predictor, bundled or trained, that tells where the hips go in what is made."""
-    critic_from: Annotated[str, arg(metavar="STEP|never")] = "never"
-    """Step at which a critic joins, which tells made motion from captured; the best weights of all are exported."""
+    critic_from: Annotated[str | None, arg(metavar="STEP|never")] = None
+    """Step at which a critic joins, which tells made motion from captured; the best weights of all are exported. never,
+    unless --paper is given."""
+    paper: bool = False
+    """Sizes, losses and optimiser as the paper prints them; other options still hold."""
     plain: bool = False
     """The network without the connections past its narrow middle, as in the paper, to compare."""
+    keys: Annotated[Literal["dense", "sparse"], arg(metavar="dense|sparse")] = "dense"
+    """Whether every frame gets a copy of the nearest key, or keys are told in their own frames alone, to compare."""
+    architecture: Annotated[
+        Literal["two-stage", "one-stage", "upsampling"], arg(metavar="two-stage|one-stage|upsampling")
+    ] = "two-stage"
+    """two-stage leaves the hips' way to the path predictor; one-stage makes it itself, and upsampling repeats frames
+    instead of transposing convolutions, to compare."""
 
     def recipe(self) -> "TweenerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
-        from priors.training.recipes.tweener import GeneratorConfig, TweenerRecipe, TweenerSettings
+        from priors.training.recipes.tweener import PAPER, GeneratorConfig, TweenerRecipe, TweenerSettings
 
+        common = self.common()
+        config, settings = PAPER if self.paper else (GeneratorConfig(), TweenerSettings())
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
+        settings = replace(settings, bfloat16=self.bfloat16, **given)
+        skips = config.skips and not self.plain
         everything = {
-            **self.common(),
-            "config": replace(GeneratorConfig(), skips=not self.plain),
-            "settings": (settings := replace(TweenerSettings(), bfloat16=self.bfloat16, **given)),
+            **common,
+            "config": replace(config, skips=skips, keys=self.keys, architecture=self.architecture),
+            "settings": settings,
             "skip_first": self.skip_first,
             "init": self.init,
             "processes": self.processes,
             "path": self.path,
         }
-        if self.critic_from == "never":
+        critic_from = self.critic_from or ("0" if self.paper else "never")
+        if critic_from == "never":
             return TweenerRecipe(**everything)
         from priors.training.recipes.tweener_critic import CriticisedTweenerRecipe, CriticSettings
 
-        begin = _parse_step(self.critic_from, settings.steps)
+        begin = _parse_step(critic_from, settings.steps)
         return CriticisedTweenerRecipe(**everything, critic=CriticSettings(begin))
 
 

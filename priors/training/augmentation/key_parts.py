@@ -29,6 +29,10 @@ class PartSettings:
     """Share of sequences with keys that are seen from one side."""
 
 
+WHOLE = PartSettings(halves=0.0, places=0.0, drawings=0.0)
+"""Keys are whole poses."""
+
+
 def tell_parts(
     known: Bool[Tensor, "batch frames"],
     heading: Float[Tensor, "batch frames"],

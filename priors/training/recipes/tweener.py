@@ -13,17 +13,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
+from mapctl.errors import RequestError
 from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.metrics.liveliness import NOTHING, Liveliness, measure_liveliness, see_from_hips
 from mapctl.skeleton import CANONICAL
 from priors.config import require_at_least
 from priors.training.augmentation.key_layouts import KeySequences, KeySettings, draw_splices, draw_windows
+from priors.training.augmentation.key_parts import WHOLE
 from priors.training.augmentation.pose_windows import PoseWindows, find_kind
 from priors.training.corpus import Corpus, Split
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.recipes.tweener_losses import Judge, LossWeights, compute_tweener_losses
 from priors.training.trainer import GradientTrainer
+from priors.tweening import generator
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
 from priors.tweening.keys import ToldParts, make_key_image
@@ -34,7 +37,6 @@ VALIDATED_FRAMES = 192
 _SHORTEST_VALIDATED = 90
 _VALIDATED_OF_KIND = 24
 _SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
-_SHORTEST_SPLICE, _LONGEST_SPLICE = 192, 1024  # frames
 _MIN_STD = 0.05  # metres
 _STYLE_POSES = 2, 8
 _FOREIGN_STYLES = 0.7  # share of styles of spliced sequences that are of another clip
@@ -52,6 +54,12 @@ class TweenerSettings:
     """Share of them in sequences that are spliced of several clips; the others are in windows of one."""
     window: int = 330
     """Frames of the longest window of one clip; of those the shortest have 64."""
+    splice: tuple[int, int] = (192, 1024)
+    """Frames of the shortest and the longest sequence that is spliced."""
+    optimiser: str = "adam"
+    """`adam`, or the paper's `rmsprop`, whose learning rate does not fall."""
+    root_growth: float = 0.0
+    """What each 1,000 steps add to the weight of the way from key to key, up to eight times its beginning."""
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
     weights: LossWeights = field(default_factory=LossWeights)
@@ -75,6 +83,40 @@ class TweenerSettings:
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch")
         require_at_least(self, _LEAST_WINDOW, "window")
+        if self.optimiser not in ("adam", "rmsprop"):
+            raise RequestError(f"optimiser must be adam or rmsprop, got {self.optimiser!r}")
+
+
+PAPER = (
+    generator.PAPER,
+    TweenerSettings(
+        steps=560_000,
+        batch=4 * 2048,
+        spliced=1.0,
+        splice=(2048, 2048),
+        optimiser="rmsprop",
+        learning_rate=1e-5,
+        styled=1.0,
+        root_growth=1.0,
+        weights=LossWeights(
+            places=0.0,
+            pace=0.0,
+            activity=0.0,
+            turns=0.0,
+            keys=300.0,
+            feet=0.0,
+            contacts=0.0,
+            path=0.0,
+            root=10.0,
+            style=50.0,
+            dwell=50.0,
+            regularisation=5.0,
+            squares=True,
+        ),
+        layout=KeySettings(longest=300.0, first_longest=300.0, shortest=300.0, runs=0.0, open_ends=0.0, parts=WHOLE),
+    ),
+)
+"""The variant as the paper prints it: section 3.6, table 5 and appendix C, at 30 frames a second."""
 
 
 class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
@@ -99,11 +141,20 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """Adam with the short memory that pays where the data change from step to step."""
-        return {"optimiser": torch.optim.Adam(self.network.parameters(), lr=self.learning_rate, betas=(0.5, 0.9))}
+        weights, rate = self.network.parameters(), self.learning_rate
+        if self.settings.optimiser == "rmsprop":
+            return {"optimiser": torch.optim.RMSprop(weights, lr=rate)}
+        return {"optimiser": torch.optim.Adam(weights, lr=rate, betas=(0.5, 0.9))}
+
+    def compute_learning_rate(self) -> float:
+        """At the current step."""
+        return self.learning_rate if self.settings.optimiser == "rmsprop" else super().compute_learning_rate()
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        return self.compute_losses(self.settings.weights)
+        weights = self.settings.weights
+        growth = self.settings.root_growth * (self.step // 1000)
+        return self.compute_losses(replace(weights, root=min(weights.root + growth, 8 * weights.root)))
 
     def compute_losses(self, weights: LossWeights, judge: Judge | None = None) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch at these weights; a `judge` adds to both its halves'."""
@@ -121,7 +172,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
             tempo=settings.tempo,
             generator=self.generator,
         )
-        frames = self._draw_frames(_SHORTEST_SPLICE, _LONGEST_SPLICE)
+        frames = self._draw_frames(*settings.splice)
         batch = max(1, round(settings.spliced * settings.batch / frames))
         other = draw_splices(self.windows, batch, frames, settings.layout, progress=progress, generator=self.generator)
         parts, spliced = (
@@ -183,8 +234,12 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
         return replace(done, data={**done.data, "path": path_predictor.compute_hash(self.path)})
 
     def format_shape(self) -> list[str]:
-        """Whether it is the paper's plain network."""
-        return [] if self.config.skips else ["--plain"]
+        """Options for a network that is not the usual one."""
+        usual, shape = GeneratorConfig(), ["--plain"] * (not self.config.skips)
+        for name in ("keys", "architecture"):
+            if (given := getattr(self.config, name)) != getattr(usual, name):
+                shape += [f"--{name} {given}"]
+        return ["--paper"] if self.config.widths == generator.PAPER.widths else shape
 
     def format_command(self) -> str:
         """What to type for the same run, for the card."""

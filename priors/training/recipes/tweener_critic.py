@@ -13,22 +13,24 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mapctl import kinematics
+from mapctl.errors import RequestError
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from priors.config import require_at_least
 from priors.training.adversaries import body_motion
-from priors.training.adversaries.body_motion import FIELD, BodyMotionCritic
+from priors.training.adversaries.body_motion import BodyMotionCritic
 from priors.training.adversaries.guard import find_winner
 from priors.training.adversaries.history import HistoryBuffer
 from priors.training.augmentation.key_layouts import KeySettings, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Row
+from priors.training.recipe import Export, Gathered, Row
 from priors.training.recipes.tweener import TweenerRecipe, TweenerTrainer, measure_kinds
 from priors.training.trainer import Trainer, draw_weights, make_divergence_error
 from priors.tweening.generator import GeneratorNetwork, regularise_batch
 from priors.tweening.keys import ToldParts, make_key_image
 
 _ADAM = (0.5, 0.9)
+_STRIDE = 2 ** len(body_motion.WIDTHS)  # frames for which the critic has a score
 _JUDGED_CLIPS = 32  # windows of each set that the critic scores for the guard
 _GAP = 120  # frames of the gaps that are compared before and after
 
@@ -52,7 +54,7 @@ class CriticSettings:
     far: float = 0.15
     """What it counts at least."""
     frames: int = 126
-    """Frames of a window that the critic sees."""
+    """Frames of a window that the critic sees; a score is of 94 (body_motion.FIELD)."""
     batch: int = 24
     """Windows of captured motion an update."""
     history: int = 192
@@ -69,7 +71,7 @@ class CriticSettings:
     """Share of the past in the running mean of the generator's weights, which is what is kept."""
 
     def __post_init__(self):
-        require_at_least(self, FIELD, "frames")
+        require_at_least(self, _STRIDE, "frames")
         require_at_least(self, 1, "batch", "history", "penalised", "ramp")
 
 
@@ -79,6 +81,10 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
 
     def __init__(self, learner: TweenerTrainer, critic: CriticSettings):
         super().__init__(steps=learner.settings.steps, seed=learner.settings.seed)
+        if learner.longest < critic.frames + 2:
+            raise RequestError(
+                f"the critic sees windows of {critic.frames + 2} frames; the longest there are have {learner.longest}"
+            )
         self.learner, self.settings = learner, critic
         self.generator = learner.generator
         self.network, self.before = (deepcopy(learner.network).requires_grad_(False) for _ in range(2))
@@ -254,7 +260,13 @@ class CriticisedTweenerRecipe(TweenerRecipe):
 
     def pin(self, trainer: Any, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""
-        return super().pin(trainer, corpus) | {"critic": vars(self.critic)}
+        return super().pin(trainer.learner, corpus) | {"critic": vars(self.critic)}
+
+    def export(self, trainer: Any, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """What is written at the end: the best weights of all, and what they and the critic measured."""
+        trainer.learner.network.load_state_dict(trainer.network.state_dict())
+        done = super().export(trainer.learner, gathered, curve)
+        return replace(done, quality={**done.quality, "validation": min(curve, key=self.score)})
 
     def find_stop_reason(self, trainer: Any, rows: Sequence[Row]) -> str | None:
         """Why to stop after these losses since the last line of news, if there is a reason."""

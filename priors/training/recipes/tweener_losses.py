@@ -66,6 +66,8 @@ class LossWeights:
     """Frames from the nearest key at which what a performer did counts half."""
     far: float = 0.0
     """What it counts at least, however far the nearest key is."""
+    squares: bool = False
+    """Whether keys, the style's poses and the way count by their distances' squares, as in the paper."""
 
 
 def see_without_root(
@@ -108,12 +110,16 @@ def compute_tweener_losses(
         "pace": shown.pace(_between(weight)),
         "activity": shown.activity(sequences.truthful),
         "feet": shown.feet(motion, _between(weight)),
-        "keys": shown.keys(sequences.told) + 0.1 * _average(turned, whole),
+        "keys": shown.keys(sequences.told, squares=weights.squares) + 0.1 * _average(turned, whole),
     }
     trajectory = path(LocalMotion.of_world(made.places[some], heading[some]))
-    terms |= _compute_path_terms(trajectory, heading[some], sequences, some, weights)
+    way = trajectory.integrate(heading[some])
+    if made_poses.root is not None:
+        way = image.to_world(made_poses.root[..., None, :])[..., 0, :][some]
+    terms |= _compute_path_terms(trajectory, way, sequences, some, weights)
     without_root = see_without_root(made.places, made.local_matrix[..., 0, :, :])
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
+    apart = apart.square() if weights.squares else apart
     terms["style"] = _compute_style_error(apart, styled)
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
     terms["regularisation"] = regularise_batch(tuple(each[some] for each in made_poses.responses))
@@ -152,10 +158,10 @@ class _Errors:
             error = error + _average(off, counts)
         return error
 
-    def keys(self, told: ToldParts) -> Tensor:
+    def keys(self, told: ToldParts, *, squares: bool) -> Tensor:
         """Compare the coordinates that keys tell of joints but the hips, from which they are seen."""
         joints = told.axes[..., 1:, :].any(dim=-1).float()
-        return _average(_length((self.off * told.axes)[..., 1:, :]), joints)
+        return _average(_measure((self.off * told.axes)[..., 1:, :], squares=squares), joints)
 
     def feet(self, motion: PartialMotion, weight: Tensor) -> Tensor:
         planted = motion.contacts[:, 1:] * motion.contacts[:, :-1]
@@ -163,12 +169,11 @@ class _Errors:
 
 
 def _compute_path_terms(
-    trajectory: RootTrajectory, heading: Tensor, sequences: KeySequences, some: slice, weights: LossWeights
+    trajectory: RootTrajectory, made: Tensor, sequences: KeySequences, some: slice, weights: LossWeights
 ) -> dict[str, Tensor]:
     """Errors of where the hips of some sequences go, as the path predictor sees it, metres, and of contacts, nats."""
     motion, known, truthful = sequences.motion, sequences.known[some], sequences.truthful[some]
     hips, contacts = motion.root_position[some], motion.contacts[some]
-    made = trajectory.integrate(heading)
     steps = truthful.float()
     errors = []
     for span in [span for span in _PATH_SPANS if span < steps.shape[1]]:
@@ -182,7 +187,7 @@ def _compute_path_terms(
     nats = cross_entropy(trajectory.contacts, contacts, reduction="none").mean(dim=-1)
     return {
         "path": torch.stack(errors).mean() + height,
-        "root": (_length(off) * share).sum(dim=1).mean(),
+        "root": (_measure(off, squares=weights.squares) * share).sum(dim=1).mean(),
         "contacts": _average(nats, _weigh_frames(known, weights) * truthful),
     }
 
@@ -231,6 +236,10 @@ def _between(weight: Float[Tensor, "batch frames"]) -> Tensor:
 
 def _average(values: Tensor, weight: Tensor) -> Tensor:
     return (values * weight).sum() / weight.sum().clamp_min(1e-6)
+
+
+def _measure(vectors: Tensor, *, squares: bool) -> Tensor:
+    return vectors.square().sum(dim=-1) if squares else _length(vectors)
 
 
 def _length(vectors: Tensor) -> Tensor:
