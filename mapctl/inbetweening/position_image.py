@@ -81,6 +81,18 @@ class PositionImage:
             -self.heading,
         )
 
+    def extended(self, frames: int) -> "PositionImage":
+        """Return the image with so many frames before it and after it of which nothing is known; the reference stands
+        still there."""
+        known = torch.nn.functional.pad(self.known_axes, (0, 0, 0, 0, frames, frames))
+        contacts = torch.nn.functional.pad(self.contacts, (0, 0, frames, frames), value=0.5)
+        held = torch.arange(-frames, self.places.shape[1] + frames, device=self.places.device)
+        held = held.clamp(0, self.places.shape[1] - 1)
+        places, present, ground, heading = (
+            each[:, held] for each in (self.places, self.present, self.ground, self.heading)
+        )
+        return PositionImage(places, contacts, known, present, ground, heading)
+
     @property
     def known(self) -> Bool[Tensor, "batch frames joints"]:
         """Whether a joint's position is known, all of it."""

@@ -1,5 +1,7 @@
 """The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight says."""
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -50,3 +52,20 @@ def interpolate_offsets(
     weight = fade_weight(seconds, fps) + _CONSTRAINT_WEIGHT * firm.double().numpy()
     right = _CONSTRAINT_WEIGHT * (values * firm[:, None]).double().numpy()
     return torch.as_tensor(solve_offsets(right, weight, start=0, frames=count)).to(values)
+
+
+def smooth_between(
+    values: Float[Tensor, "frames width"], held: Bool[Tensor, " frames"], *, hertz: float, fps: float
+) -> Float[Tensor, "frames width"]:
+    """Smooth values by the offsets that leave least second differences, with none in the frames that are held: of what
+    trembles at this frequency half is left, of slower motion nearly all (Whittaker 1923). `hertz` is at most half of
+    `fps`."""
+    if len(values) < 3:
+        return values
+    bends = torch.diff(values.double(), n=2, dim=0).numpy()
+    right = np.zeros(values.shape)
+    for tap, weight in enumerate(SECOND_DIFFERENCE):
+        right[tap : tap + len(bends)] -= weight * bends
+    firm = (2 * math.sin(math.pi * hertz / fps)) ** 4 + _CONSTRAINT_WEIGHT * held.double().numpy()
+    offsets = torch.as_tensor(solve_offsets(right, firm, start=0, frames=len(values))).to(values)
+    return torch.where(held[:, None], values, values + offsets)

@@ -18,7 +18,7 @@ from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import true_intervals
-from mapctl.numerics.smooth_offsets import interpolate_offsets
+from mapctl.numerics.smooth_offsets import interpolate_offsets, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
 from mapctl.skeleton import TOE_JOINTS
 from priors import checkpoints
@@ -28,6 +28,12 @@ from priors.tweening.keys import see_contacts
 
 SOURCE = "tweener"
 """Name of the in-betweener in notes."""
+_MARGIN = 16
+"""Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
+poses jump, by three times what mocap's do, and keys stand there."""
+_TREMBLE_HZ = 7.0
+"""Frequency of which half is left in the hips' way: told by a body that was made they tremble with its toes, three times
+as much as mocap's."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
@@ -61,7 +67,8 @@ class Tweener(Inbetweener):
         shown, missing = query.motion, query.missing
         image, origin = _show(query)
         style = torch.zeros(1, self.network.config.style) if self.style is None else self.style[None]
-        local = self.network(image, style).turn_to_world(image).local_matrix[0]
+        wide = image.extended(_MARGIN)
+        local = self.network(wide, style).turn_to_world(wide).local_matrix[0, _MARGIN:-_MARGIN]
         made = rotations.from_matrix(local.double())
         quats = torch.where(missing.joints[..., None], _meet_keys(made, query), shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
@@ -82,7 +89,8 @@ class Tweener(Inbetweener):
         seen = still.joint_positions().float()[None]
         predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
         way = predicted.integrate(facing.float()[None])[0].double()
-        led = close_path(way, body.root_position - origin, query.missing.root) + origin
+        led = close_path(way, body.root_position - origin, query.missing.root)
+        led = smooth_between(led, ~query.missing.root, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
         if query.keep_trajectory:
             led = torch.cat([body.root_position[:, :1], led[:, 1:2], body.root_position[:, 2:]], dim=-1)
         return led, predicted.contacts[0]

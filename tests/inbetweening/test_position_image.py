@@ -116,3 +116,16 @@ def test_a_batch_is_its_members():
     )
     assert torch.allclose(both.places, torch.cat([first.places, second.places]), atol=1e-12)
     assert torch.allclose(both.ground, torch.cat([first.ground, second.ground]), atol=1e-12)
+
+
+def test_frames_around_a_motion_tell_nothing_and_change_nothing_within():
+    image = shown(walk(FRAMES, turn_rate=1.0), with_hole(0, 3))
+    wide = image.extended(6)
+    for name in ("places", "contacts", "known_axes", "present", "ground", "heading"):
+        assert torch.equal(getattr(wide, name)[:, 6:-6], getattr(image, name))
+        assert getattr(wide, name).shape[1] == FRAMES + 12
+    outside = torch.cat([wide.known_axes[:, :6], wide.known_axes[:, -6:]])
+    assert not outside.any()
+    assert bool((wide.contacts[:, -6:] == 0.5).all())
+    assert bool((wide.ground[:, -6:] == image.ground[:, -1:]).all())
+    assert bool(wide.present.all())

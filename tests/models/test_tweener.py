@@ -59,13 +59,41 @@ def test_poses_are_the_network_s_own_rotations_away_from_keys():
     torch.testing.assert_close(answer.local_quat_xyzw, again.local_quat_xyzw)
 
 
+def test_the_first_and_the_last_frame_are_not_where_its_convolutions_end():
+    """A network that answers only so far as it is asked would let keys there twitch."""
+    query, made = query_of(walk(320), (1, 319)), tiny_tweener()
+    seen = []
+    made.network.register_forward_hook(lambda _, given, answer: seen.append((given[0], answer)))
+    answer = made.propose(query).motion
+    ((image, poses),) = seen
+    assert image.places.shape[1] >= 320 + 2 * 16
+    first = int(image.known[0].any(dim=1).nonzero()[0])
+    assert first >= 16
+    wanted = rotations.from_matrix(poses.pose.local_matrix[0, first + 160, 1:].double())
+    same = (wanted * answer.local_quat_xyzw[160, 1:]).sum(dim=-1).abs()
+    assert float((1 - same).max()) < 1e-6  # the frames are the right ones
+
+
+def test_hips_that_tremble_are_led_calmly():
+    motion = walk(100)
+    shaken = replace(motion, root_position=motion.root_position + 0.01 * (-1.0) ** torch.arange(100)[:, None])
+    query = query_of(motion, (1, 99))
+    calm, trembling = (
+        torch.diff(tiny_tweener(path=ToldPath(told)).propose(query).motion.root_position, n=3, dim=0)[10:-10].norm()
+        for told in (motion, shaken)
+    )
+    told = torch.diff(shaken.root_position, n=3, dim=0)[10:-10].norm()
+    assert float(trembling) < 0.4 * float(told)
+    assert float(calm) < float(trembling)
+
+
 def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
     motion = walk(100)
     query = query_of(motion, (1, 99))
     for stretch in (1.0, 1.3):
         made = tiny_tweener(path=ToldPath(motion, stretch)).propose(query).motion
         away = (made.root_position - motion.root_position)[:, ::2].norm(dim=-1)
-        assert float(away.max()) < 0.08  # the made body faces elsewhere than the walk's
+        assert float(away.max()) < 0.1  # the made body faces elsewhere than the walk's
         steps = torch.diff(made.root_position[:, 2])
         assert float(steps.min()) > 0
 

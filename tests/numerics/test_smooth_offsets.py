@@ -1,9 +1,17 @@
 """The smoothest offsets, against the same equations written out."""
 
+import math
+
 import numpy as np
 import pytest
+import torch
 
-from mapctl.numerics.smooth_offsets import SECOND_DIFFERENCE, find_overlapping_differences, solve_offsets
+from mapctl.numerics.smooth_offsets import (
+    SECOND_DIFFERENCE,
+    find_overlapping_differences,
+    smooth_between,
+    solve_offsets,
+)
 
 SPANS = [(0, 9), (0, 3), (3, 4), (3, 5), (4, 9), (8, 9), (7, 9), (1, 8)]
 
@@ -20,3 +28,26 @@ def test_offsets_solve_the_equations(start, stop, firm):
     wanted = np.linalg.solve(ours.T @ ours + firm * np.eye(stop - start), right)
     assert np.allclose(solve_offsets(right, firm, start=start, frames=9), wanted, atol=1e-12)
     assert list(find_overlapping_differences(start, stop, 9)) == list(ours.any(axis=1).nonzero()[0])
+
+
+def tremble(hertz, frames=240, fps=30.0):
+    """A sine of this frequency, one for each column."""
+    return torch.sin(2 * math.pi * hertz / fps * torch.arange(frames).double())[:, None]
+
+
+def test_of_a_tremble_half_is_left_and_nearly_all_of_what_is_slower():
+    free = torch.zeros(240, dtype=torch.bool)
+    for hertz, least, most in ((7.0, 0.45, 0.55), (14.0, 0.0, 0.3), (1.0, 0.99, 1.001)):
+        made = smooth_between(tremble(hertz), free, hertz=7.0, fps=30.0)[40:-40]
+        assert least < float(made.std() / tremble(hertz)[40:-40].std()) < most
+
+
+def test_what_is_held_stays_to_the_bit_and_a_straight_line_to_rounding():
+    values, held = tremble(9.0), torch.zeros(240, dtype=torch.bool)
+    held[[0, 77, 78, 239]] = True
+    made = smooth_between(values, held, hertz=7.0, fps=30.0)
+    assert torch.equal(made[held], values[held])
+    assert float((made - values)[~held].abs().mean()) > 0.1
+    line = torch.linspace(-3.0, 4.0, 50).double()[:, None]
+    torch.testing.assert_close(smooth_between(line, held[:50], hertz=3.0, fps=30.0), line)
+    assert torch.equal(smooth_between(line[:2], held[1:3], hertz=3.0, fps=30.0), line[:2])
