@@ -165,6 +165,23 @@ class Tweener(Table):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Representation(Table):
+    """Table 1 of Zhou et al. 2020: which numbers a network should tell rotations by. Networks are trained here, half an
+    hour in all, and measured on clips that they do not see."""
+
+    work = "mapctl.commands.bench.tweener.representation"
+
+    data: options.DataFolder
+    """Folder of .bvh files, searched below."""
+    steps: options.Count = 20_000
+    """Training steps of each network."""
+    seed: options.Count = 1
+    """Seed of what is held out, weights, poses and headings."""
+    cache: options.MaybeDataFolder = None
+    """Folder of a training run's clips as features (RUN/cache), which take minutes to read."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Gaps(Tween):
     """Such clips without frames in their middle: how far the answers are from the truth, by who gave them."""
 
@@ -238,6 +255,7 @@ TABLES: dict[str, type[Table]] = {
     "infill": Infill,
     "tween": Tween,
     "tweener": Tweener,
+    "representation": Representation,
     "gaps": Gaps,
     "transitions": Transitions,
     "timing": Timing,
