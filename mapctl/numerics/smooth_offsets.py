@@ -1,4 +1,11 @@
-"""The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight says."""
+"""The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight says.
+
+What a motion misses keys, targets, contacts and seams by is made good by these everywhere: by `interpolate_offsets` of
+places and `interpolate_turns` of rotations where the misses are known. Two are not told so: a seam between poses that
+both are right (`inbetweening.seam_blending`), whose bend is to vanish and whose offset is what comes out, by the same
+equations; and the way over the ground (`inbetweening.path_closing`), whose offsets go with the way walked, since the
+smoothest ones make who stands slide.
+"""
 
 import math
 
@@ -8,6 +15,8 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.linalg import solveh_banded
 from torch import Tensor
+
+from mapctl import rotations
 
 _CONSTRAINT_WEIGHT = 1e9  # how much more a given value counts than smoothness
 SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
@@ -45,13 +54,34 @@ def interpolate_offsets(
     values: Float[Tensor, "frames width"], firm: Bool[Tensor, " frames"], *, seconds: float, fps: float
 ) -> Float[Tensor, "frames width"]:
     """Interpolate the smoothest offsets that have the values in the frames that are firm, and fade to 0 away from them
-    over about so many seconds: a value v then asks for an acceleration of v / seconds^2."""
+    over about so many seconds: a value v then asks for an acceleration of v / seconds^2. They do not fade if `seconds`
+    are infinite: then at least two frames must be firm."""
     count = len(values)
     if count < 3:
         return torch.where(firm[:, None], values, 0.0)
     weight = fade_weight(seconds, fps) + _CONSTRAINT_WEIGHT * firm.double().numpy()
     right = _CONSTRAINT_WEIGHT * (values * firm[:, None]).double().numpy()
     return torch.as_tensor(solve_offsets(right, weight, start=0, frames=count)).to(values)
+
+
+def interpolate_turns(
+    made_xyzw: Float[Tensor, "frames joints 4"],
+    wanted_xyzw: Float[Tensor, "frames joints 4"],
+    firm: Bool[Tensor, "frames joints"],
+    *,
+    seconds: float,
+    fps: float,
+) -> Float[Tensor, "frames joints 4"]:
+    """Turn joints, smoothly over the frames around, until they are as wanted in the frames in which they are firm, as
+    `interpolate_offsets` does; joints that are never firm stay. `wanted_xyzw` may hold anything finite elsewhere."""
+    off = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(made_xyzw), wanted_xyzw))
+    offsets = torch.zeros_like(off)
+    for pattern in firm.T.unique(dim=0):
+        if bool(pattern.any()):
+            joints = (pattern == firm.T).all(dim=1)
+            solved = interpolate_offsets(off[:, joints].flatten(1), pattern, seconds=seconds, fps=fps)
+            offsets[:, joints] = solved.unflatten(1, (-1, 3))
+    return rotations.multiply(made_xyzw, rotations.from_rotation_vector(offsets))
 
 
 def smooth_between(

@@ -18,7 +18,7 @@ from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import true_intervals
-from mapctl.numerics.smooth_offsets import interpolate_offsets, smooth_between
+from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
 from mapctl.skeleton import TOE_JOINTS
 from priors import checkpoints
@@ -32,8 +32,8 @@ _MARGIN = 16
 """Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
 poses jump, by three times what mocap's do, and keys stand there."""
 _TREMBLE_HZ = 7.0
-"""Frequency of which half is left in the hips' way: told by a body that was made they tremble with its toes, three times
-as much as mocap's."""
+"""Frequency of which half is left in the hips' way: led by a body that was made they tremble with its toes, three
+times as much as mocap's."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
@@ -70,7 +70,8 @@ class Tweener(Inbetweener):
         wide = image.extended(_MARGIN)
         local = self.network(wide, style).turn_to_world(wide).local_matrix[0, _MARGIN:-_MARGIN]
         made = rotations.from_matrix(local.double())
-        quats = torch.where(missing.joints[..., None], _meet_keys(made, query), shown.local_quat_xyzw)
+        met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
+        quats = torch.where(missing.joints[..., None], met, shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
         root, logits = self._lead(body, query, origin)
         root = torch.where(missing.root[:, None], root * query.scale, shown.root_position)
@@ -112,20 +113,6 @@ def _show(query: GapQuery) -> tuple[PositionImage, Float[Tensor, " 3"]]:
         toes=TOE_JOINTS,
     )
     return image, origin
-
-
-def _meet_keys(made: Float[Tensor, "frames joints 4"], query: GapQuery) -> Float[Tensor, "frames joints 4"]:
-    """Turn joints, smoothly over the frames around, until they are as they are known to be."""
-    wanted, known = query.motion.local_quat_xyzw, ~query.missing.joints
-    off = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(made), wanted))
-    offsets = torch.zeros_like(off)
-    for pattern in known.T.unique(dim=0):
-        joints = (pattern == known.T).all(dim=1)
-        if bool(pattern.any()):
-            values = torch.where(pattern[:, None], off[:, joints].flatten(1), 0.0)
-            solved = interpolate_offsets(values, pattern, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
-            offsets[:, joints] = solved.unflatten(1, (-1, 3))
-    return rotations.multiply(made, rotations.from_rotation_vector(offsets))
 
 
 def _find_too_long(query: GapQuery) -> Iterator[GapSource]:

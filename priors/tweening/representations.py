@@ -5,6 +5,7 @@ al. 2020, table 1, repeat it. Positions of joints in, rotations out, and forward
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -104,11 +105,7 @@ class InverseKinematicsNetwork(nn.Module):
         """Positions are seen in this unit, metres."""
         super().__init__()
         sizes, self.unit = (3 * _JOINTS, *[width] * 4), unit
-        hidden = [
-            layer
-            for ins, outs in zip(sizes[:-1], sizes[1:], strict=True)
-            for layer in (nn.Linear(ins, outs), nn.LeakyReLU())
-        ]
+        hidden = [layer for ins, outs in pairwise(sizes) for layer in (nn.Linear(ins, outs), nn.LeakyReLU())]
         self.layers = nn.Sequential(*hidden, nn.Linear(width, rows))
 
     def forward(self, places: Float[Tensor, "batch joints 3"]) -> Float[Tensor, "batch rows"]:

@@ -9,7 +9,7 @@ from helpers import run, walk
 from tiny_path import save_tiny_path
 from tiny_tweener import card, network
 
-from controllers.benchmarks.tweener.long_gaps import Method, benchmark_long_gaps, cut_middle
+from controllers.benchmarks.tweener.long_gaps import Method, benchmark_long_gaps, cut_middle, measure_key_jerk
 from controllers.inbetweening.pipeline import InfillSettings
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import estimate_contact_logits
@@ -48,6 +48,18 @@ def test_who_knows_the_motion_is_as_alive_as_mocap_and_slerp_is_not():
     assert slerp["error_cm"] > 2
     assert 0.4 < slow["speed"] < 0.75
     assert slow["jerk"] > slerp["jerk"]
+    assert told["key_jerk"] < 1.5
+
+
+def test_a_body_that_twitches_beside_a_key_is_told():
+    motion = walk(60)
+    own = measure_key_jerk(motion, motion)
+    assert 0.05 < own < 1.5
+    for frame, least in ((2, 2), (57, 2), (30, 0)):
+        root = motion.root_position.clone()
+        root[frame] += 0.05
+        found = measure_key_jerk(replace(motion, root_position=root), motion)
+        assert found > least * own if least else found == own
 
 
 def test_gaps_lie_in_the_middle_and_shorter_clips_are_taken_whole():

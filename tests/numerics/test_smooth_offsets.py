@@ -5,10 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import generator
 
+from mapctl import rotations
 from mapctl.numerics.smooth_offsets import (
     SECOND_DIFFERENCE,
     find_overlapping_differences,
+    interpolate_offsets,
+    interpolate_turns,
     smooth_between,
     solve_offsets,
 )
@@ -51,3 +55,31 @@ def test_what_is_held_stays_to_the_bit_and_a_straight_line_to_rounding():
     line = torch.linspace(-3.0, 4.0, 50).double()[:, None]
     torch.testing.assert_close(smooth_between(line, held[:50], hertz=3.0, fps=30.0), line)
     assert torch.equal(smooth_between(line[:2], held[1:3], hertz=3.0, fps=30.0), line[:2])
+
+
+def test_offsets_that_do_not_fade_are_the_cubic_that_leaves_and_arrives_at_rest():
+    held = torch.ones(34, dtype=torch.bool)
+    held[2:-2] = False
+    values = torch.zeros(34, 1).double()
+    values[-2:] = 0.7
+    found = interpolate_offsets(values, held, seconds=math.inf, fps=30.0)[2:-2, 0]
+    share = torch.arange(1, 31).double() / 31
+    assert float((found - 0.7 * (3 * share**2 - 2 * share**3)).abs().max()) < 0.007
+    steps = torch.diff(torch.cat([values[1:2, 0], found, values[-2:-1, 0]]))
+    assert float(steps[[0, -1]].max()) < 0.2 * float(steps.max())
+
+
+def test_joints_turn_until_they_are_as_wanted_and_no_further():
+    made = rotations.from_rotation_vector(torch.randn(200, 3, 3, generator=generator()).double())
+    wanted = rotations.from_rotation_vector(torch.randn(200, 3, 3, generator=generator(1)).double())
+    firm = torch.zeros(200, 3, dtype=torch.bool)
+    firm[[20, 100], 0] = True
+    firm[100, 1] = True
+    found = interpolate_turns(made, wanted, firm, seconds=0.3, fps=30.0)
+    same = (found * wanted).sum(dim=-1).abs()
+    assert float((1 - same[firm]).max()) < 1e-12
+    assert torch.equal(found[:, 2], made[:, 2])  # never firm
+    turned = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(made), found)).norm(dim=-1)
+    assert float(turned[20, 1]) < 0.1 < float(turned[20, 0])  # a joint is not led by another's keys
+    assert float(turned[180:].max()) < 0.03  # and far from keys none is
+    assert float(torch.diff(turned[15:26, 0]).abs().max()) < 0.2 * float(turned[20, 0])

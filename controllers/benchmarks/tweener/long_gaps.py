@@ -47,6 +47,7 @@ class _Sums:
     true_planted: float = 0.0
     sliding: float = 0.0  # cm/s, summed over planted frames
     true_sliding: float = 0.0
+    key_jerk: float = 0.0
     seconds: float = 0.0
 
     def __add__(self, other: "_Sums") -> "_Sums":
@@ -62,7 +63,7 @@ def benchmark_long_gaps(
 ) -> list[Row]:
     """Measure methods, and slerp, by kind of clip (canonical, at PRIOR_FPS), with a gap of so many frames between two
     whole poses: errors, cm, of joints seen from the hips and of the hips over the ground; speed, spread, jerk and
-    planted frames over mocap's; and the planted toes' speed, cm/s."""
+    planted frames over mocap's; the planted toes' speed, cm/s; and the jerk at the keys (`measure_key_jerk`)."""
     compared = (Method("slerp", SlerpInbetweener(), InfillSettings(finish=False)), *methods)
     rows = []
     for number, (kind, clips) in enumerate(kinds.items()):
@@ -106,8 +107,16 @@ def _measure(clip: Motion, method: Method) -> _Sums:
         float(theirs.planted[1:].sum()),
         100 * float(ours.speed[ours.planted[1:]].sum()),
         100 * float(theirs.speed[theirs.planted[1:]].sum()),
+        measure_key_jerk(done.motion, clip),
         done.seconds,
     )
+
+
+def measure_key_jerk(made: Motion, true: Motion) -> float:
+    """Measure the largest jerk beside the first and the last frame, over the 95th percentile of mocap's: of means over
+    joints in the world, in the two third differences at either end."""
+    ours, theirs = (torch.diff(each.joint_positions(), n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (made, true))
+    return float(ours[[0, 1, -2, -1]].max() / theirs.quantile(0.95).clamp_min(1e-9))
 
 
 def _see(motion: Motion) -> Float[Tensor, "frames joints 3"]:
@@ -125,5 +134,6 @@ def _summarise(found: _Sums) -> Row:
         "planted": found.planted / max(found.true_planted, 1e-9),
         "planted_cm_s": found.sliding / max(found.planted, 1.0),
         "mocap_cm_s": found.true_sliding / max(found.true_planted, 1.0),
+        "key_jerk": found.key_jerk / found.clips,
         "ms_frame": 1000 * found.seconds / found.frames,
     }

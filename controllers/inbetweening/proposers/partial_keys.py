@@ -23,7 +23,7 @@ from mapctl.inbetweening.whole_body import bend_limbs, reach_targets
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
-from mapctl.numerics.smooth_offsets import interpolate_offsets
+from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, LIMBS
 
@@ -38,12 +38,13 @@ _MIN_LIMB_SECONDS, _LIMB_ACCELERATION = 0.15, 15.0
 feet reach in walking."""
 _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION = 0.25, 3.0
 """Least time and acceleration of hips and trunk."""
-_ARMS = tuple(
+_ARMS = [
     joint
     for name, limb in LIMBS.items()
     if name.endswith("Hand")
     for joint in (CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end)
-)
+]
+_TRUNK = [joint for joint in range(CANONICAL.num_joints) if joint not in _ARMS]  # and legs
 _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
@@ -218,19 +219,16 @@ def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> M
 def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], query: GapQuery) -> Motion:
     """Blend `body` to the poses `posed` in the frames of keys and back, feet staying on their own trajectories."""
     fps = float(body.fps)
-    turn = rotations.to_rotation_vector(
-        rotations.multiply(rotations.inverse(body.local_quat_xyzw), posed.local_quat_xyzw)
-    )
     positions, goals = body.joint_positions(), posed.joint_positions()
     distance = torch.where(keys[:, None], (goals - positions).norm(dim=-1), 0.0)
     limb = _compute_duration(distance[:, [limb.end for limb in LIMBS.values()]], _MIN_LIMB_SECONDS, _LIMB_ACCELERATION)
     trunk = _compute_duration(distance[:, :1], _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION)
     known = ~query.missing.joints | keys[:, None]
+    wanted_quats = torch.where(keys[:, None, None], posed.local_quat_xyzw, body.local_quat_xyzw)
     quats = body.local_quat_xyzw.clone()
-    for joint in range(body.num_joints):
-        seconds = limb if joint in _ARMS else trunk
-        rotation = interpolate_offsets(turn[:, joint] * keys[:, None], known[:, joint], seconds=seconds, fps=fps)
-        quats[:, joint] = rotations.multiply(quats[:, joint], rotations.from_rotation_vector(rotation))
+    for joints, seconds in ((_ARMS, limb), (_TRUNK, trunk)):
+        there, firm = wanted_quats[:, joints], known[:, joints]
+        quats[:, joints] = interpolate_turns(quats[:, joints], there, firm, seconds=seconds, fps=fps)
     offset = interpolate_offsets(
         (posed.root_position - body.root_position) * keys[:, None], ~query.missing.root | keys, seconds=trunk, fps=fps
     )

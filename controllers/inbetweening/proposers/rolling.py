@@ -1,5 +1,6 @@
 """Rollouts within a motion: the committed frames before one, and its insertion into a gap or beyond the end."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from mapctl import contacts, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.motion import Motion
+from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, replay
@@ -67,22 +69,35 @@ def insert_rollout(
     made = decode(window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double()))
     count, missed = stop - start, 0.0
     made, planted = _warp_time(made, window.trial.contacts[0], max(1, round(count * tempo)), count)
-    share = torch.sin(0.5 * torch.pi * torch.arange(1, count + 1) / (count + 1)).square()[:, None].double()
     root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), contact_logits.clone()
     root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
     if count < len(made.root_position):
         there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
         missed = float((there.joint_positions() - here.joint_positions()).norm(dim=-1).mean())
-        root[start:stop] += share * (root[stop] - made.root_position[count])
-        turn = rotations.multiply(rotations.inverse(made.local_quat_xyzw[count]), quats[stop])
-        correction = rotations.from_rotation_vector(share[..., None] * rotations.to_rotation_vector(turn))
-        quats[start:stop] = rotations.multiply(quats[start:stop], correction)
+        root[start:stop], quats[start:stop] = _arrive(here, there, root[start:stop], quats[start:stop])
     new = torch.zeros(len(root), dtype=torch.bool)
     new[start:stop] = True
     root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
     quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
     logits[start:stop] = contacts.to_logits(planted[:count]).to(logits)
     return replace(body, root_position=root, local_quat_xyzw=quats), logits, missed
+
+
+def _arrive(
+    here: Motion, there: Motion, root: Float[Tensor, "frames 3"], quats: Float[Tensor, "frames joints 4"]
+) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
+    """Spread what a rollout arrives `here` instead of `there` over all its frames: none of it in the two frames before,
+    all of it in two after, so that it leaves and arrives at its own pace."""
+    turn = rotations.to_rotation_vector(
+        rotations.multiply(rotations.inverse(here.local_quat_xyzw), there.local_quat_xyzw)
+    )
+    firm = torch.ones(len(root) + 4, dtype=torch.bool)
+    firm[2:-2] = False
+    miss = root.new_zeros(len(firm), 3 + 3 * quats.shape[1])
+    miss[-2:] = torch.cat([there.root_position - here.root_position, turn.flatten(1)], dim=1)
+    offsets = interpolate_offsets(miss, firm, seconds=math.inf, fps=PRIOR_FPS)[2:-2]
+    turns = rotations.from_rotation_vector(offsets[:, 3:].unflatten(1, (-1, 3)))
+    return root + offsets[:, :3], rotations.multiply(quats, turns)
 
 
 def _warp_time(
