@@ -195,10 +195,12 @@ def bend_limbs(
         placed = wanted[:, limb.end] | name.endswith("Foot")
         # Under a trunk that leans, limbs keep their orientation: carried along, knees would end up behind.
         posed = _keep_orientation(posed, limb.upper, orientations[:, limb.upper], turning[:, limb.upper])
-        positions = posed.joint_positions().clone()
-        positions[:, limb.end] = torch.where(placed[:, None], ends[:, limb.end], positions[:, limb.end])
         free = torch.zeros_like(turning)
         free[:, [limb.upper, limb.lower]] = (turning[:, [limb.upper, limb.lower]].all(dim=1) & placed)[:, None]
+        if not bool(placed.any()):
+            continue
+        positions = posed.joint_positions().clone()
+        positions[:, limb.end] = torch.where(placed[:, None], ends[:, limb.end], positions[:, limb.end])
         quats = inverse.solve_inverse_kinematics(
             positions,
             posed.local_quat_xyzw,

@@ -14,13 +14,14 @@ from mapctl.inbetweening import GapQuery, PositionImage, Proposal
 from mapctl.inbetweening.path_closing import close_path
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import LocalMotion
+from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
-from mapctl.skeleton import TOE_JOINTS
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import MAX_KEY_FRAMES, GeneratorConfig, GeneratorNetwork
@@ -28,7 +29,7 @@ from priors.tweening.keys import see_contacts
 
 SOURCE = "tweener"
 """Name of the in-betweener in notes."""
-_MARGIN = 16
+_MARGIN = 4
 """Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
 poses jump, by three times what mocap's do, and keys stand there."""
 _TREMBLE_HZ = 7.0
@@ -62,7 +63,8 @@ class Tweener(Inbetweener):
         """Propose poses of the whole motion at once, and lead the hips by them, without sampling.
 
         What keys were missed by is made good by the smoothest offsets of joints' rotations; what the way misses a known
-        place by is spread in proportion to the way walked. Effector targets are ignored.
+        place by is spread in proportion to the way walked; hips do not tremble, and legs bend so that feet which stand
+        stay there. Effector targets are ignored.
         """
         shown, missing = query.motion, query.missing
         image, origin = _show(query)
@@ -73,28 +75,32 @@ class Tweener(Inbetweener):
         met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
         quats = torch.where(missing.joints[..., None], met, shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
-        root, logits = self._lead(body, query, origin)
-        root = torch.where(missing.root[:, None], root * query.scale, shown.root_position)
-        motion = replace(query.to_character(body), root_position=root)
+        body, logits = self._lead(body, query, origin)
+        motion = query.to_character(body)
+        root = torch.where(missing.root[:, None], motion.root_position, shown.root_position)
+        motion = replace(motion, root_position=root)
         known = image.known[0][:, list(TOE_JOINTS)]
         planted = contacts.to_logits(contacts.detect_contacts(body.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS))
         return Proposal(motion, torch.where(known, planted, logits), SOURCE, tuple(_find_too_long(query)))
 
     def _lead(
         self, body: Motion, query: GapQuery, origin: Float[Tensor, " 3"]
-    ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 2"]]:
-        """Lead the hips by how the body moves, from known place to known place, in metres at unit size; also returns
-        the contacts' logits."""
+    ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+        """Lead the hips by how the body moves, from known place to known place, at unit size; also returns the
+        contacts' logits."""
         facing = heading(body.local_quat_xyzw[:, 0])
         still = replace(body, root_position=torch.zeros_like(body.root_position))
         seen = still.joint_positions().float()[None]
         predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
         way = predicted.integrate(facing.float()[None])[0].double()
         led = close_path(way, body.root_position - origin, query.missing.root)
-        led = smooth_between(led, ~query.missing.root, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
+        calm = smooth_between(led, ~query.missing.root, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
         if query.keep_trajectory:
-            led = torch.cat([body.root_position[:, :1], led[:, 1:2], body.root_position[:, 2:]], dim=-1)
-        return led, predicted.contacts[0]
+            calm = torch.cat([body.root_position[:, :1], calm[:, 1:2], body.root_position[:, 2:]], dim=-1)
+            return replace(body, root_position=calm), predicted.contacts[0]
+        made = replace(body, root_position=calm)
+        share = torch.sigmoid(predicted.contacts[0]).double()
+        return keep_feet(made, led + origin - calm, share, query), predicted.contacts[0]
 
 
 def _show(query: GapQuery) -> tuple[PositionImage, Float[Tensor, " 3"]]:
@@ -113,6 +119,18 @@ def _show(query: GapQuery) -> tuple[PositionImage, Float[Tensor, " 3"]]:
         toes=TOE_JOINTS,
     )
     return image, origin
+
+
+def keep_feet(
+    body: Motion, away: Float[Tensor, "frames 3"], planted: Float[Tensor, "frames 2"], query: GapQuery
+) -> Motion:
+    """Bend the legs of a body whose hips were moved so far from where planted feet want them, until these are where
+    they were; `planted` from 0 to 1."""
+    ends = body.joint_positions().clone()
+    for foot, toe in enumerate(TOE_JOINTS):
+        ends[:, CANONICAL.parents[toe]] += planted[:, foot, None] * away
+    wanted = torch.zeros(ends.shape[:2], dtype=torch.bool)
+    return bend_limbs(body, body, ends, wanted, query.missing.joints)
 
 
 def _find_too_long(query: GapQuery) -> Iterator[GapSource]:

@@ -1,5 +1,6 @@
 """The tweener as an in-betweener: exact keys, hips that go by the body, any length, one path predictor."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -18,6 +19,8 @@ from mapctl.errors import CheckpointError
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
+from mapctl.skeleton import CANONICAL
+from priors.tweening.inbetweener import keep_feet
 
 
 def query_of(motion, *gaps):
@@ -66,11 +69,12 @@ def test_the_first_and_the_last_frame_are_not_where_its_convolutions_end():
     made.network.register_forward_hook(lambda _, given, answer: seen.append((given[0], answer)))
     answer = made.propose(query).motion
     ((image, poses),) = seen
-    assert image.places.shape[1] >= 320 + 2 * 16
+    assert image.places.shape[1] >= 320 + 2 * 4
     first = int(image.known[0].any(dim=1).nonzero()[0])
-    assert first >= 16
-    wanted = rotations.from_matrix(poses.pose.local_matrix[0, first + 160, 1:].double())
-    same = (wanted * answer.local_quat_xyzw[160, 1:]).sum(dim=-1).abs()
+    assert first >= 4
+    upper = [joint for joint, name in enumerate(CANONICAL.names) if joint and not re.search("Leg|Foot|Toes", name)]
+    wanted = rotations.from_matrix(poses.pose.local_matrix[0, first + 160, upper].double())
+    same = (wanted * answer.local_quat_xyzw[160, upper]).sum(dim=-1).abs()
     assert float((1 - same).max()) < 1e-6  # the frames are the right ones
 
 
@@ -85,6 +89,24 @@ def test_hips_that_tremble_are_led_calmly():
     told = torch.diff(shaken.root_position, n=3, dim=0)[10:-10].norm()
     assert float(trembling) < 0.4 * float(told)
     assert float(calm) < float(trembling)
+
+
+def test_planted_feet_stay_where_the_hips_were_calmed():
+    """And feet in the air go with the hips."""
+    motion, query = walk(60), query_of(walk(60), (1, 59))
+    away = torch.tensor([0.01, -0.005, 0.012]).double() * (-1.0) ** torch.arange(60)[:, None]
+    calm = replace(motion, root_position=motion.root_position - away)
+    planted = torch.zeros(60, 2).double()
+    planted[20:40, 0] = 1
+    kept = keep_feet(calm, away, planted, query).joint_positions()
+    ankles = [CANONICAL.index("leftFoot"), CANONICAL.index("rightFoot")]
+    off = (kept - motion.joint_positions())[:, ankles].norm(dim=-1)
+    assert float(off[20:40, 0].max()) < 4e-3  # a leg that is stretched reaches no further
+    assert float(off[20:40, 0].median()) < 1e-3
+    assert float(off[20:40, 1].min()) > 0.01
+    assert float(off[:20, 0].min()) > 0.01
+    hands = CANONICAL.index("leftHand")
+    torch.testing.assert_close(kept[:, hands], calm.joint_positions()[:, hands])
 
 
 def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
