@@ -3,13 +3,13 @@ appendix D).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mapctl import retarget, rotations
+from mapctl import kinematics, retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
@@ -19,6 +19,7 @@ from mapctl.skeleton import CANONICAL
 POSES = 8
 """Poses that are taken of a motion unless another number is asked for."""
 _APART = PRIOR_FPS // 2  # frames between two of them, in a motion that is long enough
+_LEAP = 3.0  # times as far as in any other frame: from the T-pose before a take to its first frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,21 +39,21 @@ def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> MotionD
         raise RequestError(f"motion DNA needs at least one pose, got {count}")
     if motion.num_frames < 1:
         raise RequestError("motion DNA needs a motion with frames")
-    canonical = retarget.to_canonical(motion, rig)[0].resample(PRIOR_FPS)
-    upright = canonical.local_quat_xyzw.clone()
+    canonical = _drop_leap(retarget.to_canonical(motion, rig)[0].resample(PRIOR_FPS))
+    return of_rotations(canonical.local_quat_xyzw, count)
+
+
+def of_rotations(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int = POSES) -> MotionDna:
+    """Take poses of local rotations of canonical joints at PRIOR_FPS, as `of` does; the hips' own do not matter."""
+    upright = local_quat_xyzw.clone()
     upright[:, 0] = upright.new_tensor([0.0, 0.0, 0.0, 1.0])
-    bare = replace(
-        canonical, skeleton=CANONICAL, root_position=torch.zeros_like(canonical.root_position), local_quat_xyzw=upright
-    )
-    chosen = choose_frames(upright, count)
-    return MotionDna(bare.joint_positions()[chosen].float())
+    chosen = upright[choose_frames(upright, count)]
+    return MotionDna(kinematics.positions_from_matrices(CANONICAL, rotations.to_matrix(chosen)).float())
 
 
 def choose_frames(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int) -> Int[Tensor, " chosen"]:
     """Choose up to so many frames in which joints turn fastest, as far apart as half a second where there is room."""
-    frames = len(local_quat_xyzw)
-    change = rotations.multiply(rotations.inverse(local_quat_xyzw[:-1]), local_quat_xyzw[1:])
-    turned = rotations.to_rotation_vector(change).norm(dim=-1).mean(dim=-1)
+    frames, turned = len(local_quat_xyzw), _measure_turns(local_quat_xyzw)
     none = turned.new_zeros(1)
     speed = torch.maximum(torch.cat([turned, none]), torch.cat([none, turned]))
     apart = min(_APART, max(1, frames // count))
@@ -61,6 +62,20 @@ def choose_frames(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int)
         if len(chosen) < count and all(abs(frame - other) >= apart for other in chosen):
             chosen.append(frame)
     return torch.tensor(sorted(chosen))
+
+
+def _measure_turns(local_quat_xyzw: Float[Tensor, "frames joints 4"]) -> Float[Tensor, " steps"]:
+    """Measure how far joints turn from frame to frame, mean over joints, radians."""
+    change = rotations.multiply(rotations.inverse(local_quat_xyzw[:-1]), local_quat_xyzw[1:])
+    return rotations.to_rotation_vector(change).norm(dim=-1).mean(dim=-1)
+
+
+def _drop_leap(motion: Motion) -> Motion:
+    """Drop a first frame from which joints leap to the second: a T-pose before the take is none of its poses."""
+    if motion.num_frames < 3:
+        return motion
+    turned = _measure_turns(motion.local_quat_xyzw[:, 1:])
+    return motion.slice(1, motion.num_frames) if float(turned[0]) > _LEAP * float(turned[1:].max()) else motion
 
 
 def join(parts: Sequence[MotionDna]) -> MotionDna:

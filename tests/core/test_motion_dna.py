@@ -57,3 +57,11 @@ def test_nothing_is_no_style():
         motion_dna.of(walk(20), 0)
     with pytest.raises(RequestError, match="at least one motion"):
         motion_dna.join([])
+
+
+def test_a_t_pose_before_a_take_is_none_of_its_poses():
+    motion = walk(60)
+    first = torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(1, 21, 4)
+    quats = torch.cat([first, motion.local_quat_xyzw[1:]])
+    taken = motion_dna.of(replace(motion, local_quat_xyzw=quats), 6)
+    torch.testing.assert_close(taken.poses, motion_dna.of(motion.slice(1, 60), 6).poses)
