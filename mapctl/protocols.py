@@ -259,6 +259,13 @@ class Inbetweener(Protocol):
         """
         return False
 
+    @property
+    def has_style(self) -> bool:
+        """Whether it was told how to move, by motion DNA; gaps then go to it in which another would do as well.
+        Default: no.
+        """
+        return False
+
     @abstractmethod
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a motion of the query's frames without gaps; what is drawn is drawn from the generator, or from a

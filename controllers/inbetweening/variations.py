@@ -26,6 +26,8 @@ _MIN_FRAMES = 8  # frames at PRIOR_FPS of the shortest motion whose energy is me
 
 Tweening = Callable[[Inbetweener, torch.Generator], InbetweenSolution]
 """Function that makes one variation: `tween` with its motion, keys and settings bound."""
+StyleDraw = Callable[[int, torch.Generator], Inbetweener]
+"""Function that returns the in-betweener, in a style of its own, of the variation of a number among those drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,21 +62,25 @@ def sample_variations(
     count: int,
     *,
     generator: torch.Generator,
+    styles: StyleDraw | None = None,
     refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> Variations:
     """Make so many motions through the same keys. The first ones do not depend on the count.
 
-    The first is by one in-betweener; in the others the likeliest density of `rollouts` is sampled and steered from key
-    to key. RequestError for fewer than two, and for keys that are too close in time to leave a choice.
+    The first is by one in-betweener. The others are by those that `styles` draws; without, the likeliest density of
+    `rollouts` is sampled and steered from key to key. Energies are by that density. RequestError for fewer than two,
+    and for keys that are too close in time to leave a choice.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
     found = [_make_first(make, first, generator)]
     density = _select_density(rollouts, found[0])
-    found += _sample_rollouts(make, replace(rollouts, densities=[density]), count - 1, generator, progress)
+    rolled = replace(rollouts, densities=[density])
+    found += _sample(make, styles or (lambda number, draws: rolled), count - 1, generator, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
-        raise RequestError(f"no two keys have {rollouts.settings.span} between them, which leaves nothing to vary")
+        room = "room for a style" if styles else f"{rollouts.settings.span} between them"
+        raise RequestError(f"no two keys have {room}, which leaves nothing to vary")
     each = tuple(_score_variation(one, density, refinement) for one in found)
     return Variations(each, measure_diversity([one.motion for one in found]))
 
@@ -95,7 +101,8 @@ def lowest_energy(
         raise RequestError(f"the best is of 2 to {MAX_VARIATIONS}, got {count}")
     found = [_make_first(make, AutoInbetweener(rollouts.fallback), generator), make(SlerpInbetweener(), generator)]
     density = _select_density(rollouts, found[0])
-    found += _sample_rollouts(make, replace(rollouts, densities=[density]), count - 2, generator, progress)
+    rolled = replace(rollouts, densities=[density])
+    found += _sample(make, lambda number, draws: rolled, count - 2, generator, progress)
     nats = [_score_variation(one, density, refinement).energy for one in found]
     names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
     best = found[index := min(range(count), key=nats.__getitem__)]
@@ -120,18 +127,15 @@ def _score_variation(made: InbetweenSolution, density: Density, refinement: Refi
     return Variation(made, score(made.motion, made.contacts, density, refinement, made.rig))
 
 
-def _sample_rollouts(
-    make: Tweening,
-    rollouts: RolloutInbetweener,
-    count: int,
-    generator: torch.Generator,
-    progress: Callable[[int, int], None] | None,
+def _sample(
+    make: Tweening, draw: StyleDraw, count: int, generator: torch.Generator, progress: Callable[[int, int], None] | None
 ) -> Sequence[InbetweenSolution]:
-    """Sample variations by rollouts, each with a seed of its own: the first ones do not depend on the count."""
+    """Sample variations, each with a seed of its own: the first ones do not depend on the count."""
     found = []
     for number in range(count):
         if progress is not None:
             progress(number, count)
         seed = int(torch.randint(2**62, (1,), generator=generator))
-        found.append(make(rollouts, torch.Generator().manual_seed(seed)))
+        draws = torch.Generator().manual_seed(seed)
+        found.append(make(draw(number, draws), draws))
     return found

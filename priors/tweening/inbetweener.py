@@ -1,6 +1,6 @@
 """The tweener as an in-betweener: poses from the generator, the hips' way from the path predictor, exact keys."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -18,7 +18,6 @@ from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
-from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
@@ -26,6 +25,8 @@ from priors import checkpoints
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import MAX_KEY_FRAMES, GeneratorConfig, GeneratorNetwork
 from priors.tweening.keys import see_contacts
+from priors.tweening.splitting import Split, find_splits, place_poses, show_edges
+from priors.tweening.styles import Style, read_classes
 
 SOURCE = "tweener"
 """Name of the in-betweener in notes."""
@@ -50,13 +51,33 @@ class Tweener(Inbetweener):
     """Predictor of where the hips go."""
     card: checkpoints.Card
     """Card of the weights."""
-    style: Float[Tensor, " style"] | None = field(default=None)
-    """What the network's style encoder makes of a motion's poses; None leaves the style to the keys."""
+    style: Style | None = field(default=None)
+    """How to move; None leaves it to the keys."""
+    classes: Mapping[str, Style] = field(default_factory=dict)
+    """Styles that the weights know by name."""
 
-    @torch.no_grad()
+    @property
+    def has_style(self) -> bool:
+        """Whether it was told how to move."""
+        return self.style is not None
+
+    @property
+    def source(self) -> str:
+        """Its name in notes."""
+        return SOURCE if self.style is None else f"{SOURCE} in the style of {self.style.name}"
+
     def styled(self, dna: MotionDna) -> "Tweener":
         """Return the in-betweener that moves as a motion of which these are poses."""
-        return replace(self, style=self.network.style(dna.poses[None])[0])
+        return self.in_style(self.encode_style(dna))
+
+    def in_style(self, style: Style) -> "Tweener":
+        """Return the in-betweener that moves in a style: one of `classes`, or what `encode_style` made."""
+        return replace(self, style=style)
+
+    @torch.no_grad()
+    def encode_style(self, dna: MotionDna, name: str = "motion DNA") -> Style:
+        """Encode poses of a motion as a style of this name."""
+        return Style(name, self.network.style(dna.poses[None])[0], dna.poses)
 
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
@@ -64,14 +85,12 @@ class Tweener(Inbetweener):
 
         What keys were missed by is made good by the smoothest offsets of joints' rotations; what the way misses a known
         place by is spread in proportion to the way walked; hips do not tremble, and legs bend so that feet which stand
-        stay there. Effector targets are ignored.
+        stay there. Effector targets are ignored. Gaps that are longer than the network sees are split by poses of the
+        style, or of the keys beside them.
         """
-        shown, missing = query.motion, query.missing
-        image, origin = _show(query)
-        style = torch.zeros(1, self.network.config.style) if self.style is None else self.style[None]
-        wide = image.extended(_MARGIN)
-        local = self.network(wide, style).turn_to_world(wide).local_matrix[0, _MARGIN:-_MARGIN]
-        made = rotations.from_matrix(local.double())
+        shown, missing, splits = query.motion, query.missing, list(find_splits(query))
+        told = self._tell_poses(query, splits)
+        made, origin = self._make(query, told)
         met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
         quats = torch.where(missing.joints[..., None], met, shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
@@ -79,9 +98,44 @@ class Tweener(Inbetweener):
         motion = query.to_character(body)
         root = torch.where(missing.root[:, None], motion.root_position, shown.root_position)
         motion = replace(motion, root_position=root)
-        known = image.known[0][:, list(TOE_JOINTS)]
+        known = query.known_positions[:, list(TOE_JOINTS)]
         planted = contacts.to_logits(contacts.detect_contacts(body.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS))
-        return Proposal(motion, torch.where(known, planted, logits), SOURCE, tuple(_find_too_long(query)))
+        return Proposal(
+            motion, torch.where(known, planted, logits), self.source, tuple(self._tell_splits(query, splits, told))
+        )
+
+    def _make(
+        self, query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]
+    ) -> tuple[Float[Tensor, "frames joints 4"], Float[Tensor, " 3"]]:
+        """Make rotations of all frames, near what is known and near poses that are told by frame, metres, world; also
+        returns where the network's origin is."""
+        image, origin = _show(query, told)
+        style = torch.zeros(self.network.config.style) if self.style is None else self.style.vector
+        wide = image.extended(_MARGIN)
+        local = self.network(wide, style[None]).turn_to_world(wide).local_matrix[0, _MARGIN:-_MARGIN]
+        return rotations.from_matrix(local.double()), origin
+
+    def _tell_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
+        """Choose the poses that split gaps, by frame, at their places in a motion of unit size, metres, world."""
+        told = {}
+        for split in splits:
+            own = None if self.style is None else self.style.poses
+            poses = show_edges(query, split) if own is None else own
+            if len(poses):
+                placed = place_poses(poses, query.to_unit_size(query.motion), split.frames)
+                told |= dict(zip(split.frames, placed, strict=True))
+        return told
+
+    def _tell_splits(
+        self, query: GapQuery, splits: Sequence[Split], told: Mapping[int, Float[Tensor, "joints 3"]]
+    ) -> Iterator[GapSource]:
+        """Tell which gaps are too long for the network, and when which poses split them."""
+        by = "the keys beside it" if self.style is None or self.style.poses is None else "the style"
+        for split in splits:
+            times = ", ".join(f"{float(query.seconds[frame]):.1f}" for frame in split.frames if frame in told)
+            reason = f"longer than the {MAX_KEY_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} sees; "
+            reason += f"split at {times} s by poses of {by}" if times else "give more keys"
+            yield GapSource(split.start, split.stop, self.source, reason)
 
     def _lead(
         self, body: Motion, query: GapQuery, origin: Float[Tensor, " 3"]
@@ -103,13 +157,17 @@ class Tweener(Inbetweener):
         return keep_feet(made, led + origin - calm, share, query), predicted.contacts[0]
 
 
-def _show(query: GapQuery) -> tuple[PositionImage, Float[Tensor, " 3"]]:
-    """Return the query as the network takes it, of unit size and near the origin, and where that origin is."""
+def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
+    """Return the query, and poses that are told by frame, as the network takes it, of unit size and near the origin,
+    and where that origin is."""
     body, known = query.to_unit_size(query.motion), query.known_positions
     placed = known[:, 0].nonzero()[:, 0]
     origin = body.root_position[placed[0] if len(placed) else 0] * torch.tensor([1.0, 0.0, 1.0]).double()
     places = body.joint_positions()
     planted = contacts.detect_contacts(places[:, list(TOE_JOINTS)], PRIOR_FPS).float()
+    if told:
+        places, known = places.clone(), known.clone()
+        places[list(told)], known[list(told)] = torch.stack(list(told.values())), True
     image = PositionImage.of_world(
         (places - origin).float()[None],
         heading(body.local_quat_xyzw[:, 0]).float()[None],
@@ -133,23 +191,17 @@ def keep_feet(
     return bend_limbs(body, body, ends, wanted, query.missing.joints)
 
 
-def _find_too_long(query: GapQuery) -> Iterator[GapSource]:
-    """Yield gaps in which nothing is known and that are longer than the network sees."""
-    reason = f"longer than the {MAX_KEY_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} sees; give more keys"
-    for _, start, stop in true_intervals(query.nothing_known[:, None]):
-        if stop - start > MAX_KEY_FRAMES:
-            yield GapSource(start, stop, SOURCE, reason)
-
-
 def load(name: str = "tweener", path: str = "path") -> Tweener:
     """Load the bundled tweener, or a trained one by its file or run folder, with the path predictor that it was trained
     with; CheckpointError for anything else, and for another path predictor."""
     with checkpoints.open_checkpoint(name, "tweener") as (tensors, card):
         network = GeneratorNetwork(GeneratorConfig.of_card(card.config))
         network.load_state_dict(tensors)
+        classes = read_classes(card, network.config.style)
     wanted, found = card.data.get("path"), path_predictor.compute_hash(path)
     if wanted != found:
         raise CheckpointError(
             f"{name} was trained with the path predictor {wanted}; {path} is {found}: name it by --path"
         )
-    return Tweener(name, network.eval().requires_grad_(False), path_predictor.load(path), card)
+    network = network.eval().requires_grad_(False)
+    return Tweener(name, network, path_predictor.load(path), card, classes=classes)

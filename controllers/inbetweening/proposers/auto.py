@@ -48,6 +48,8 @@ class ChoiceSettings:
     """Frames of the longest gap with enough context in which only the network is tried."""
     long: int = 181
     """Frames of the shortest gap between whole poses that is a tweener's."""
+    styled: int = 60
+    """And where the tweener was told a style: in less than 2 s there is no room for one."""
     acceptable_cost: float = 0.2
     """Cost, m/s, of a proposal below which no other one is tried."""
     tempos: tuple[float, ...] = (1.0, 0.94, 1.06)
@@ -113,6 +115,11 @@ class AutoInbetweener(Inbetweener):
         """Whether the network does; rollouts then leave gaps with such keys to it."""
         return self.network.takes_partial_keys
 
+    @property
+    def has_style(self) -> bool:
+        """Whether the tweener was told one."""
+        return self.tweener is not None and self.tweener.has_style
+
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the candidate with the lowest cost in each gap, one after the other in time, without sampling."""
         first = self.network.propose(query, generator=generator)
@@ -125,15 +132,21 @@ class AutoInbetweener(Inbetweener):
         unfilled = {other.start: other.by for other in first.others}
         for start, stop in gaps:
             before = replace(best, by=unfilled.get(start, first.source))
-            if long is not None and _is_long(query, start, stop, self.settings):
-                best = _choose_still(query, _fill_from(long, before, (start, stop)), (start, stop), self.settings)
+            if long is not None and self._is_tweeners(query, start, stop):
+                best = _fill_from(long, before, (start, stop))
+                if not self.has_style:
+                    best = _choose_still(query, best, (start, stop), self.settings)
             else:
                 best = _choose_candidate(query, before, roller, (start, stop), self.settings)
             told = first.others if long is None or best.by != long.source else long.others
             reason = next((other.reason for other in told if other.start == start), "")
-            others.append(GapSource(start, stop, best.by, reason))
+            others.append(GapSource(start, stop, best.by, reason or self._note_no_style(query, start, stop)))
             if roller is not None:
                 roller.body, roller.contact_logits = query.to_unit_size(best.body), best.contact_logits
+        if self.has_style:
+            told = {other.start for other in others}
+            short = [gap for gap in query.enclosed_gaps if gap[0] not in told]
+            others += [GapSource(*gap, first.source, self._note_no_style(query, *gap)) for gap in short]
         chosen = replace(first, motion=best.body, contact_logits=best.contact_logits, others=tuple(others))
         return extrapolate_end(query, chosen, self.densities, RolloutSettings())
 
@@ -143,8 +156,18 @@ class AutoInbetweener(Inbetweener):
         """Return the tweener's proposal, where there is a tweener and a gap for it."""
         if self.tweener is None or query.keep_trajectory:
             return None
-        wanted = any(_is_long(query, *gap, self.settings) for gap in gaps)
+        wanted = any(self._is_tweeners(query, *gap) for gap in gaps)
         return self.tweener.propose(query, generator=generator) if wanted else None
+
+    def _note_no_style(self, query: GapQuery, start: int, stop: int) -> str:
+        """Say where a style was told and a gap is not the tweener's."""
+        lost = self.has_style and (query.keep_trajectory or not self._is_tweeners(query, start, stop))
+        return "too short, or with parts told, for a style" if lost else ""
+
+    def _is_tweeners(self, query: GapQuery, start: int, stop: int) -> bool:
+        """Return whether a gap is the tweener's: long, or with room for the style that it was told."""
+        shortest = self.settings.styled if self.has_style else self.settings.long
+        return stop - start >= shortest and not _has_partial_keys(query, start, stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +195,6 @@ def _has_partial_keys(query: GapQuery, start: int, stop: int) -> bool:
     edges = [start - 1, stop]
     partly = missing.joints[edges].any() | missing.root[edges].any()
     return bool(partly) or (targets is not None and bool(targets.wanted[start:stop].any()))
-
-
-def _is_long(query: GapQuery, start: int, stop: int, settings: ChoiceSettings) -> bool:
-    """Return whether a gap is a tweener's: long, and without partial keys."""
-    return stop - start >= settings.long and not _has_partial_keys(query, start, stop)
 
 
 def _fill_from(proposal: Proposal, before: _Candidate, gap: tuple[int, int]) -> _Candidate:

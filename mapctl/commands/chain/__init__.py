@@ -27,10 +27,15 @@ class Chain(Command):
     """Seed of the gaps' lengths and of what rollouts sample."""
     method: options.Method = "auto"
     """Who proposes, as in `mapctl infill`."""
+    dna: options.MaybeDna = None
+    """Motion files or classes whose style the tweener takes, as in `mapctl infill`."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
     inbetweener: options.MaybeName = None
-    """The file or run folder of a trained transformer or infiller; the bundled one if not given."""
+    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given."""
+    path: options.MaybeName = None
+    """For --method tweener: the file or run folder of the path predictor that it was trained with; the bundled one if
+    not given."""
     video: options.MaybeFile = None
     """Film of the motion: .mp4, .gif or .png."""
     quiet: bool = False

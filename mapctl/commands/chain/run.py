@@ -9,6 +9,7 @@ from mapctl import formats
 from mapctl.commands.chain import Chain
 from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.style import read_dna
 from mapctl.errors import RequestError
 from mapctl.retarget import to_canonical
 from scenes.film import film
@@ -19,10 +20,13 @@ def run(command: Chain) -> int:
     options.check_seed(command.seed)
     results.check_method(command.method, finish=not command.no_finish, inbetweener=command.inbetweener)
     results.check_destinations(command.out, command.video, given=command.clips)
+    if command.path is not None and command.method != "tweener":
+        raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
+    dna = read_dna(command.dna, command.method)
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
     done = chain(
         [inputs.read_motion(path, None) for path in command.clips],
-        build_inbetweener(command.method, results.load_models(command.inbetweener, None)),
+        build_inbetweener(command.method, results.load_models(command.inbetweener, None, command.path, dna)),
         settings=settings,
         filling=InfillSettings(finish=not command.no_finish),
         generator=torch.Generator().manual_seed(command.seed),

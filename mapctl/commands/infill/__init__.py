@@ -32,6 +32,9 @@ class Infill(Command):
     pose where the body stands still, the tweener through gaps of seconds; a note on each gap names it. transformer,
     infiller, tweener: that network alone. rollouts: a density's rollouts, wherever nothing is known. slerp:
     interpolation."""
+    dna: options.MaybeDna = None
+    """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
+    gaps with --method tweener, in those of 2 s and more without parts with auto."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     curve: options.MaybeCurve = None

@@ -11,6 +11,7 @@ from mapctl import formats, report
 from mapctl.commands.infill import Infill
 from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.frame_syntax import parse_ranges
+from mapctl.commands.shared.style import read_dna
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -44,6 +45,8 @@ def _check(command: Infill) -> None:
         raise RequestError("--path predicts the hips' place for --way and for --method tweener; leave it out")
     if command.curve is not None and command.method in ("slerp", "rollouts"):
         raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
+    if command.curve is not None and command.dna is not None:
+        raise RequestError("--dna says how to move and --curve where; only one of them can be had, leave the other out")
     finish, prior = not command.no_finish, command.prior
     results.check_method(command.method, finish=finish, prior=prior, inbetweener=command.inbetweener)
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
@@ -94,7 +97,8 @@ def _run_infilling(
 
 
 def _build_inbetweener(command: Infill) -> Inbetweener:
-    return build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior, command.path))
+    dna = read_dna(command.dna, command.method)
+    return build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior, command.path, dna))
 
 
 def _tell(command: Infill, done: InbetweenSolution) -> None:

@@ -13,6 +13,7 @@ from mapctl.commands.info import Info, clip
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 from priors import checkpoints
+from priors.tweening.styles import count_clips
 
 NOTICE = "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is."
 
@@ -45,9 +46,11 @@ def _print_tables() -> None:
 
 
 def read_prior_card(name: str) -> dict[str, Any]:
-    """Read the whole card of a prior, and its path; CheckpointError if there is none."""
+    """Read the whole card of a prior, and its path; classes of motion without their vectors, with how many clips each
+    is of. CheckpointError if there is none."""
     path = checkpoints.locate(name)
-    return {"file": str(path), **vars(checkpoints.read_card(path.with_suffix(".json")))}
+    card = checkpoints.read_card(path.with_suffix(".json"))
+    return {"file": str(path), **vars(card), "data": count_clips(card.data)}
 
 
 def list_priors() -> list[dict[str, Any]]:

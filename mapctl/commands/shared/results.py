@@ -12,14 +12,13 @@ from mapctl import formats, metrics
 from mapctl import report as reports
 from mapctl.commands.shared import exit_status, inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.style import Example, tell_style
 from mapctl.errors import RequestError
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
-from mapctl.motion_dna import MotionDna
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
-from priors.tweening.inbetweener import Tweener
 from scenes.plots.denoising import film_side_by_side
 
 _SIZE = (1280, 720)
@@ -45,10 +44,10 @@ def check_method(method: str, *, finish: bool, prior: str | None = None, inbetwe
 
 
 def load_models(
-    inbetweener: str | None, prior: str | None, path: str | None = None, dna: MotionDna | None = None
+    inbetweener: str | None, prior: str | None, path: str | None = None, dna: Sequence[Example] = ()
 ) -> ModelLoaders:
-    """Build the loaders of the named models, or of the bundled ones; RequestError for a network that is not of the
-    kind that the method asks for.
+    """Build the loaders of the named models, or of the bundled ones, tweeners in a style if there is one; RequestError
+    for a network that is not of the kind that the method asks for, and for classes that are not known.
     """
 
     def load_network(method: str) -> Inbetweener:
@@ -62,11 +61,10 @@ def load_models(
         wanted = kinds.get(method, network.card.kind)
         if network.card.kind != wanted:
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
-        return network if dna is None or not isinstance(network, Tweener) else network.styled(dna)
+        return tell_style(network, dna)
 
     def load_tweener() -> Inbetweener:
-        tweener = priors.load_tweener()
-        return tweener if dna is None else tweener.styled(dna)
+        return tell_style(priors.load_tweener(), dna)
 
     return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"), load_tweener)
 

@@ -37,9 +37,9 @@ class Tween(Command):
     pose where the body stands still, the tweener through gaps of seconds; a note on each gap names it. transformer,
     infiller, tweener: that network alone. rollouts: a density's rollouts, wherever nothing is known. slerp:
     interpolation."""
-    dna: Annotated[str | None, arg(metavar="CLIP,CLIP")] = None
-    """Motion files of any known rig whose poses tell the tweener its style: in all gaps with --method tweener, in those
-    that auto leaves to it. The bundled one hardly heeds it so far (docs/tweening.md)."""
+    dna: options.MaybeDna = None
+    """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
+    gaps with --method tweener, in those of 2 s and more between whole poses with auto. Several are mixed."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     rig: options.MaybeRig = None
@@ -53,8 +53,10 @@ class Tween(Command):
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
     variations: options.Count = 1
-    """Number of different motions, as OUT_000.bvh, OUT_001.bvh, ...: the first is what a single one would be, the
-    others are rollouts of densities (--prior, or auto) that are steered from key to key."""
+    """Number of different motions, as OUT_000.bvh, OUT_001.bvh, ...: the first is what a single one would be. With
+    --dna the others are in one of its styles each, and when all were had by some of the poses of one; with --method
+    tweener alone each is of a class. Else they are rollouts of densities (--prior, or auto), steered from key to
+    key."""
     best_of: options.Count = 1
     """Number of motions of which the one with the lowest energy is kept: from the network's proposal, slerp's, and
     rollouts of densities (--prior, or auto) that are steered from key to key."""

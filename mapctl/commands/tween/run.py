@@ -15,15 +15,15 @@ from controllers.inbetweening.proposers import build_inbetweener
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from controllers.inbetweening.variations import Tweening
-from mapctl import formats, motion_dna, report
+from mapctl import formats, report
 from mapctl.commands.shared import exit_status, inputs, results
 from mapctl.commands.shared.frame_syntax import parse_frame
+from mapctl.commands.shared.style import read_dna
 from mapctl.commands.shared.tables import print_table
 from mapctl.commands.tween import Tween, variations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.keyframe_toml import KeyRequest, read_keys
 from mapctl.intent.keyframes import Keys
-from mapctl.motion_dna import MotionDna
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
 
@@ -33,10 +33,11 @@ def run(command: Tween) -> int:
     request = _read_key_request(command)
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     clip = _read_keyframe_clip(command, request)
-    models = results.load_models(command.inbetweener, command.prior, command.path, _read_dna(command))
+    dna = read_dna(command.dna, command.method)
+    models = results.load_models(command.inbetweener, command.prior, command.path, dna)
     make = _prepare_tweening(command, clip)
     if command.variations > 1:
-        ok = variations.run_variations(command, clip, make, models)
+        ok = variations.run_variations(command, clip, make, models, dna)
         return exit_status.NOT_SATISFIED if command.strict and not ok else 0
     intervals = _suggest_timing(command, clip)
     if command.best_of > 1:
@@ -74,14 +75,6 @@ def _is_key_file(command: Tween) -> bool:
     return command.source.suffix.lower() == ".toml"
 
 
-def _read_dna(command: Tween) -> MotionDna | None:
-    """Read the poses of the motion files that are to tell the style."""
-    if command.dna is None:
-        return None
-    files = [Path(name.strip()) for name in command.dna.split(",")]
-    return motion_dna.join([motion_dna.of(formats.load(file)) for file in files])
-
-
 def _read_key_request(command: Tween) -> KeyRequest | None:
     return read_keys(command.source) if _is_key_file(command) else None
 
@@ -98,8 +91,6 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
         raise RequestError(f"{unused[0]} is for motion files; {command.source} says itself what its keys are")
     if not _is_key_file(command) and command.keyframes is None:
         raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-    if command.dna is not None and command.method not in ("auto", "tweener"):
-        raise RequestError(f"--method {command.method} has no style; leave --dna out or take the tweener")
     if command.path is not None and command.method != "tweener":
         raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
     variations.check_answers(command, given)

@@ -11,12 +11,15 @@ from controllers.inbetweening.keyframe_poses import KeyframeClip
 from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, build_inbetweener
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors
-from controllers.inbetweening.variations import Tweening, Variations, lowest_energy, sample_variations
+from controllers.inbetweening.variations import StyleDraw, Tweening, Variations, lowest_energy, sample_variations
 from mapctl import formats, report
 from mapctl.commands.shared import options, results
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.style import Example, find_styles, find_tweener, restyle
 from mapctl.commands.tween import Tween
 from mapctl.errors import RequestError
+from mapctl.protocols import Inbetweener
+from priors.tweening.styles import draw_style
 
 _MAX_ANSWERS = 1000
 _FIRST_SAMPLED = 3  # the motions before it are the network's and slerp's
@@ -35,6 +38,8 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
             raise RequestError(f"{name} must be 1 to {_MAX_ANSWERS}, got {count}")
         if count > 1 and command.method == "slerp":
             raise RequestError(f"--method slerp knows one answer only; leave {name} out")
+    if command.dna is not None and command.best_of > 1:
+        raise RequestError("--best-of keeps one of several rollouts, which know no style; leave it or --dna out")
     if command.variations > 1 and command.best_of > 1:
         raise RequestError("--variations keeps all answers and --best-of one; choose one")
     if command.variations == 1:
@@ -60,13 +65,19 @@ def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) ->
         return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
 
 
-def run_variations(command: Tween, clip: KeyframeClip, make: Tweening, models: ModelLoaders) -> bool:
+def run_variations(
+    command: Tween, clip: KeyframeClip, make: Tweening, models: ModelLoaders, dna: Sequence[Example]
+) -> bool:
     """Make, write, report; the report lists every file with its energy. Return whether all that was requested holds."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("variations", quiet=command.quiet) as progress:
         first = build_inbetweener(command.method, models)
-        rollouts = RolloutInbetweener(models.densities(), models.network("auto"))
-        found = sample_variations(make, first, rollouts, command.variations, generator=generator, progress=progress)
+        # Where there are styles the density only tells energies.
+        styles = _prepare_styles(command, first, dna)
+        rollouts = RolloutInbetweener(models.densities(), first if styles else models.network("auto"))
+        found = sample_variations(
+            make, first, rollouts, command.variations, generator=generator, styles=styles, progress=progress
+        )
     files = number_paths(command.out, command.variations)
     for one, file in zip(found.each, files, strict=True):
         formats.save(one.solution.motion, file)
@@ -77,12 +88,29 @@ def run_variations(command: Tween, clip: KeyframeClip, make: Tweening, models: M
     return all(one.solution.status.ok for one in found.each)
 
 
+def _prepare_styles(command: Tween, first: Inbetweener, dna: Sequence[Example]) -> StyleDraw | None:
+    """Prepare the draw of styles, of those that --dna names or of the classes that the tweener knows; None for methods
+    whose variations are rollouts. RequestError where there is nothing to draw from."""
+    tweener = find_tweener(first)
+    if tweener is None or (not dna and command.method != "tweener"):
+        return None
+    styles = find_styles(tweener, dna) or list(tweener.classes.values())
+    if not styles:
+        raise RequestError(f"{tweener.name} knows no classes of motion to draw variations from; name clips by --dna")
+    order = torch.randperm(len(styles), generator=torch.Generator().manual_seed(command.seed)).tolist()
+
+    def draw(number: int, draws: torch.Generator) -> Inbetweener:
+        return restyle(first, draw_style(styles, number, tweener.encode_style, order=order, generator=draws))
+
+    return draw
+
+
 def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:
     for one, file in zip(found.each, files, strict=True):
         frames = one.solution.motion.num_frames
         print(
             f"{file}: {frames} frames through {keys} keys; energy {one.energy:.1f} nats a frame;"
-            f" {1000 * one.solution.seconds / frames:.1f} ms a frame"
+            f" {1000 * one.solution.seconds / frames:.1f} ms a frame{_name_styles(one.solution)}"
         )
     print(
         f"{len(files)} variations, on average {found.diversity.world_cm:.1f} cm apart in the world and"
@@ -91,6 +119,12 @@ def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:
     first = found.each[0].solution
     for note in (*first.notes, *first.gap_notes):
         print(note)
+
+
+def _name_styles(made: InbetweenSolution) -> str:
+    """Name the in-betweeners that were told a style."""
+    named = dict.fromkeys(source.by for source in made.sources if " in the style of " in source.by)
+    return "".join(f"; {name}" for name in named)
 
 
 def _report_variations(
