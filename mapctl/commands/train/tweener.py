@@ -26,6 +26,9 @@ class TrainTweener(ParallelOptions):
     unless --paper is given."""
     paper: bool = False
     """Sizes, losses and optimiser as the paper prints them; other options still hold."""
+    labels: Annotated[str | None, arg(metavar="REGEX")] = None
+    """Class of a clip by its path below the data folder, for `mapctl tween --dna NAME`: what the first group matches;
+    if not given, Bandai Namco's content, else the folder or the file's name without a number."""
     plain: bool = False
     """The network without the connections past its narrow middle, as in the paper, to compare."""
     keys: Annotated[Literal["dense", "sparse"], arg(metavar="dense|sparse")] = "dense"
@@ -53,6 +56,7 @@ class TrainTweener(ParallelOptions):
             "init": self.init,
             "processes": self.processes,
             "path": self.path,
+            **({} if self.labels is None else {"labels": self.labels}),
         }
         critic_from = self.critic_from or ("0" if self.paper else "never")
         if critic_from == "never":

@@ -28,8 +28,10 @@ from priors.training.recipes.tweener_losses import Judge, LossWeights, compute_t
 from priors.training.trainer import GradientTrainer
 from priors.tweening import generator
 from priors.tweening import path as path_predictor
+from priors.tweening.class_vectors import compute_classes, group_clips
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
 from priors.tweening.path import PathNetwork
+from priors.tweening.styles import LABELS, find_class
 
 _SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
 _MIN_STD = 0.05  # metres
@@ -203,14 +205,18 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
     """How it is trained."""
     path: str = "path"
     """The path predictor that sees where the hips go, bundled or trained."""
+    labels: str = LABELS
+    """Regular expression whose first group in a clip's name is its class, whose style the card tells."""
 
     def check(self) -> None:
         """Before anything is read."""
         super().check()
+        find_class("", self.labels)
         path_predictor.load(self.path)
 
     def make_untaught(self, parts: Split) -> TweenerTrainer:
         """The trainer, its weights drawn."""
+        group_clips(parts.train.names, self.labels)  # what the end of training needs
         network = path_predictor.load(self.path).network
         network.reduced_precision = self.settings.bfloat16
         trainer = TweenerTrainer(self.config, self.settings, parts.train, network)
@@ -225,7 +231,8 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
     def export(self, trainer: TweenerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """What is written at the end: the card tells the path predictor it was trained with."""
         done = super().export(trainer, gathered, curve)
-        return replace(done, data={**done.data, "path": path_predictor.compute_hash(self.path)})
+        classes = compute_classes(trainer.network, gathered.parts.train, self.labels)
+        return replace(done, data={**done.data, "path": path_predictor.compute_hash(self.path), **classes})
 
     def format_shape(self) -> list[str]:
         """Options for a network that is not the usual one."""
@@ -237,7 +244,8 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
 
     def format_command(self) -> str:
         """What to type for the same run, for the card."""
-        return super().format_command() + (" --path PATH" if self.path != "path" else "")
+        labels = "" if self.labels == LABELS else f" --labels '{self.labels}'"
+        return super().format_command() + labels + (" --path PATH" if self.path != "path" else "")
 
 
 def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
