@@ -1,15 +1,19 @@
 """A generator of long in-betweens of a few kilobytes, with drawn weights."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import tiny_path
 import torch
+from torch import Tensor
 
+from mapctl.motion_dna import MotionDna
 from mapctl.protocols import PathPredictor
 from priors import checkpoints
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
 from priors.tweening.inbetweener import Tweener
 from priors.tweening.path import compute_hash
+from priors.tweening.styles import encode_classes
 
 CONFIG = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
 
@@ -23,13 +27,14 @@ def network(*, seed: int = 0, drawn: float = 0.05) -> GeneratorNetwork:
     return made.eval().requires_grad_(False)
 
 
-def card(path: str = "") -> checkpoints.Card:
-    """Of the tiny tweener, which was trained with the path predictor of this hash."""
+def card(path: str = "", classes: Sequence[str] = ()) -> checkpoints.Card:
+    """Of the tiny tweener, which was trained with the path predictor of this hash and knows made-up classes."""
+    members = {name: [MotionDna(_draw_poses(name))] for name in classes}
     return checkpoints.Card(
         "tweener",
         CONFIG.as_card(),
         licence="none, it is made up",
-        data={"path": path},
+        data={"path": path, **(encode_classes(network().style, members) if classes else {})},
         **checkpoints.Card.layout_fields(),
     )
 
@@ -39,8 +44,13 @@ def tiny_tweener(*, seed: int = 0, path: PathPredictor | None = None) -> Tweener
     return Tweener("tiny", network(seed=seed), path or tiny_path.tiny_path(), card())
 
 
-def save_tiny_tweener(path: Path, predictor: str) -> Path:
+def save_tiny_tweener(path: Path, predictor: str, classes: Sequence[str] = ()) -> Path:
     """Write the weights and the card, for this file of a path predictor; returns the path for --inbetweener."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network().state_dict(), card(compute_hash(predictor)), path)
+    checkpoints.save(network().state_dict(), card(compute_hash(predictor), classes), path)
     return path
+
+
+def _draw_poses(name: str) -> Tensor:
+    """Poses that are different for every name, metres."""
+    return torch.randn(3, 21, 3, generator=torch.Generator().manual_seed(len(name)))

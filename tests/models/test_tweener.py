@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import on_rig
 from helpers import walk
 from tiny_path import ToldPath, save_tiny_path
 from tiny_tweener import save_tiny_tweener, tiny_tweener
@@ -138,15 +137,6 @@ def test_the_answer_moves_and_turns_with_its_keys():
     wanted = rotations.rotate(turn.expand(90, 4), one.root_position) + shift
     assert float((wanted - other.root_position).abs().max()) < 2e-3
     assert float((one.local_quat_xyzw[:, 1:] - other.local_quat_xyzw[:, 1:]).abs().max()) < 2e-3
-
-
-def test_gaps_beyond_what_the_network_sees_are_named():
-    query = query_of(on_rig("canonical", 600), (10, 580))
-    (source,) = tiny_tweener().propose(query).attribute(query)
-    assert (source.by, source.start, source.stop) == ("tweener", 10, 580)
-    assert "longer than the 16 s" in source.reason
-    short = query_of(on_rig("canonical", 120), (10, 100))
-    assert not tiny_tweener().propose(short).attribute(short)[0].reason
 
 
 def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():

@@ -263,7 +263,7 @@ def test_every_option_reaches_the_trainer(model):
 
 @pytest.mark.parametrize(
     "words",
-    [["--density", "mine"], ["--components", "3"], ["--labels", "(?P<a>b)"], ["--paper"], ["--device", "cpu"]],
+    [["--density", "mine"], ["--components", "3"], ["--paper"], ["--device", "cpu"]],
     ids=lambda words: words[0],
 )
 def test_options_of_other_models_are_unknown(model, words):

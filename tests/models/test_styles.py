@@ -1,0 +1,115 @@
+"""Styles by name: classes of clips, their vectors in a card, and what variations draw of them."""
+
+import json
+
+import pytest
+import tiny_tweener
+import torch
+from helpers import corpus, generator, write_corpus
+from tiny_path import save_tiny_path
+
+import priors
+from mapctl.errors import CheckpointError, RequestError
+from priors import checkpoints
+from priors.tweening import class_vectors
+from priors.tweening.class_vectors import collect_dna, compute_classes, group_clips
+from priors.tweening.styles import Style, count_clips, draw_style, encode_classes, find_class, pick_class, read_classes
+
+
+@pytest.mark.parametrize(
+    ("clip", "name"),
+    [
+        ("bandai-namco-2/data/dataset-2_wave-left-hand_active_015.bvh", "wave-left-hand"),
+        ("dataset-1_walk_feminine_001.bvh", "walk"),
+        ("cmu/01/01_01.bvh", "cmu-01"),
+        ("dance/salsa_03.bvh", "dance"),
+        ("a/b/c/x.bvh", "b-c"),
+        ("jump_03.bvh", "jump"),
+        ("003.bvh", None),
+    ],
+)
+def test_the_class_of_a_clip_is_in_its_name(clip, name):
+    assert find_class(clip) == name
+
+
+def test_labels_of_one_s_own_are_the_first_group_that_took_part():
+    assert find_class("take_angry_walk.bvh", r"_([a-z]+)_") == "angry"
+    assert find_class("take_angry_walk.bvh", r"(run)|(walk)") == "walk"
+    assert find_class("take.bvh", r"_([a-z]+)_") is None
+    with pytest.raises(RequestError, match="must be a regular expression"):
+        find_class("take.bvh", "(")
+    with pytest.raises(RequestError, match="needs a group"):
+        find_class("take.bvh", "take")
+    with pytest.raises(RequestError, match=r"matches no clip, such as 'a\.bvh'"):
+        group_clips(["a.bvh"], "(z)")
+    assert group_clips(["003.bvh"]) == {}
+
+
+def test_vectors_are_means_over_clips_and_come_back_from_the_card():
+    encoder, made = tiny_tweener.network().style, corpus(3, 90)
+    members = collect_dna(made, r"walk-([01])")
+    assert {name: len(each) for name, each in members.items()} == {"0": 1, "1": 1}
+    two = {"both": [members["0"][0], members["1"][0]], "one": members["0"]}
+    data = encode_classes(encoder, two)
+    card = tiny_tweener.card()
+    card.data.update(json.loads(json.dumps(data)))
+    classes = read_classes(card, 5)
+    each = [encoder(dna.poses[None])[0] for dna in two["both"]]
+    torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
+    assert count_clips(card.data)["classes"] == {"both": 2, "one": 1}
+    assert compute_classes(tiny_tweener.network(), made)["classes"]["walk"]["clips"] == 3
+
+
+def test_no_pose_is_in_the_card():
+    """Who gets the package gets no motion: a class is as many numbers as the style has."""
+    data = compute_classes(tiny_tweener.network(), corpus(3, 90))
+    assert len(data["classes"]["walk"]["vector"]) <= 4 * (2 * 5 / 3 + 1)
+
+
+@pytest.mark.parametrize("vector", ["%%%", "AAAA", None, "AHwAfAB8AHwAfA=="])
+def test_a_broken_class_is_refused(vector):
+    card = tiny_tweener.card()
+    card.data["classes"] = {"walk": {"clips": 1, "vector": vector}}
+    with pytest.raises(CheckpointError, match="the class walk in the card"):
+        read_classes(card, 5)
+
+
+def test_an_unknown_class_is_told_with_the_nearest():
+    known = {name: Style(name, torch.zeros(5)) for name in ("wave-left-hand", "walk", "run")}
+    assert pick_class(known, "run").name == "run"
+    with pytest.raises(RequestError, match="no class wavelefthand; the nearest class is wave-left-hand"):
+        pick_class(known, "wavelefthand")
+    with pytest.raises(RequestError, match="know no classes"):
+        pick_class({}, "walk")
+
+
+def test_styles_are_drawn_one_after_the_other_then_by_parts():
+    poses = torch.randn(6, 21, 3, generator=generator())
+    styles = [Style("a", torch.zeros(5), poses), Style("b", torch.ones(5)), Style("c", 2 * torch.ones(5))]
+
+    def encode(dna, name):
+        return Style(name, dna.poses.mean().expand(5), dna.poses)
+
+    def drawn(number, seed=0, of=styles):
+        return draw_style(of, number, encode, order=range(len(of))[::-1], generator=generator(seed))
+
+    assert [drawn(number).name for number in range(3)] == ["c", "b", "a"]
+    assert drawn(3).name in ("c and a", "c and b")
+    assert drawn(5).name == "a, 3 of its poses"
+    assert not torch.equal(drawn(5).vector, drawn(5, seed=1).vector)
+    assert torch.equal(drawn(5).vector, drawn(5).vector)
+    assert len(drawn(0, of=styles[:1]).poses) == 3  # one file: never all of it, which is the first variation
+    with pytest.raises(RequestError, match="the class b alone leaves nothing to vary"):
+        drawn(0, of=styles[1:2])
+
+
+def test_classes_are_written_into_the_card_of_trained_weights(tmp_path, monkeypatch):
+    data, predictor = write_corpus(tmp_path / "data", 3), str(save_tiny_path(tmp_path / "path.safetensors"))
+    file = tiny_tweener.save_tiny_tweener(tmp_path / "t.safetensors", predictor)
+    card = checkpoints.read_card(file.with_suffix(".json"))
+    card.data["held_out"] = {"validation": ["walk-1.bvh"], "test": []}
+    file.with_suffix(".json").write_text(checkpoints.encode_json(vars(card), file))
+    assert priors.load_tweener(str(file), predictor).classes == {}
+    class_vectors.main(data, str(file), labels=r"walk-(\d)")
+    assert list(priors.load_tweener(str(file), predictor).classes) == ["0", "2"]
