@@ -1,6 +1,6 @@
 """A generator of long in-betweens of a few kilobytes, with drawn weights."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import tiny_path
@@ -27,14 +27,20 @@ def network(*, seed: int = 0, drawn: float = 0.05) -> GeneratorNetwork:
     return made.eval().requires_grad_(False)
 
 
-def card(path: str = "", classes: Sequence[str] = ()) -> checkpoints.Card:
+def card(
+    path: str = "", classes: Sequence[str] = (), held_out: Mapping[str, Sequence[str]] | None = None
+) -> checkpoints.Card:
     """Of the tiny tweener, which was trained with the path predictor of this hash and knows made-up classes."""
     members = {name: [MotionDna(_draw_poses(name))] for name in classes}
     return checkpoints.Card(
         "tweener",
         CONFIG.as_card(),
         licence="none, it is made up",
-        data={"path": path, **(encode_classes(network().style, members) if classes else {})},
+        data={
+            "path": path,
+            "held_out": held_out or {},
+            **(encode_classes(network().style, members) if classes else {}),
+        },
         **checkpoints.Card.layout_fields(),
     )
 
@@ -44,10 +50,12 @@ def tiny_tweener(*, seed: int = 0, path: PathPredictor | None = None) -> Tweener
     return Tweener("tiny", network(seed=seed), path or tiny_path.tiny_path(), card())
 
 
-def save_tiny_tweener(path: Path, predictor: str, classes: Sequence[str] = ()) -> Path:
+def save_tiny_tweener(
+    path: Path, predictor: str, classes: Sequence[str] = (), held_out: Mapping[str, Sequence[str]] | None = None
+) -> Path:
     """Write the weights and the card, for this file of a path predictor; returns the path for --inbetweener."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network().state_dict(), card(compute_hash(predictor), classes), path)
+    checkpoints.save(network().state_dict(), card(compute_hash(predictor), classes, held_out), path)
     return path
 
 

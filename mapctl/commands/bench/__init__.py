@@ -160,6 +160,8 @@ class Tweener(Table):
     """Other in-betweeners to compare in long gaps, bundled or trained."""
     seconds: Annotated[str, arg(metavar="S,S,...")] = "6.4"
     """Long gaps, seconds."""
+    dna: options.Count = 0
+    """Instead of long gaps: the same keys 8 s apart under motion DNA of so many clips of different content."""
     raw: bool = False
     """Leave out the rows that a MAP stage finishes."""
 

@@ -1,10 +1,11 @@
-"""`mapctl bench tweener`: the hips' trajectory told by the body, or long gaps."""
+"""`mapctl bench tweener`: the hips' trajectory told by the body, long gaps, or motion DNA."""
 
 from collections.abc import Iterator
 
 import priors
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.shared.tables import Row
+from controllers.benchmarks.tweener.dna import benchmark_dna, choose_examples, choose_keys, load_style_clips
 from controllers.benchmarks.tweener.long_gaps import Method, benchmark_long_gaps
 from controllers.benchmarks.tweener.root_prediction import benchmark_root_prediction
 from controllers.benchmarks.tweener.walked_in_place import benchmark_walked_in_place
@@ -19,6 +20,8 @@ from mapctl.features import PRIOR_FPS
 
 def run(table: Tweener) -> int:
     """Measure and print."""
+    if table.dna:
+        return print_rows(table, _measure_dna(table, table.tweener or "tweener"))
     if table.tweener is not None:
         return print_rows(table, _measure_long_gaps(table, table.tweener))
     path = priors.load_path(table.path)
@@ -36,6 +39,21 @@ def _measure_long_gaps(table: Tweener, name: str) -> list[Row]:
             )
         rows += [{"seconds": seconds, **row} for row in found]
     return rows
+
+
+def _measure_dna(table: Tweener, name: str) -> list[Row]:
+    tweener = priors.load_tweener(name, table.path)
+    clips = load_style_clips(table.data, tweener.card.data.get("held_out", {}))
+    with show_progress("keys") as progress:
+        return benchmark_dna(
+            choose_keys(clips),
+            choose_examples(clips, table.dna),
+            clips,
+            lambda dna: tweener if dna is None else tweener.styled(dna),
+            priors.load_inbetweener(),
+            settings=InfillSettings(finish=not table.raw),
+            progress=progress,
+        )
 
 
 def _parse_seconds(text: str) -> list[float]:
