@@ -1,5 +1,6 @@
 """The contact sheet: the whole motion with ghosts along its trajectory, and a row of stills below it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,8 @@ _GAP = 0.008
 """Margin between pictures, as a share of the width."""
 _GHOST_STRIDE = 1.0
 """Distance between ghosts, about, metres."""
+_STRIP_STILLS, _STRIP_SHAPE = 9, 1.3
+"""Stills of a strip, and the height of each over its width."""
 _MAX_GHOSTS = 16
 """Number of ghosts of all actors together, but at least four each."""
 
@@ -46,6 +49,26 @@ def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, siz
         left = round(k * (size[0] - width) / (row.count - 1))
         still = _add_label(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
         sheet[size[1] + gap :, left : left + width] = still
+    return sheet
+
+
+def draw_strips(
+    strips: Sequence[tuple[str, Stage]], brush: Painter, camera: CameraSettings, size: tuple[int, int]
+) -> Array:
+    """Draw a row of stills of each stage, at the same shares of its time, below each other and under its name: (height,
+    width, 3) uint8 of the given width, all rows together as high as they come."""
+    gap = max(2, round(_GAP * size[0]))
+    width = (size[0] - (_STRIP_STILLS - 1) * gap) // _STRIP_STILLS
+    height = round(width * _STRIP_SHAPE)
+    sheet = np.full((len(strips) * (height + gap) - gap, size[0], 3), 255, np.uint8)
+    for row, (name, stage) in enumerate(strips):
+        views, top = stage.views(camera, (width, height)), row * (height + gap)
+        for k, moment in enumerate(_space_evenly(stage.num_frames - 1, _STRIP_STILLS)):
+            left, label = k * (width + gap), f"{moment / float(stage.fps):.1f} s"
+            picture = _add_label(
+                brush.paint(views[moment], stage.content(moment)), label if k else name.replace(" and ", "\n")
+            )
+            sheet[top : top + height, left : left + width] = picture
     return sheet
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
 from mapctl.mesh.primitives import Array, Surface
+from mapctl.motion import Motion
 from scenes.cameras import CameraSettings
-from scenes.contact_sheet import draw_contact_sheet
+from scenes.contact_sheet import draw_contact_sheet, draw_strips
 from scenes.content import Painter
 from scenes.renderers.select import RendererName, select_painter
 from scenes.stage import Shot, Stage
@@ -64,6 +65,18 @@ def film(
         for path in sheets:
             save_png(path, picture)
     return paths
+
+
+def draw_strips_to(
+    motions: Sequence[tuple[str, Motion]], out: PathOrText, *, size: tuple[int, int] = (1280, 720)
+) -> None:
+    """Draw motions below each other, a row of stills at the same times of each and under its name, to a .png of this
+    width. RequestError for other endings."""
+    (path,) = check_outputs([out], size)
+    if path.suffix.lower() != ".png":
+        raise RequestError(f"motions below each other are a .png, not {path}")
+    strips = [(name, Stage([Shot(motion)])) for name, motion in motions]
+    save_png(path, draw_strips(strips, select_painter(None), CameraSettings("follow"), size))
 
 
 def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path]:

@@ -139,6 +139,13 @@ def test_variations_are_drawn_among_styles_and_come_again(here, models, prior, c
         assert lines[1] != lines[2]
 
 
+def test_variations_are_shown_below_each_other(here, models, prior):
+    words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "style.bvh", "--quiet"]
+    assert run("tween", *words, "--video", "four.png") == 0
+    assert Path("four.png").stat().st_size > 1000
+    assert run("tween", *words, "--video", "four.gif") == 2
+
+
 def test_weights_without_classes_have_no_variations_to_draw(here, prior, tmp_path, capsys):
     predictor = save_tiny_path(tmp_path / "path.safetensors")
     trained = save_tiny_tweener(tmp_path / "tweener.safetensors", str(predictor))

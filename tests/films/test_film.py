@@ -14,7 +14,7 @@ from mapctl.errors import RequestError
 from mapctl.mesh import colours
 from scenes.cameras import CameraSettings
 from scenes.content import Painter
-from scenes.film import film
+from scenes.film import draw_strips_to, film
 from scenes.renderers import offscreen, select
 from scenes.renderers.select import back_end, select_painter
 from scenes.stage import Shot, Stage
@@ -234,3 +234,15 @@ def test_the_renderer_can_be_chosen_by_the_environment(monkeypatch):
     monkeypatch.setenv(select.RENDERER_VARIABLE, "crayon")
     with pytest.raises(RequestError, match="auto, egl or stick"):
         select_painter()
+
+
+def test_motions_below_each_other_are_a_row_each_under_their_names(tmp_path):
+    out = tmp_path / "rows.png"
+    motions = [("one", walk(20)), ("other and third", walk(20)), ("one", walk(20))]
+    draw_strips_to(motions, out, size=(360, 100))
+    picture = np.asarray(Image.open(out)).astype(int)
+    assert picture.shape[1] == 360
+    rows = np.array_split(picture[: picture.shape[0] // 3 * 3], 3)
+    assert min(row.std() for row in rows) > 5
+    with pytest.raises(RequestError, match=r"are a \.png"):
+        draw_strips_to(motions, tmp_path / "rows.gif")

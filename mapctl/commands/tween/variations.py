@@ -19,9 +19,12 @@ from mapctl.commands.shared.style import Example, find_styles, find_tweener, res
 from mapctl.commands.tween import Tween
 from mapctl.errors import RequestError
 from mapctl.protocols import Inbetweener
+from mapctl.retarget import to_canonical
 from priors.tweening.styles import draw_style
+from scenes.film import draw_strips_to
 
 _MAX_ANSWERS = 1000
+_IN_STYLE = " in the style of "
 _FIRST_SAMPLED = 3  # the motions before it are the network's and slerp's
 
 
@@ -51,10 +54,10 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
         return
     if command.suggest_timing:
         raise RequestError("--suggest-timing tells of one answer; leave --variations out")
-    if command.video is not None:
-        raise RequestError("--video shows one answer; leave it out, and film OUT_000 by `mapctl render`")
+    if command.video is not None and command.video.suffix.lower() != ".png":
+        raise RequestError("--video of several answers is a .png of stills; film OUT_000 by `mapctl render`")
     first, *others = number_paths(command.out, command.variations)
-    results.check_destinations(first, None, *others, command.report, given=given)
+    results.check_destinations(first, command.video, *others, command.report, given=given)
 
 
 def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) -> InbetweenSolution:
@@ -79,10 +82,16 @@ def run_variations(
             make, first, rollouts, command.variations, generator=generator, styles=styles, progress=progress
         )
     files = number_paths(command.out, command.variations)
-    for one, file in zip(found.each, files, strict=True):
+    rows = list(zip(found.each, files, strict=True))
+    for one, file in rows:
         formats.save(one.solution.motion, file)
     if command.report is not None:
         report.write_report(_report_variations(command, clip, found, files), command.report)
+    if command.video is not None:
+        draw_strips_to(
+            [(_name_row(one.solution, file), to_canonical(one.solution.motion, clip.rig)[0]) for one, file in rows],
+            command.video,
+        )
     if not command.quiet:
         _tell(found, files, len(clip.keys.frames))
     return all(one.solution.status.ok for one in found.each)
@@ -121,9 +130,15 @@ def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:
         print(note)
 
 
+def _name_row(made: InbetweenSolution, file: Path) -> str:
+    """Name a motion in a picture: by its style, or its file."""
+    named = [source.by.partition(_IN_STYLE)[2] for source in made.sources if _IN_STYLE in source.by]
+    return named[0] if named else file.stem
+
+
 def _name_styles(made: InbetweenSolution) -> str:
     """Name the in-betweeners that were told a style."""
-    named = dict.fromkeys(source.by for source in made.sources if " in the style of " in source.by)
+    named = dict.fromkeys(source.by for source in made.sources if _IN_STYLE in source.by)
     return "".join(f"; {name}" for name in named)
 
 

@@ -1,0 +1,47 @@
+"""`mapctl train tweener --labels`: what a run's card tells of its clips' classes."""
+
+from dataclasses import replace
+
+import pytest
+import tiny_tweener
+from helpers import write_corpus
+from tiny_path import save_tiny_path
+
+import priors
+from mapctl.commands.train.tweener import TrainTweener
+from mapctl.errors import RequestError
+from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings
+from priors.training.run import train
+from priors.tweening.styles import LABELS
+
+SETTINGS = replace(TweenerSettings(), steps=1, batch=3, window=32)
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("labels")
+    predictor = str(save_tiny_path(folder / "path.safetensors"))
+    data = write_corpus(folder / "data")
+    return TweenerRecipe(data, folder / "run", config=tiny_tweener.CONFIG, settings=SETTINGS, path=predictor)
+
+
+def test_an_exported_run_knows_the_classes_of_its_training_clips(recipe):
+    out = train(replace(recipe, labels=r"walk-([0-4])"), lambda line: None)
+    tweener = priors.load_tweener(str(out), recipe.path)
+    held_out = {name for part in tweener.card.data["held_out"].values() for name in part}
+    seen = {f"{number}" for number in range(5) if f"walk-{number}.bvh" not in held_out}
+    assert set(tweener.classes) == seen
+    assert "--labels 'walk-([0-4])'" in tweener.card.training["command"]
+
+
+def test_labels_that_cannot_be_are_refused_before_training(recipe):
+    for labels, said in (("(", "regular expression"), ("walk", "needs a group"), ("(run)", "matches no clip")):
+        with pytest.raises(RequestError, match=said):
+            train(replace(recipe, labels=labels, out=recipe.out / "other"), lambda line: None)
+
+
+def test_the_option_is_the_recipe_s(recipe):
+    told = TrainTweener(data=recipe.data, out=recipe.out, labels="(x)", path=recipe.path).recipe()
+    assert told.labels == "(x)"
+    assert TrainTweener(data=recipe.data, out=recipe.out, path=recipe.path).recipe().labels == LABELS
+    assert "--labels" not in recipe.format_command()
