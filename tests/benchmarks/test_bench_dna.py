@@ -70,6 +70,8 @@ def test_who_shows_what_is_told_wins_all_pairs_and_who_does_not_none():
     assert heeding["DNA"]["eq_11_cm"] < 0.1 < heeding["no DNA"]["eq_11_cm"]
     assert heeding["poses pasted as keys"]["eq_11_cm"] < 0.1
     assert heeding["mocap of the same content"]["eq_11_cm"] < heeding["mocap of another content"]["eq_11_cm"]
+    assert heeding["DNA 40 s apart"]["speed_cm_s"] > 10 > 1 > heeding["no DNA 40 s apart"]["speed_cm_s"]
+    assert heeding["DNA 40 s apart"]["spread_cm"] > 2 > heeding["no DNA 40 s apart"]["spread_cm"]
     deaf = rows_of(lambda dna: SlerpInbetweener(), examples)["DNA"]
     assert (deaf["pairs_percent"], deaf["nearer_cm"]) == (0, 0)
 
@@ -133,4 +135,5 @@ def test_the_command_measures_clips_that_the_card_holds_out(tmp_path, capsys):
     words = ["--data", data, "--tweener", trained, "--path", predictor, "--dna", 2, "--raw", "--json"]
     assert run("bench", "tweener", *words) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [row["by"] for row in rows] == ["DNA", "no DNA", "poses pasted as keys", "mocap of another content"]
+    named = ["DNA", "no DNA", "poses pasted as keys", "DNA 40 s apart", "no DNA 40 s apart", "mocap of another content"]
+    assert [row["by"] for row in rows] == named

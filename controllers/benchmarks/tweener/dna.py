@@ -36,6 +36,9 @@ _INTERVAL_SECONDS = 3.0  # of Eq. 12, for each of which an interval is to have o
 _DWELL_METRES, _LEAST_DWELL = 0.06, 5  # metres, and frames: what is kept for less flashes up
 _NO_PAIRS = {"pairs_percent": float("nan"), "nearer_cm": float("nan")}
 _FASTEST = 0.995
+_WINDOW_SECONDS = 5
+BEYOND_SECONDS, _BEYOND_EXAMPLES = 40.0, 4
+"""Seconds between keys that no network sees both at once, and how many examples are tried there."""
 _STANDS = 0.3  # metres that hips sway at most
 
 
@@ -131,6 +134,22 @@ class _Made:
         return float(speed.quantile(_FASTEST))
 
     @property
+    def speed(self) -> float:
+        """Mean speed of joints in the five seconds in which they are slowest, cm/s: who freezes anywhere has none."""
+        speed = torch.diff(self.bare, dim=0).norm(dim=-1).mean(dim=-1)
+        return 100 * PRIOR_FPS * float(min(part.mean() for part in self._cut(speed)))
+
+    @property
+    def spread(self) -> float:
+        """Mean distance of joints from where they are on average, in the five seconds in which that is least, cm."""
+        return 100 * float(min((part - part.mean(dim=0)).norm(dim=-1).mean() for part in self._cut(self.bare)))
+
+    def _cut(self, frames: Tensor) -> Iterator[Tensor]:
+        """Cut into windows of five seconds; what is shorter is one."""
+        count = max(1, len(frames) // (_WINDOW_SECONDS * PRIOR_FPS))
+        return iter(frames.tensor_split(count))
+
+    @property
     def jerk(self) -> float:
         """Mean third difference, m/s^3."""
         return float(torch.diff(self.bare, n=3, dim=0).norm(dim=-1).mean()) * PRIOR_FPS**3
@@ -182,33 +201,42 @@ def benchmark_dna(
 ) -> list[Row]:
     """Measure motions through the keys of each clip, so many seconds apart, under the DNA of each example: the share of
     pairs, %, in which its poses come nearer in the motion made under it than in that under another, and by how much,
-    cm; Eq. 11 and Eq. 12 in cm; the fastest joint over the examples' own; planted toes, cm/s, and jerk, m/s^3; how long
-    poses stay, frames, and how many flash up, %. Beside it no DNA, its poses pasted as keys for `pasting`, and mocap
-    among `clips`.
+    cm; Eq. 11 and Eq. 12 in cm; the fastest joint over the examples' own; planted toes, cm/s, and jerk, m/s^3; joints'
+    speed, cm/s, and the spread of poses, cm, in the five seconds in which they are least; how long poses stay, frames,
+    and how many flash up, %. Beside it no DNA, its poses pasted as keys for `pasting`, keys 40 s apart, and mocap among
+    `clips`.
     """
-    kinds = ("DNA", "no DNA", "poses pasted as keys")
-    made: dict[str, list[list[_Made]]] = {kind: [] for kind in kinds}
+    made: dict[str, list[list[_Made]]] = {}
+
+    def fill(kind: str, told: Iterator[tuple[Motion, Keys, Inbetweener]]) -> None:
+        motions = [_Made.of(tween(*each, settings=settings).motion) for each in told]
+        made.setdefault(kind, []).append(motions)
+
+    few = examples[:_BEYOND_EXAMPLES]
+    beyond = f" {BEYOND_SECONDS:g} s apart"
     for number, key in enumerate(keys):
-        plain = lay_keys(key, seconds)
-        ends = Keys((0, plain.num_frames - 1))
-
-        def fill(shown: Motion, at: Keys, inbetweener: Inbetweener) -> _Made:
-            return _Made.of(tween(shown, at, inbetweener, settings=settings).motion)
-
-        alone = fill(plain, ends, make(None))
-        made["no DNA"].append([alone for _ in examples])
-        made["DNA"].append([fill(plain, ends, make(example.dna)) for example in examples])
-        pasted = [paste_poses(plain, example.motion) for example in examples]
-        made["poses pasted as keys"].append([fill(*each, pasting) for each in pasted])
+        near, far = (lay_keys(key, each) for each in (seconds, BEYOND_SECONDS))
+        fill("DNA", ((near, _ends(near), make(example.dna)) for example in examples))
+        fill("no DNA", iter([(near, _ends(near), make(None))]))
+        fill("poses pasted as keys", ((*paste_poses(near, example.motion), pasting) for example in examples))
+        fill("DNA" + beyond, ((far, _ends(far), make(example.dna)) for example in few))
+        fill("no DNA" + beyond, iter([(far, _ends(far), make(None))]))
         if progress is not None:
             progress(number + 1, len(keys))
     usual = sum(_Made.of(example.motion).fastest for example in examples) / len(examples)
     rows = []
     for kind, found in made.items():
-        told = [(one, example.dna) for row in found for one, example in zip(row, examples, strict=True)]
-        pairs = _NO_PAIRS if kind == "no DNA" else _compare_pairs(found, examples)
-        rows.append({"by": kind, **pairs, **_measure(told, usual, seconds)})
+        asked = few if kind.endswith(beyond) else examples
+        found = [row * len(asked) if kind.startswith("no DNA") else row for row in found]
+        told = [(one, example.dna) for row in found for one, example in zip(row, asked, strict=True)]
+        pairs = _NO_PAIRS if kind.startswith("no DNA") else _compare_pairs(found, asked)
+        apart = BEYOND_SECONDS if kind.endswith(beyond) else seconds
+        rows.append({"by": kind, **pairs, **_measure(told, usual, apart)})
     return [*rows, *_measure_mocap(examples, clips, usual, seconds)]
+
+
+def _ends(motion: Motion) -> Keys:
+    return Keys((0, motion.num_frames - 1))
 
 
 def paste_poses(plain: Motion, clip: Motion) -> tuple[Motion, Keys]:
@@ -248,6 +276,8 @@ def _measure(told: Sequence[tuple[_Made, MotionDna]], usual: float, seconds: flo
         "fastest": [one.fastest / usual for one, _ in told],
         "planted_cm_s": [one.sliding for one, _ in told],
         "jerk_m_s3": [one.jerk for one, _ in told],
+        "speed_cm_s": [one.speed for one, _ in told],
+        "spread_cm": [one.spread for one, _ in told],
     }
     means = {name: sum(values) / len(values) for name, values in columns.items()}
     flashed = 100 * sum(count < _LEAST_DWELL for count in dwell) / len(dwell)
