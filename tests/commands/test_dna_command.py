@@ -139,6 +139,14 @@ def test_variations_are_drawn_among_styles_and_come_again(here, models, prior, c
         assert lines[1] != lines[2]
 
 
+def test_the_seed_draws_the_order_of_styles(here, models, prior, capsys):
+    words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "walk,style.bvh,wave-left-hand"]
+    for seed in range(4):
+        assert run("tween", *words, "--seed", seed) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("out_001")]
+    assert len({line.partition(" in the style of ")[2] for line in lines}) > 1
+
+
 def test_variations_are_shown_below_each_other(here, models, prior):
     words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "style.bvh", "--quiet"]
     assert run("tween", *words, "--video", "four.png") == 0

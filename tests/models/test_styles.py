@@ -10,6 +10,7 @@ from tiny_path import save_tiny_path
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
+from mapctl.motion_dna import MotionDna
 from priors import checkpoints
 from priors.tweening import class_vectors
 from priors.tweening.class_vectors import collect_dna, compute_classes, group_clips
@@ -49,12 +50,14 @@ def test_vectors_are_means_over_clips_and_come_back_from_the_card():
     encoder, made = tiny_tweener.network().style, corpus(3, 90)
     members = collect_dna(made, r"walk-([01])")
     assert {name: len(each) for name, each in members.items()} == {"0": 1, "1": 1}
-    two = {"both": [members["0"][0], members["1"][0]], "one": members["0"]}
+    other = MotionDna(torch.randn(4, 21, 3, generator=generator()))
+    two = {"both": [members["0"][0], other], "one": members["0"]}
     data = encode_classes(encoder, two)
     card = tiny_tweener.card()
     card.data.update(json.loads(json.dumps(data)))
     classes = read_classes(card, 5)
     each = [encoder(dna.poses[None])[0] for dna in two["both"]]
+    assert float((each[0] - each[1]).abs().max()) > 0.1
     torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
     assert count_clips(card.data)["classes"] == {"both": 2, "one": 1}

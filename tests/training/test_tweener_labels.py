@@ -38,6 +38,7 @@ def test_labels_that_cannot_be_are_refused_before_training(recipe):
     for labels, said in (("(", "regular expression"), ("walk", "needs a group"), ("(run)", "matches no clip")):
         with pytest.raises(RequestError, match=said):
             train(replace(recipe, labels=labels, out=recipe.out / "other"), lambda line: None)
+        assert not list(recipe.out.glob("other/*checkpoint*"))
 
 
 def test_the_option_is_the_recipe_s(recipe):
