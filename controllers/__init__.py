@@ -10,11 +10,12 @@ from controllers.inbetweening.infill import InfillSettings, infill, retraced
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from controllers.inbetweening.tween import tween
 from controllers.steering import steer
-from mapctl.intent.keyframes import Key, Keys
+from mapctl.intent.keyframes import Drawing, Key, Keys
 
 __all__ = [
     "AutoInbetweener",
     "DenoiseSettings",
+    "Drawing",
     "FollowSettings",
     "GenerateSettings",
     "InfillSettings",

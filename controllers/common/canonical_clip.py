@@ -11,6 +11,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
 from mapctl.inbetweening.query import GapQuery
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
@@ -44,8 +45,14 @@ class CanonicalClip:
         interpolated = interpolate_missing(motion, missing)
         return CanonicalClip(motion, missing, interpolated, *to_canonical(interpolated, rig))
 
-    def query(self, *, effector_targets: EffectorTargets | None = None, keep_trajectory: bool = False) -> GapQuery:
-        """Build the query for in-betweeners, at PRIOR_FPS; targets are by frame of the clip.
+    def query(
+        self,
+        *,
+        effector_targets: EffectorTargets | None = None,
+        keep_trajectory: bool = False,
+        loose: LooseKeys | None = None,
+    ) -> GapQuery:
+        """Build the query for in-betweeners, at PRIOR_FPS; targets and loose keys are by frame of the clip.
 
         A frame of the query between two of the clip is the nearby frame with the fewest missing values, if that has
         fewer than the two.
@@ -67,15 +74,17 @@ class CanonicalClip:
         joints, seconds = self._missing_canonical_joints(), at / float(canonical.fps)
         if effector_targets is not None:
             effector_targets = effector_targets.shown(seconds, fps=float(canonical.fps))
+        if loose is not None:
+            loose = loose.shown(seconds, fps=float(canonical.fps))
         mask = MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
-        return GapQuery(shown, mask, seconds, effector_targets, keep_trajectory)
+        return GapQuery(shown, mask, seconds, effector_targets, keep_trajectory, loose)
 
     def back(self, made: Motion, query: GapQuery) -> Motion:
         """Return an answer to the query on the rig, at the clip's rate, with blended seams and what is known to the
         bit. If the answer is the query's own interpolation, return the interpolation on the rig.
         """
         filled = self.interpolated
-        if made is not query.motion or query.keep_trajectory:
+        if made is not query.motion or query.keep_trajectory or query.loose is not None:
             resampled = _resample_like(self.canonical, made, query.seconds)
             filled = from_canonical(resampled, self.rigmap, self.interpolated)
             filled = self._blend_seams(restore_observed(filled, self.interpolated, self.missing))

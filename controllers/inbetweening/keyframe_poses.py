@@ -8,13 +8,15 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import reduce
 from pathlib import Path
+from typing import Literal
 
 import torch
 
-from controllers.inbetweening.keyframes import effector_joint
+from controllers.inbetweening.keyframes import effector_joint, resolve_drawing
 from mapctl import formats, rotations
 from mapctl.errors import MapctlError, RequestError
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.intent.drawing_csv import read_drawing
 from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.kinematics import heading
@@ -40,7 +42,7 @@ def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> Keyframe
     """Build the motion and the keys of a request. RequestError, which names the key, for poses and joints that do not
     exist; `rig` is the body's where it is not the one that would be recognised.
     """
-    first = next((number for number, key in enumerate(request.key) if key.needs_pose), 0)
+    first = next((number for number, key in enumerate(request.key) if key.pose is not None), 0)
     reader = _PoseReader(rig)
     with _prefix_errors("body" if request.body is not None else f"key[{first}].pose"):
         body = reader.body(request.body or request.key[first].pose or "")
@@ -49,7 +51,7 @@ def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> Keyframe
     for number, key in enumerate(request.key):
         frame = request.frame_of(key)
         keys[frame] = _build_key(key, frame, body.rigmap, number)
-        if key.needs_pose:
+        if key.needs_pose or key.tells_place:
             poses[frame] = replace(_build_pose(key, request, reader, body, number), fps=fps, source=body.clip.source)
     return KeyframeClip(_interpolate_poses(poses, max(keys) + 1), Keys(tuple(keys.values())), as_rig(body.rigmap))
 
@@ -58,6 +60,8 @@ def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> Keyframe
 class _LoadedClip:
     """Motion of a file, as read and retargeted."""
 
+    path: str
+    """The file."""
     clip: Motion
     """Clip as read."""
     canonical: Motion
@@ -84,14 +88,15 @@ class _PoseReader:
         """Load the body's own file, on its rig where one is given."""
         unit = None if self.rig is None else self.rig.metres_per_unit
         clip = formats.load(Path(path), metres_per_unit=unit)
-        self.clips[path] = _LoadedClip(clip, *RiggedCharacter.of(clip, self.rig))
+        self.clips[path] = _LoadedClip(path, clip, *RiggedCharacter.of(clip, self.rig))
         return self.clips[path]
 
     def pose(self, path: str, body: _LoadedClip) -> _LoadedClip:
         """Load a clip, retargeted to the body; the rig of another skeleton must be recognised."""
         if path not in self.clips:
             clip = formats.load(Path(path))
-            self.clips[path] = _LoadedClip(clip, retarget_motion(clip, body.target_body).motion, body.target_body)
+            moved = retarget_motion(clip, body.target_body).motion
+            self.clips[path] = _LoadedClip(path, clip, moved, body.target_body)
         return self.clips[path]
 
 
@@ -100,13 +105,21 @@ def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:
         with _prefix_errors(f"key[{number}].{name}"):
             for joint in names:
                 effector_joint(joint, rigmap)
-    return Key(frame, limbs=key.joints, places=key.reach, root_only=key.root_only)
+    drawing = None
+    if key.drawing is not None:
+        with _prefix_errors(f"key[{number}].drawing"):
+            drawing = read_drawing(key.drawing, key.view_deg or 0.0)
+            resolve_drawing(drawing, rigmap)
+    placed = drawing is not None and key.place is not None
+    kind: Literal["place"] | bool = "place" if key.root_only == "place" else bool(key.root_only)
+    return Key(frame, key.joints, key.reach, root_only=kind, half=key.half, drawing=drawing, placed=placed)
 
 
 def _build_pose(key: KeyEntry, request: KeyRequest, reader: _PoseReader, body: _LoadedClip, number: int) -> Motion:
-    """Build one frame on the body's rig, at its requested position and heading."""
+    """Build one frame on the body's rig, at its requested position and heading; of a key that tells a place alone, any
+    pose of the body's there."""
     with _prefix_errors(f"key[{number}].pose"):
-        found = reader.pose(key.pose or request.body or "", body)
+        found = reader.pose(key.pose or request.body or body.path, body)
     clip = found.clip
     frame = key.pose_frame or 0
     if key.pose_seconds is not None:
@@ -139,7 +152,7 @@ def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:
     """Interpolate from pose to pose between their frames."""
     at = torch.tensor(sorted(poses))
     joined = reduce(Motion.join, (poses[frame] for frame in sorted(poses)))
-    source = torch.searchsorted(at, torch.arange(frames), right=True) - 1
+    source = (torch.searchsorted(at, torch.arange(frames), right=True) - 1).clamp_min(0)
     moving = {joint: values[source] for joint, values in joined.moving_offsets.items()}
     motion = replace(
         joined,

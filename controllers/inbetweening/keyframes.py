@@ -1,15 +1,20 @@
 """Keyframes of in-betweening: what they leave missing, their effector targets, and the errors of a motion at them."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
+from controllers.inbetweening.geometry.drawn_poses import measure_drawing_error
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.inbetweening.missing import MissingMask
-from mapctl.intent.keyframes import Key, Keys
+from mapctl.intent.keyframes import Drawing, Key, Keys
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, identify_rig, rig_joint_positions
@@ -24,9 +29,11 @@ def missing_between_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) ->
     joints, root = free[:, None].expand(-1, motion.num_joints).clone(), free.clone()
     carries_hips = torch.tensor([_carries_hips(joint, rigmap) for joint in range(motion.num_joints)])
     for key in keys:
-        if key.what == "root":
+        if key.what in ("root", "half"):
             root[key.frame] = False
             joints[key.frame] = ~carries_hips
+        if key.half is not None:
+            joints[key.frame] &= ~_find_half(key.half, rigmap)
     return MissingMask(joints, root)
 
 
@@ -46,6 +53,44 @@ def collect_effector_targets(keys: Sequence[Key], motion: Motion, rigmap: RigMap
     return EffectorTargets(positions, wanted)
 
 
+def collect_loose_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> LooseKeys | None:
+    """Collect places over the ground and drawings of keys; None where no key tells either. RequestError for drawn
+    joints that the rig has not, or has twice."""
+    if all(key.what not in ("place", "drawing") for key in keys):
+        return None
+    loose, hips = LooseKeys.none(motion.num_frames, CANONICAL.num_joints), rig_joint_positions(motion, rigmap)[:, 0]
+    for key in keys:
+        if key.what == "place" or key.placed:
+            loose.placed[key.frame] = True
+            loose.ground[key.frame] = hips[key.frame, ::2]
+        if key.drawing is not None:
+            loose.view[key.frame] = math.radians(key.drawing.view_deg)
+            for joint, place in resolve_drawing(key.drawing, rigmap).items():
+                loose.drawn[key.frame, joint] = True
+                loose.sketch[key.frame, joint] = loose.sketch.new_tensor(place)
+    return loose
+
+
+def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, float]]:
+    """Return the places of a drawing by canonical joint; RequestError, with the nearest name, for a joint that is none
+    of these, or that is drawn twice."""
+    found: dict[int, tuple[float, float]] = {}
+    own = {joint: CANONICAL.index(name) for name, joint in rigmap.joints.items()}
+    for name, place in drawing.places_xy.items():
+        joint = CANONICAL.names.index(name) if name in CANONICAL.names else None
+        if joint is None:
+            there = find_joint(name, rigmap.rig_skeleton.names, lambda: rigmap.joints)
+            joint = None if there is None else own.get(there)
+        if joint is None:
+            names = [*rigmap.joint_names.values()]
+            nearest = describe_nearest(name, names, [classify_joint(c) for c in rigmap.joint_names])
+            raise RequestError(f"no joint {name!r} that could be drawn; {nearest}")
+        if joint in found:
+            raise RequestError(f"{name!r} is drawn twice, by its own name and by the canonical one")
+        found[joint] = place
+    return found
+
+
 def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
     """Compute by key the largest error over joints: of positions, cm, and of rotations, degrees, where it gives any."""
     wanted, hips = keys.checked(source), rigmap.joint_of[0]
@@ -53,17 +98,32 @@ def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) ->
     rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
     angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
     targets = collect_effector_targets(wanted, source, rigmap)
-    rows = []
+    loose = collect_loose_keys(wanted, source, rigmap)
+    known = ~missing_between_keys(wanted, source, rigmap).joints
+    rows, places = [], rig_joint_positions(made, rigmap)
     for key in wanted:
         row: dict[str, Any] = {"frame": key.frame, "what": key.what}
         if key.what == "limbs" and targets is not None:
-            miss = (rig_joint_positions(made, rigmap)[key.frame] - targets.places[key.frame]).norm(dim=-1)
+            miss = (places[key.frame] - targets.places[key.frame]).norm(dim=-1)
             rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
             continue
-        joints = [hips or 0] if key.what == "root" else list(range(source.num_joints))
+        if loose is not None and key.what in ("place", "drawing"):
+            rows.append(row | _compute_loose_errors(places[key.frame], loose, key.frame))
+            continue
+        joints = [hips or 0] if key.what == "root" else known[key.frame].nonzero()[:, 0].tolist()
         row |= {"missed_cm": float(distance[key.frame, joints].max())}
         rows.append(row | {"missed_deg": float(angles[key.frame, joints].max())})
     return rows
+
+
+def _compute_loose_errors(places: Float[Tensor, "joints 3"], loose: LooseKeys, frame: int) -> dict[str, float]:
+    """Compute by how much the hips miss their place over the ground, and joints on average where they are drawn."""
+    row: dict[str, float] = {}
+    if bool(loose.placed[frame]):
+        row["missed_cm"] = 100 * float((places[0, ::2] - loose.ground[frame]).norm())
+    if bool(loose.drawn[frame].any()):
+        row["drawn_cm"] = 100 * measure_drawing_error(places, loose, frame)
+    return row
 
 
 def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
@@ -84,6 +144,23 @@ def effector_joint(name: str, rigmap: RigMap) -> int:
         return ends[joint]
     given = [classify_joint(CANONICAL.names[end]) for end in ends.values()]
     raise RequestError(f"no hand or foot {name!r}; {describe_nearest(name, [names[end] for end in ends], given)}")
+
+
+def _find_half(half: str, rigmap: RigMap) -> Bool[Tensor, " joints"]:
+    """Find the joints of a rig that belong to a half of the body. Those that no canonical joint is belong to that which
+    the nearest one below them does, or else above; the upper half has what hangs on the hips besides."""
+    parents = rigmap.rig_skeleton.parents
+    legs = {joint: _is_leg(name) for name, joint in rigmap.joints.items() if name != CANONICAL.names[0]}
+    for joint in reversed(range(len(parents))):  # upwards, from what hangs below
+        if joint in legs and parents[joint] >= 0 and parents[joint] != rigmap.joint_of[0]:
+            legs.setdefault(parents[joint], legs[joint])
+    for joint, parent in enumerate(parents):
+        legs.setdefault(joint, legs.get(parent, False) if parent != rigmap.joint_of[0] else False)
+    return torch.tensor([legs[joint] == (half == "lower") for joint in range(len(parents))])
+
+
+def _is_leg(name: str) -> bool:
+    return name.endswith(("Leg", "Foot", "Toes"))
 
 
 def _carries_hips(joint: int, rigmap: RigMap) -> bool:

@@ -11,7 +11,8 @@ import torch
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.common.map_refinement import RefinementSettings
 from controllers.inbetweening.gap_notes import compose_gap_notes
-from controllers.inbetweening.geometry.root_path import move_root_along_curve
+from controllers.inbetweening.geometry.root_path import move_root_along_curve, move_root_over_places
+from controllers.inbetweening.proposers.loose_keys import hold_loose_keys, meet_places, note_drawings, show_drawn_poses
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.refine import INFILL_REFINEMENT, refine_gaps
 from controllers.inbetweening.solution import InbetweenSolution
@@ -20,8 +21,10 @@ from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.inbetweening import Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets, compute_target_errors, reach_effector_targets
+from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
+from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Density, Inbetweener
@@ -32,6 +35,7 @@ from mapctl.terms import Term
 _REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
 _REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached
 _MAX_REACH_ATTEMPTS = 6
+_PLACE_SECONDS = 0.5  # over which what the hips are moved by fades away from a place
 
 
 @dataclass(frozen=True)
@@ -54,14 +58,15 @@ def fill(
     terms: Sequence[Term] = (),
     rig: Rig | None = None,
     targets: EffectorTargets | None = None,
+    loose: LooseKeys | None = None,
     curve: Curve | None = None,
     generator: torch.Generator | None = None,
 ) -> InbetweenSolution:
     """Fill missing values of a motion.
 
-    `targets` are positions of the rig's hands and feet in frames in which they are missing; the hips follow `curve`
-    while they are. The MAP stage adds `terms`, and the likeliest of `densities` its likelihood; RequestError for terms
-    where it is left out.
+    `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` places over the
+    ground and drawings in such frames; the hips follow `curve` while they are missing. The MAP stage adds `terms`, and
+    the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
     if terms and not settings.finish:
@@ -70,13 +75,21 @@ def fill(
     clip = CanonicalClip.of(motion, missing, rig)
     if curve is not None:
         clip = replace(clip, canonical=move_root_along_curve(clip.canonical, missing.root, curve))
-    query = clip.query(effector_targets=targets, keep_trajectory=curve is not None)
+    if loose is not None:
+        clip = _lead_over_places(clip, loose)
+    query = clip.query(effector_targets=targets, keep_trajectory=curve is not None, loose=loose)
+    query = show_drawn_poses(query, inbetweener, generator)
     answer, reached = propose_through_keys(query, inbetweener, generator)
+    answer = meet_places(answer, query)
     made, ledger, windows = answer.motion, Ledger(), ()
     if settings.finish:
-        made, ledger, windows = refine_gaps(answer, query, reached, settings.refinement, densities, terms)
+        firm = replace(query, missing=hold_loose_keys(query))
+        made, ledger, windows = refine_gaps(answer, firm, reached, settings.refinement, densities, terms)
     done, unreached = _reach_targets(clip, clip.back(made, query), targets)
-    status = Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer))
+    done = _meet_places(clip, done, loose)
+    status = (
+        Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer, loose)).with_notes(note_drawings(made, query))
+    )
     status = status.with_notes(unreached, infeasible=bool(unreached))
     return InbetweenSolution(
         done,
@@ -92,9 +105,28 @@ def fill(
     )
 
 
-def _note_open_ends(clip: CanonicalClip, answer: Proposal) -> tuple[str, ...]:
+def _lead_over_places(clip: CanonicalClip, loose: LooseKeys) -> CanonicalClip:
+    """Lead the interpolation between keys over the places of loose ones."""
+    hips = clip.rigmap.joint_of[0]
+    turned = clip.missing.root if hips is None else clip.missing.joints[:, hips]
+    return replace(clip, canonical=move_root_over_places(clip.canonical, clip.missing.root, turned, loose))
+
+
+def _meet_places(clip: CanonicalClip, filled: Motion, loose: LooseKeys | None) -> Motion:
+    """Move the hips, smoothly, by the little that resampling and the MAP stage leave them from their places."""
+    if loose is None or not bool(loose.placed.any()):
+        return filled
+    canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
+    root, free = canonical.root_position.clone(), clip.missing.root
+    off = torch.where((loose.placed & free)[:, None], loose.ground - root[:, ::2], 0.0)
+    moved = interpolate_offsets(off, loose.placed | ~free, seconds=_PLACE_SECONDS, fps=float(filled.fps))
+    root[:, ::2] += torch.where(free[:, None], moved, 0.0)
+    return clip.restore_observed(from_canonical(replace(canonical, root_position=root), rigmap, filled))
+
+
+def _note_open_ends(clip: CanonicalClip, answer: Proposal, loose: LooseKeys | None) -> tuple[str, ...]:
     """Note which in-betweener extrapolates gaps that have one edge only."""
-    notes, missing = [], clip.missing.root
+    notes, missing = [], clip.missing.root if loose is None else clip.missing.root & ~loose.placed & ~loose.drawings
     if bool(missing[0]):
         by = answer.source
         notes.append(

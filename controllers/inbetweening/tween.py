@@ -8,8 +8,13 @@ from typing import Any
 
 import torch
 
-from controllers.inbetweening.feasibility import check_keyframes
-from controllers.inbetweening.keyframes import collect_effector_targets, keyframe_errors, missing_between_keys
+from controllers.inbetweening.feasibility import check_keyframes, note_joint_ranges
+from controllers.inbetweening.keyframes import (
+    collect_effector_targets,
+    collect_loose_keys,
+    keyframe_errors,
+    missing_between_keys,
+)
 from controllers.inbetweening.pipeline import InfillSettings, fill
 from controllers.inbetweening.solution import InbetweenSolution
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
@@ -41,7 +46,8 @@ def tween(
     wanted = keys.checked(motion)
     canonical, rigmap, shown = keyframe_motion(wanted, motion, rig)
     missing, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
-    infeasible = check_keyframes(shown, canonical, rigmap, missing, targets)
+    loose = collect_loose_keys(wanted, motion, rigmap)
+    infeasible = check_keyframes(shown, canonical, rigmap, missing, targets, loose)
     done = fill(
         motion,
         missing,
@@ -51,9 +57,12 @@ def tween(
         terms=terms,
         rig=as_rig(rigmap),
         targets=targets,
+        loose=loose,
         generator=generator,
     )
-    return replace(done, status=done.status.with_notes(infeasible, infeasible=bool(infeasible)))
+    beyond = note_joint_ranges(canonical, missing, rigmap)
+    status = done.status.with_notes(beyond)
+    return replace(done, status=status.with_notes(infeasible, infeasible=bool(infeasible)))
 
 
 def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
@@ -61,7 +70,8 @@ def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> t
     identified from these, and on the rig.
     """
     free = torch.ones(motion.num_frames, dtype=torch.bool)
-    free[[key.frame for key in wanted if key.shown]] = False
+    # Where keys tell no rotation at all, the rig is known by the pose at any of them.
+    free[[key.frame for key in wanted if key.shown] or [wanted[0].frame]] = False
     shown = interpolate_missing(motion, MissingMask.of_frames(free, motion.num_joints))
     return *to_canonical(shown, rig), shown
 

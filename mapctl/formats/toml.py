@@ -13,7 +13,8 @@ from mapctl.errors import FileFormatError
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Configuration of dataclasses that are read: no key but their fields, and finite numbers."""
-_KINDS = ("float", "str", "constrained-float", "constrained-str")  # which pydantic names where a value may be either
+_KINDS = ("bool", "float", "str", "constrained-float", "constrained-str")
+"""Kinds that pydantic names where a value may be either."""
 _MAX_SHOWN = 60  # characters of a wrong value that are shown
 
 T = TypeVar("T")

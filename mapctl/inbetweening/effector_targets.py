@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl.errors import RequestError
@@ -29,16 +29,21 @@ class EffectorTargets:
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
         """Return the targets at other, increasing times: each is moved to the time nearest to its own."""
-        own = torch.arange(len(self.places), dtype=seconds.dtype) / fps
-        after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
-        before = (after - 1).clamp_min(0)
-        nearest = torch.where((seconds[before] - own).abs() <= (seconds[after] - own).abs(), before, after)
+        nearest = find_nearest_times(len(self.places), seconds, fps=fps)
         joints = self.places.shape[1]
         positions, wanted = self.places.new_zeros(len(seconds), joints, 3), self.wanted.new_zeros(len(seconds), joints)
         for frame, joint in self.wanted.nonzero().tolist():
             positions[nearest[frame], joint] = self.places[frame, joint]
             wanted[nearest[frame], joint] = True
         return EffectorTargets(positions, wanted)
+
+
+def find_nearest_times(frames: int, seconds: Float[Tensor, " shown"], *, fps: float) -> Int[Tensor, " frames"]:
+    """Find for each of so many frames which of other, increasing times is the nearest."""
+    own = torch.arange(frames, dtype=seconds.dtype) / fps
+    after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
+    before = (after - 1).clamp_min(0)
+    return torch.where((seconds[before] - own).abs() <= (seconds[after] - own).abs(), before, after)
 
 
 def check_limbs(targets: EffectorTargets) -> None:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.numerics.intervals import true_intervals
 
 _LEAST_STEP = 1e-4  # metres a frame that even a body which does not move counts as walking
@@ -38,3 +39,19 @@ def close_path(
             offset = torch.lerp(miss[0, list(axes)], miss[-1, list(axes)], share[:, None])
             path[start:stop, list(axes)] = predicted[start:stop, list(axes)] + offset
     return path
+
+
+def lead_over_keys(
+    predicted: Float[Tensor, "frames 3"],
+    known: Float[Tensor, "frames 3"],
+    lost: Bool[Tensor, " frames"],
+    loose: LooseKeys | None,
+) -> Float[Tensor, "frames 3"]:
+    """Close a path as `close_path` does, over places of loose keys too, which tell no height."""
+    path = close_path(predicted, known, lost)
+    if loose is None or not bool(loose.placed.any()):
+        return path
+    told = torch.stack([loose.ground[:, 0], predicted[:, 1], loose.ground[:, 1]], dim=-1).to(known)
+    placed = lost & loose.placed
+    ground = close_path(predicted, torch.where(placed[:, None], told, known), lost & ~placed)
+    return torch.stack([ground[:, 0], path[:, 1], ground[:, 2]], dim=-1)

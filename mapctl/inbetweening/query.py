@@ -9,6 +9,7 @@ from torch import Tensor
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
@@ -29,6 +30,9 @@ class GapQuery:
     """World positions that joints are to reach in frames in which they are missing."""
     keep_trajectory: bool = False
     """Whether the root of `motion` shows the requested trajectory where it is missing; it may sway about that."""
+    loose: LooseKeys | None = None
+    """Places over the ground and drawings in frames that are missing; `motion` leads over the places, and looks along
+    them where no heading is known."""
 
     @property
     def known_positions(self) -> Bool[Tensor, "frames joints"]:
@@ -49,6 +53,12 @@ class GapQuery:
         """First frames and one past the last of gaps in which nothing is known, with known frames on both sides."""
         gaps = true_intervals(self.nothing_known[:, None])
         return [(start, stop) for _, start, stop in gaps if start > 0 and stop < self.motion.num_frames]
+
+    @property
+    def only_places(self) -> bool:
+        """Whether nothing is told but where the hips are over the ground."""
+        untold = bool(self.nothing_known.all()) and self.effector_targets is None
+        return untold and self.loose is not None and not bool(self.loose.drawn.any())
 
     @property
     def scale(self) -> float:

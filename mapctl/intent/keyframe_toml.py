@@ -5,13 +5,14 @@ from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import toml
 from mapctl.formats.toml import STRICT
+from mapctl.intent.keyframes import KINDS, NO_PLACE, check_kinds
 
 _MOST_SECONDS = 3600.0
 _MOST_FRAMES = 100_000
@@ -50,13 +51,26 @@ class KeyEntry:
     """Hands and feet of the body whose positions in the pose are all that counts."""
     reach: Mapping[Name, tuple[Metres, Metres, Metres]] = field(default_factory=dict)
     """Hands and feet of the body with target positions x, y, z, metres: all that counts, as for `joints`."""
-    root_only: bool = False
-    """Whether only position and rotation of the hips count."""
+    root_only: bool | str = False
+    """Whether only position and rotation of the hips count; "place": only where they are over the ground."""
+    half: Literal["upper", "lower"] | None = None
+    """Half of the body that counts, with the hips."""
+    drawing: Name | None = None
+    """A CSV file of joint,x,y, relative to the key file: what the pose looks like from one side."""
+    view_deg: Annotated[float, Field(ge=-3600, le=3600)] | None = None
+    """Heading from the body to who sees it as the drawing has it, degrees; 0 if not given."""
 
     @property
     def needs_pose(self) -> bool:
         """Whether anything of a pose counts."""
+        if self.drawing is not None or (self.root_only == "place" and self.place is not None):
+            return False
         return not self.reach or any(name not in self.reach for name in self.joints)
+
+    @property
+    def tells_place(self) -> bool:
+        """Whether it tells where the hips are over the ground."""
+        return self.place is not None if self.drawing is not None else not (self.joints or self.reach)
 
 
 @dataclass(frozen=True)
@@ -79,18 +93,16 @@ class KeyRequest:
             fault = _find_fault(key, self.body)
             if fault is not None:
                 raise RequestError(f"key[{number}].{fault}")
+        if self.body is None and all(key.pose is None for key in self.key):
+            raise RequestError("body: this key is needed where no key has a pose")
         frames = [self.frame_of(key) for key in self.key]
         for number, frame in enumerate(frames):
             if frame > _MOST_FRAMES:
                 raise RequestError(f"key[{number}].seconds: a motion may have {_MOST_FRAMES} frames, got {frame}")
             if (other := frames.index(frame)) < number:
                 raise RequestError(f"key[{number}]: key[{other}] is at frame {frame} already")
-        for number in (frames.index(min(frames)), frames.index(max(frames))):
-            if self.key[number].joints or self.key[number].reach or self.key[number].root_only:
-                raise RequestError(
-                    f"key[{number}]: the first and the last key in time are whole poses, without "
-                    "joints, reach or root_only"
-                )
+        if not any(key.tells_place for key in self.key):
+            raise RequestError(NO_PLACE)
         if min(frames) > 0:
             first = frames.index(min(frames))
             raise RequestError(
@@ -99,8 +111,8 @@ class KeyRequest:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """All motion files that are read."""
-        named = (self.body, *(key.pose for key in self.key))
+        """All motion files and drawings that are read."""
+        named = (self.body, *(key.pose for key in self.key), *(key.drawing for key in self.key))
         return tuple(dict.fromkeys(name for name in named if name is not None))
 
     def frame_of(self, key: KeyEntry) -> int:
@@ -120,9 +132,8 @@ def read_keys(path: str | PathLike[str]) -> KeyRequest:
     def found(name: str | None) -> str | None:
         return None if name is None else str(folder / name)
 
-    return replace(
-        request, body=found(request.body), key=tuple(replace(key, pose=found(key.pose)) for key in request.key)
-    )
+    keys = (replace(key, pose=found(key.pose), drawing=found(key.drawing)) for key in request.key)
+    return replace(request, body=found(request.body), key=tuple(keys))
 
 
 def _find_fault(key: KeyEntry, body: str | None) -> str | None:
@@ -131,9 +142,33 @@ def _find_fault(key: KeyEntry, body: str | None) -> str | None:
         return "frame: a key is at a frame or at seconds, one of them"
     if key.pose_frame is not None and key.pose_seconds is not None:
         return "pose_frame: a pose is told by pose_frame or by pose_seconds, not by both"
+    return _find_kind_fault(key) or _find_pose_fault(key, body)
+
+
+def _find_kind_fault(key: KeyEntry) -> str | None:
+    """Find faults in what of a key counts."""
+    if key.root_only not in (True, False, "place"):
+        return f'root_only: it is true, false or "place", got "{key.root_only}"'
     if key.root_only and (key.joints or key.reach):
         return "root_only: a key tells the root or some joints; choose one"
+    try:
+        check_kinds({name: bool(getattr(key, name)) for name in KINDS}, bool(key.joints or key.reach))
+    except RequestError as error:
+        return f"{next(name for name in KINDS if getattr(key, name))}: {error}"
+    if key.view_deg is not None and key.drawing is None:
+        return "view_deg: it says from where a drawing is seen, and there is none"
+    return None
+
+
+def _find_pose_fault(key: KeyEntry, body: str | None) -> str | None:
+    """Find faults in the pose of a key and in where it is put."""
     idle = [name for name in _POSE_FIELDS if getattr(key, name) is not None]
+    loose = key.drawing is not None or key.root_only == "place"
+    if loose:
+        idle = [name for name in idle if name in ("height", "facing_deg") or (name != "place" and not key.needs_pose)]
+    if idle and loose:
+        kind = "drawing" if key.drawing is not None else "place alone"
+        return f"{idle[0]}: of a key that is told by a {kind} it does not count; leave it out"
     if idle and not key.needs_pose:
         return f"{idle[0]}: of a key that only reaches, no pose counts; leave it out"
     if key.needs_pose and key.pose is None and body is None:

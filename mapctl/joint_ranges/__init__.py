@@ -12,7 +12,7 @@ from functools import cache
 from importlib.resources import files
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import rotations
@@ -121,14 +121,18 @@ class OutOfRange:
     """Number of frames in which it is beyond."""
 
 
-def outside(motion: Motion, ranges: JointRanges | None = None) -> list[OutOfRange]:
+def outside(
+    motion: Motion, ranges: JointRanges | None = None, *, known: Bool[Tensor, "frames joints"] | None = None
+) -> list[OutOfRange]:
     """List the joints of a canonical motion that turn beyond their ranges by more than TOLERANCE_DEG, the farthest
-    first. MapctlError for other skeletons."""
+    first; those that are `known`, if that is given. MapctlError for other skeletons."""
     if motion.skeleton.names != CANONICAL.names:
         raise MapctlError("joint ranges are those of canonical joints; use retarget.to_canonical first")
     ranges = load() if ranges is None else ranges
     angles = ranges.to_angles(rotations.to_matrix(motion.local_quat_xyzw[:, 1:]))
     excess = torch.rad2deg(ranges.find_excess(angles)).amax(dim=-1)
+    if known is not None:
+        excess = torch.where(known[:, 1:], excess, 0.0)
     beyond = excess > TOLERANCE_DEG
     found = [
         OutOfRange(name, int(excess[:, joint].argmax()), float(excess[:, joint].max()), int(beyond[:, joint].sum()))

@@ -4,14 +4,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts, rotations
 from mapctl.errors import CheckpointError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal
-from mapctl.inbetweening.path_closing import close_path
+from mapctl.inbetweening.loose_keys import LooseKeys
+from mapctl.inbetweening.path_closing import lead_over_keys
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import LocalMotion
 from mapctl.inbetweening.whole_body import bend_limbs
@@ -25,6 +26,7 @@ from priors import checkpoints
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import MAX_KEY_FRAMES, GeneratorConfig, GeneratorNetwork
 from priors.tweening.keys import see_contacts
+from priors.tweening.partial_keys import show_loose_keys
 from priors.tweening.splitting import Split, find_splits, place_poses, show_edges
 from priors.tweening.styles import Style, read_classes
 
@@ -147,8 +149,10 @@ class Tweener(Inbetweener):
         seen = still.joint_positions().float()[None]
         predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
         way = predicted.integrate(facing.float()[None])[0].double()
-        led = close_path(way, body.root_position - origin, query.missing.root)
-        calm = smooth_between(led, ~query.missing.root, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
+        loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
+        led = lead_over_keys(way, body.root_position - origin, query.missing.root, loose)
+        told = ~query.missing.root if loose is None else ~query.missing.root | loose.placed
+        calm = smooth_between(led, told, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
         if query.keep_trajectory:
             calm = torch.cat([body.root_position[:, :1], calm[:, 1:2], body.root_position[:, 2:]], dim=-1)
             return replace(body, root_position=calm), predicted.contacts[0]
@@ -160,7 +164,7 @@ class Tweener(Inbetweener):
 def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
     """Return the query, and poses that are told by frame, as the network takes it, of unit size and near the origin,
     and where that origin is."""
-    body, known = query.to_unit_size(query.motion), query.known_positions
+    body, known = query.to_unit_size(query.motion), _find_told_joints(query)
     placed = known[:, 0].nonzero()[:, 0]
     origin = body.root_position[placed[0] if len(placed) else 0] * torch.tensor([1.0, 0.0, 1.0]).double()
     places = body.joint_positions()
@@ -171,12 +175,22 @@ def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tup
     image = PositionImage.of_world(
         (places - origin).float()[None],
         heading(body.local_quat_xyzw[:, 0]).float()[None],
-        see_contacts(planted[None], known.all(dim=1)[None]),
+        see_contacts(planted[None], known.any(dim=1)[None]),
         known=known[None],
         present=torch.ones(1, len(places), dtype=torch.bool),
         toes=TOE_JOINTS,
     )
-    return image, origin
+    return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
+
+
+def _find_told_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:
+    """Find the joints whose positions are told: in the world, or about hips of whose whole body the place alone is
+    missing."""
+    return query.known_positions | ~query.missing.joints.any(dim=1, keepdim=True)
+
+
+def _shift(loose: LooseKeys, by: Float[Tensor, " 3"]) -> LooseKeys:
+    return replace(loose, ground=loose.ground + by[::2])
 
 
 def keep_feet(

@@ -1,4 +1,5 @@
-"""Trajectory of the hips along a curve while their position is missing, from one known position to the next."""
+"""Trajectory of the hips while their position is missing: along a curve from one known position to the next, or
+straight over places that are told by themselves."""
 
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
+from mapctl.inbetweening.loose_keys import LooseKeys, estimate_standing_height, lead_over_places
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
@@ -56,3 +58,22 @@ def _interpolate_edges(
     ends: Float[Tensor, "2 width"], share: Float[Tensor, " frames"]
 ) -> Float[Tensor, "frames width"]:
     return torch.lerp(ends[0], ends[1], share[:, None])
+
+
+def move_root_over_places(
+    motion: Motion, missing_root: Bool[Tensor, " frames"], missing_hips: Bool[Tensor, " frames"], loose: LooseKeys
+) -> Motion:
+    """Move the hips of a canonical motion over the places of loose keys where their position is missing, and turn them
+    along that way where no frame tells their rotation. At a height that no frame tells they stand."""
+    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
+    ground = torch.where(loose.placed[:, None], loose.ground, root[:, ::2])
+    facing = heading(quats[:, 0])
+    way, looked = lead_over_places(
+        ground[None], facing[None], placed=(loose.placed | ~missing_root)[None], faced=~missing_hips[None]
+    )
+    root[:, ::2] = torch.where(missing_root[:, None], way[0], root[:, ::2])
+    if bool(missing_root.all()):
+        root[:, 1] = estimate_standing_height(motion.skeleton)
+    turn = torch.where(missing_hips, looked[0] - facing, 0.0)
+    quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
+    return replace(motion, root_position=root, local_quat_xyzw=quats)
