@@ -53,9 +53,10 @@ def _join_remarks(
 
 def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
     """Format a gap in frames of the motion's own rate."""
-    edges = source.start - 1, min(source.stop, len(query.seconds) - 1)
-    start, stop = (float(query.seconds[frame]) for frame in edges)
-    return f"{round(start * fps) + 1}:{round(stop * fps)}"
+    first = 0 if source.start == 0 else round(float(query.seconds[source.start - 1]) * fps) + 1
+    last = len(query.seconds) - 1
+    stop = round(float(query.seconds[min(source.stop, last)]) * fps)
+    return f"{first}:{stop + (source.stop > last)}"
 
 
 def _estimate_gap_error(query: GapQuery, answer: Proposal, source: GapSource) -> ErrorEstimate | None:

@@ -78,7 +78,7 @@ def fill(
     if loose is not None:
         clip = _lead_over_places(clip, loose)
     query = clip.query(effector_targets=targets, keep_trajectory=curve is not None, loose=loose)
-    query = show_drawn_poses(query, inbetweener, generator)
+    asked, query = query, show_drawn_poses(query, inbetweener, generator)
     answer, reached = propose_through_keys(query, inbetweener, generator)
     answer = meet_places(answer, query)
     made, ledger, windows = answer.motion, Ledger(), ()
@@ -88,7 +88,7 @@ def fill(
     done, unreached = _reach_targets(clip, clip.back(made, query), targets)
     done = _meet_places(clip, done, loose)
     status = (
-        Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer, loose)).with_notes(note_drawings(made, query))
+        Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer, loose)).with_notes(note_drawings(made, asked))
     )
     status = status.with_notes(unreached, infeasible=bool(unreached))
     return InbetweenSolution(

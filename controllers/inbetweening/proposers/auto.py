@@ -16,6 +16,7 @@ from torch import Tensor
 from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.proposers.extrapolation import extrapolate_end
 from controllers.inbetweening.proposers.rollouts import Roller, RolloutSettings
+from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
@@ -121,7 +122,14 @@ class AutoInbetweener(Inbetweener):
         return self.tweener is not None and self.tweener.has_style
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose the candidate with the lowest cost in each gap, one after the other in time, without sampling."""
+        """Propose the candidate with the lowest cost in each gap, one after the other in time, without sampling.
+
+        Loose keys are the tweener's, if there is one; places that are all that is told are walked over by a density
+        where that knows such walks.
+        """
+        if query.loose is not None:
+            walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
+            return walked or (self.tweener or self.network).propose(query, generator=generator)
         first = self.network.propose(query, generator=generator)
         gaps = [gap for gap in query.enclosed_gaps if not _has_enough_context(query, *gap, self.settings)]
         if self.takes_partial_keys:

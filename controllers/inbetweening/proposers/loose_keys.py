@@ -11,7 +11,7 @@ import torch
 
 from controllers.inbetweening.geometry.drawn_poses import fit_drawings, measure_drawing_error
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.inbetweening.path_closing import lead_over_keys
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -20,8 +20,8 @@ _REPORTED_ERROR = 0.03  # metres from where a joint is drawn, on average, beyond
 
 
 def show_drawn_poses(query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator) -> GapQuery:
-    """Return a query whose drawings are poses, fitted about what an in-betweener proposes; their place stays open where
-    it is not told."""
+    """Return a query that has poses instead of drawings, fitted about what an in-betweener proposes; their place stays
+    open where it is not told."""
     loose = query.loose
     if loose is None or not bool(loose.drawn.any()):
         return query
@@ -31,7 +31,9 @@ def show_drawn_poses(query: GapQuery, inbetweener: Inbetweener, generator: torch
     root, quats = query.motion.root_position.clone(), query.motion.local_quat_xyzw.clone()
     quats[drawn], root[drawn, 1] = fitted.local_quat_xyzw[drawn], fitted.root_position[drawn, 1]
     missing = MissingMask(query.missing.joints & ~drawn[:, None], query.missing.root)
-    return replace(query, motion=replace(query.motion, root_position=root, local_quat_xyzw=quats), missing=missing)
+    shown = interpolate_missing(replace(query.motion, local_quat_xyzw=quats), missing)
+    places = replace(loose, drawn=torch.zeros_like(loose.drawn))
+    return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=places)
 
 
 def meet_places(proposal: Proposal, query: GapQuery) -> Proposal:
@@ -50,7 +52,7 @@ def hold_loose_keys(query: GapQuery) -> MissingMask:
 
 
 def note_drawings(motion: Motion, query: GapQuery) -> tuple[str, ...]:
-    """Note drawings that a motion does not look like."""
+    """Note drawings of a query that a motion does not look like."""
     if query.loose is None:
         return ()
     places, frames = motion.joint_positions(), query.loose.drawings.nonzero()[:, 0].tolist()
