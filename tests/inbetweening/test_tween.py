@@ -15,11 +15,12 @@ from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
-from mapctl.intent.keyframes import Key, Keys
+from mapctl.intent.keyframes import Drawing, Key, Keys
 
 RIGS = ("canonical", "bandai", "daz")
 ON_RIGS = [*((rig, 30) for rig in RIGS), ("daz", 120)]
 LIMBS = {"canonical": ("leftHand", "rightFoot"), "bandai": ("Hand_L", "Foot_R"), "daz": ("lHand", "rFoot")}
+DRAWN = Drawing({"hips": (0.0, 1.0), "head": (0.0, 2.0)})
 HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
@@ -212,11 +213,16 @@ def test_the_same_comes_twice():
         (Keys.of((0, 20, 44), limbs=("Foot_R", "foott_l")), "no hand or foot 'foott_l'; the nearest is Foot_L"),
         (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
         (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
+        (Keys((Key(0, limbs=("Foot_R",)), Key(44, limbs=("Hand_L",)))), "no key tells where the hips are"),
+        (Keys((Key(0, drawing=DRAWN), Key(44, drawing=DRAWN))), "no key tells where the hips are"),
         (
-            Keys((Key(0, root_only=True), 20, 44)),
-            "first and the last key are whole poses; that at frame 0 tells the root",
+            Keys((0, Key(44, drawing=Drawing({"hips": (0, 0), "haed": (0, 1)})))),
+            "no joint 'haed' .*the nearest is Head",
         ),
-        (Keys((0, 20, Key(44, limbs=("Hand_L",)))), "that at frame 44 tells the limbs only"),
+        (
+            Keys((0, Key(44, drawing=Drawing({"Hand_L": (0, 0), "leftHand": (0, 1)})))),
+            "'leftHand' is drawn twice, by its own name and by the canonical one",
+        ),
         (Keys((0, Key(20, places={"Hnad_L": (0.0, 1.0, 0.0)}), 44)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
     ],
 )

@@ -7,6 +7,9 @@ from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest, read_keys
 
 TWO = '[[key]]\nframe = 0\npose = "a.bvh"\n[[key]]\nframe = 30\npose = "b.bvh"\n'
 
+LIMB = "reach = { leftHand = [0, 1, 0] }"
+DRAWINGS = 'body = "c.bvh"\n[[key]]\nframe = 0\ndrawing = "d.csv"\n[[key]]\nframe = 30\ndrawing = "d.csv"\n'
+
 
 def written(tmp_path, text):
     path = tmp_path / "keys.toml"
@@ -73,8 +76,24 @@ def test_all_keys_of_a_table_are_read(tmp_path):
         (f"{TWO}facing_deg = nan", "key[1].facing_deg: "),
         (f"{TWO}height = 1979-05-27", "key[1].height: "),
         (f"{TWO}reach = {{ a = [1, 2] }}", "key[1].reach.a[2]: "),
-        (f"{TWO}root_only = true", "key[1]: the first and the last key in time are whole poses"),
-        (f"{TWO}joints = ['LeftHand']", "key[1]: the first and the last key in time are whole poses"),
+        (f"{TWO}joints = ['LeftHand']".replace('pose = "a.bvh"', LIMB, 1), "no key tells where the hips are"),
+        (f'{TWO}half = "left"', "key[1].half: input should be 'upper' or 'lower', got \"left\""),
+        (f'{TWO}half = "upper"\nroot_only = true', "key[1].half: half and root_only are 2 kinds of keys; choose one"),
+        (
+            f'{TWO}half = "upper"\ndrawing = "d.csv"\nroot_only = "place"',
+            "key[1].half: half and drawing and root_only are 3 kinds of keys; choose one",
+        ),
+        (f'{TWO}half = "upper"\njoints = ["a"]', "key[1].half: a key tells half or hands and feet; choose one"),
+        (f'{TWO}drawing = "d.csv"', "key[1].pose: of a key that is told by a drawing it does not count; leave it out"),
+        (f'{TWO}root_only = "plaec"', 'key[1].root_only: it is true, false or "place", got "plaec"'),
+        (f"{TWO}root_only = 1", "key[1].root_only: "),
+        (
+            f'{TWO}root_only = "place"\nheight = 1.0',
+            "key[1].height: of a key that is told by a place alone it does not count; leave it out",
+        ),
+        (f"{TWO}view_deg = 90", "key[1].view_deg: it says from where a drawing is seen, and there is none"),
+        (DRAWINGS, "no key tells where the hips are"),
+        (DRAWINGS.replace('body = "c.bvh"', ""), "body: this key is needed where no key has a pose"),
         (
             f"{TWO}[[key]]\nframe = 9\npose = 'a.bvh'\nroot_only = true\njoints = ['a']",
             "key[2].root_only: a key tells the root or some joints; choose one",
@@ -102,8 +121,18 @@ def test_files_that_are_no_text_or_not_there_are_refused(tmp_path):
 
 
 def test_a_request_is_checked_however_it_is_made():
-    keys = (KeyEntry(frame=0, pose="a.bvh"), KeyEntry(frame=3, pose="a.bvh", root_only=True))
-    with pytest.raises(RequestError, match=r"key\[1\]: the first and the last key"):
+    keys = (KeyEntry(frame=0, pose="a.bvh"), KeyEntry(frame=3, pose="a.bvh", root_only=True, half="upper"))
+    with pytest.raises(RequestError, match=r"key\[1\]\.half: half and root_only"):
         KeyRequest(keys)
     with pytest.raises(RequestError, match="at least two keys"):
         KeyRequest(keys[:1])
+
+
+def test_keys_that_are_not_whole_are_read_and_none_need_be(tmp_path):
+    text = DRAWINGS.replace("frame = 30", "frame = 30\nplace = [1, 2]\nview_deg = -90")
+    more = '[[key]]\nseconds = 0.5\nroot_only = "place"\nplace = [0, 1]\n[[key]]\nseconds = 2\nhalf = "lower"\n'
+    request = read_keys(written(tmp_path, text + more))
+    assert [key.tells_place for key in request.key] == [False, True, True, True]
+    assert [key.needs_pose for key in request.key] == [False, False, False, True]
+    assert (request.key[1].drawing, request.key[1].view_deg) == (str(tmp_path / "d.csv"), -90)
+    assert str(tmp_path / "d.csv") in request.files

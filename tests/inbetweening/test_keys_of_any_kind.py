@@ -1,0 +1,225 @@
+"""Halves of a body, places over the ground and drawings as keys: what they tell is met, on any rig and at any rate, and
+what they do not tell changes nothing."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from captures import on_rig
+from methods import UNFINISHED, by_method
+from tiny_infiller import tiny_infiller
+from tiny_tweener import tiny_tweener
+
+from controllers.inbetweening.geometry.drawn_poses import fit_drawings, measure_drawing_error
+from controllers.inbetweening.keyframes import missing_between_keys
+from controllers.inbetweening.tween import measure_keyframe_errors, tween
+from mapctl import rotations
+from mapctl.inbetweening.loose_keys import LooseKeys, estimate_size, lead_over_places, view_axes
+from mapctl.inbetweening.missing import restore_observed
+from mapctl.intent.keyframes import Drawing, Key, Keys
+from mapctl.kinematics import heading
+from mapctl.retarget import to_canonical
+from mapctl.skeleton import CANONICAL
+
+LAST = 45
+RATES = [("canonical", 30), ("bandai", 30), ("daz", 120)]
+PLACE = {"root_only": "place"}
+
+
+def frames_of(fps):
+    return 0, fps // 2 + 1, fps + 3, round(1.5 * fps) - 1
+
+
+def drawing_of(canonical, frame, *, view_deg, names=CANONICAL.names, unit=100.0):
+    """What somebody draws who sees the pose from there, in centimetres from anywhere."""
+    seen = canonical.joint_positions()[frame] @ view_axes(torch.tensor(math.radians(view_deg)).double()).mT
+    places = {name: tuple((unit * seen[CANONICAL.index(name)] + torch.tensor([7.0, -3.0])).tolist()) for name in names}
+    return Drawing(places, view_deg)
+
+
+def spoilt(motion, missing, *, off=0.3):
+    """The motion with other values wherever they do not count."""
+    turn = rotations.from_rotation_vector(torch.full((*motion.local_quat_xyzw.shape[:2], 3), off).double())
+    moving = {joint: values + off for joint, values in motion.moving_offsets.items()}
+    other = replace(
+        motion,
+        root_position=motion.root_position + off,
+        moving_offsets=moving,
+        local_quat_xyzw=rotations.multiply(motion.local_quat_xyzw, turn),
+    )
+    return restore_observed(other, motion, missing)
+
+
+@pytest.mark.parametrize(("rig", "fps"), RATES)
+@pytest.mark.parametrize("half", ["upper", "lower"])
+def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
+    motion = on_rig(rig, round(1.5 * fps), fps=fps)
+    keys = Keys(tuple(Key(frame, half=half) for frame in frames_of(fps)))
+    rigmap = to_canonical(motion)[1]
+    missing = missing_between_keys(keys.checked(motion), motion, rigmap)
+    told = {name for name, own in rigmap.joints.items() if not missing.joints[0, own]}
+    legs = {name for name in rigmap.joints if name.endswith(("Leg", "Foot", "Toes"))}
+    assert told == ((set(rigmap.joints) - legs) if half == "upper" else {"hips", *legs})
+    made = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
+    known = ~missing.joints
+    assert torch.equal(made.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
+    assert torch.equal(made.motion.root_position[~missing.root], motion.root_position[~missing.root])
+    assert all(row["missed_cm"] < 1e-6 for row in measure_keyframe_errors(made.motion, motion, keys))
+    again = tween(spoilt(motion, missing), keys, tiny_tweener(), settings=UNFINISHED)
+    assert torch.equal(made.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
+
+
+@pytest.mark.parametrize(("rig", "fps", "method"), [*((*rate, "infiller") for rate in RATES), ("daz", 120, "slerp")])
+def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, method):
+    motion = on_rig(rig, round(1.5 * fps), fps=fps)
+    keys = Keys(tuple(Key(frame, **PLACE) for frame in frames_of(fps)))
+    by, settings = by_method(method, tiny_tweener() if method == "infiller" else tiny_infiller(drawn=0.02))
+    made = tween(motion, keys, by, settings=settings)
+    rows = measure_keyframe_errors(made.motion, motion, keys)
+    assert [row["what"] for row in rows] == ["place"] * 4
+    assert all(row["missed_cm"] < 1e-6 for row in rows)
+    assert made.notes == ()
+    canonical = to_canonical(made.motion)[0]
+    way = torch.diff(to_canonical(motion)[0].root_position[[0, -1], ::2], dim=0)[0]
+    facing = heading(canonical.local_quat_xyzw[:, 0])
+    if method == "slerp":  # the others' poses are made up
+        assert float(rotations.wrap_angle(facing[0] - torch.atan2(way[0], way[1])).abs()) < 0.5
+
+
+def test_places_are_met_after_the_map_stage_and_beside_whole_poses():
+    motion = on_rig("bandai", LAST)
+    keys = Keys((0, Key(20, **PLACE), Key(44, half="lower")))
+    made = tween(motion, keys, tiny_tweener())
+    assert all(row["missed_cm"] < 0.1 for row in measure_keyframe_errors(made.motion, motion, keys))
+    assert made.windows
+
+
+def test_only_the_ground_is_told_by_a_place():
+    """Another height and another pose in its frame change no bit."""
+    motion = on_rig("canonical", LAST)
+    keys = Keys((0, Key(20, **PLACE), 44))
+    lifted = motion.root_position.clone()
+    lifted[20, 1] += 0.5
+    quats = motion.local_quat_xyzw.clone()
+    quats[20] = quats[5]
+    other = replace(motion, root_position=lifted, local_quat_xyzw=quats)
+    first, second = (tween(each, keys, tiny_tweener(), settings=UNFINISHED).motion for each in (motion, other))
+    assert torch.equal(first.root_position, second.root_position)
+    assert torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
+
+
+def test_the_way_leads_straight_and_looks_along_itself_where_no_heading_is_told():
+    ground = torch.zeros(1, 9, 2).double()
+    ground[0, 4], ground[0, 8] = torch.tensor([0.0, 2.0]), torch.tensor([2.0, 2.0])
+    placed = torch.zeros(1, 9, dtype=torch.bool)
+    placed[0, [0, 4, 8]] = True
+    never = torch.zeros_like(placed)
+    way, facing = lead_over_places(ground, torch.full((1, 9), 9.0).double(), placed=placed, faced=never)
+    assert way[0, [2, 6]].tolist() == [[0.0, 1.0], [1.0, 2.0]]
+    assert torch.rad2deg(facing[0, [0, 2, 4, 8]]).tolist() == pytest.approx([0, 22.5, 45, 90])
+    told = never.clone()
+    told[0, 3] = True
+    assert (lead_over_places(ground, torch.full((1, 9), 1.0).double(), placed=placed, faced=told)[1] == 1.0).all()
+
+
+def test_a_viewer_in_front_sees_the_left_hand_on_the_right():
+    """Who faces +Z has the left hand toward +X; seen from behind it is on the left, from his left side nearer."""
+    left = torch.tensor([1.0, 0.3, 0.0])
+    for view, right in ((0, 1.0), (180, -1.0), (90, 0.0), (-90, 0.0)):
+        seen = view_axes(torch.tensor(math.radians(view))) @ left
+        assert seen.tolist() == pytest.approx([right, 0.3], abs=1e-6)
+    ahead = torch.tensor([0.0, 0.0, 1.0])  # whoever sees him from his left sees him walk to the left
+    assert (view_axes(torch.tensor(math.radians(90.0))) @ ahead)[0] == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("view_deg", [0, 50, 90, 180])
+def test_a_drawn_pose_comes_to_look_so(view_deg):
+    """Of another pose at hand, in centimetres; in space it is about right too, though no depth is told."""
+    motion = on_rig("canonical", LAST)
+    loose = LooseKeys.none(LAST, CANONICAL.num_joints)
+    drawing = drawing_of(motion, 20, view_deg=view_deg)
+    loose.view[20] = math.radians(view_deg)
+    loose.drawn[20] = True
+    loose.sketch[20] = torch.tensor([drawing.places_xy[name] for name in CANONICAL.names])
+    quats = motion.local_quat_xyzw.clone()
+    quats[20, 1:] = quats[33, 1:]
+    other = replace(motion, local_quat_xyzw=quats)
+    assert measure_drawing_error(other.joint_positions()[20], loose, 20) > 0.02
+    made = fit_drawings(other, loose, faced=True)
+    assert measure_drawing_error(made.joint_positions()[20], loose, 20) < 0.01
+    assert torch.equal(made.local_quat_xyzw[:20], other.local_quat_xyzw[:20])
+    seen, wanted = (each.joint_positions()[20] - each.root_position[20] for each in (made, motion))
+    assert float((seen - wanted).norm(dim=-1).mean()) < 0.08
+
+
+def test_a_drawing_shows_by_its_bones_how_large_it_is():
+    arm = CANONICAL.indices(("leftUpperArm", "leftLowerArm", "leftHand"))
+    flat = torch.tensor([[0.0, 0.0], [24.33, 0.0], [24.33, 11.0]]).double()  # the lower arm leads half away
+    assert estimate_size(flat, arm, CANONICAL) == pytest.approx(0.01, rel=1e-3)
+
+
+def test_drawings_from_other_sides_are_told_as_far_as_they_show():
+    motion = on_rig("canonical", LAST)
+    loose = LooseKeys.none(LAST, CANONICAL.num_joints)
+    for frame, view in ((5, 30.0), (15, 210.0), (25, 120.0)):
+        loose.view[frame], loose.drawn[frame] = math.radians(view), True
+        drawn = drawing_of(motion, frame, view_deg=view, unit=1.0).places_xy
+        loose.sketch[frame] = torch.tensor([drawn[name] for name in CANONICAL.names])
+    seen = loose.see_from_one_side(motion.skeleton)
+    assert seen.view == pytest.approx(math.radians(30))
+    assert seen.known[5, :, :2].all()
+    assert seen.known[15, :, :2].all()
+    assert seen.known[25, :, 1].all()
+    assert not seen.known[25, :, 0].any()
+    assert not seen.known[..., 2].any()
+    axes = view_axes(torch.tensor(math.radians(30)).double())
+    for frame in (5, 15):
+        wanted = (motion.joint_positions()[frame] - motion.root_position[frame]) @ axes.mT
+        away = seen.places[frame, :, :2] - wanted
+        assert float((away - away.mean(dim=0)).abs().max()) < 0.06
+        assert float(seen.places[frame, 0, 0]) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 120)])
+def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
+    motion = on_rig(rig, round(1.5 * fps), fps=fps)
+    canonical = to_canonical(motion)[0]
+    first, *_, last = frames_of(fps)
+    torso = ("hips", "chest", "head", "leftHand", "rightHand", "leftFoot", "rightFoot")
+    keys = Keys(
+        (
+            Key(first, drawing=drawing_of(canonical, first, view_deg=20), placed=True),
+            Key(last, drawing=drawing_of(canonical, last, view_deg=110, names=torso)),
+        )
+    )
+    made = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
+    rows = measure_keyframe_errors(made.motion, motion, keys)
+    assert [row["what"] for row in rows] == ["drawing", "drawing"]
+    assert max(row["drawn_cm"] for row in rows) < 3
+    assert rows[0]["missed_cm"] < 1e-6
+    assert "missed_cm" not in rows[1]
+
+
+def test_a_drawing_of_no_body_is_said():
+    motion = on_rig("canonical", LAST)
+    drawn = drawing_of(motion, 30, view_deg=0).places_xy
+    places = dict(zip(CANONICAL.names, reversed(drawn.values()), strict=True))
+    done = tween(motion, Keys((0, Key(30, drawing=Drawing(places)), 44)), tiny_tweener(), settings=UNFINISHED)
+    assert any(note.startswith("at 1.00 s joints stay ") for note in done.notes)
+
+
+def test_a_joint_beyond_its_range_is_named_with_degrees_and_stays():
+    motion = on_rig("canonical", LAST)
+    knee = CANONICAL.index("leftLowerLeg")
+    quats = motion.local_quat_xyzw.clone()
+    quats[44, knee] = rotations.from_rotation_vector(torch.tensor([-0.8, 0.0, 0.0]).double())
+    bent = replace(motion, local_quat_xyzw=quats)
+    done = tween(bent, Keys((0, Key(44, half="lower"))), tiny_tweener(), settings=UNFINISHED)
+    assert any(
+        note.startswith("leftLowerLeg is ") and "degrees beyond its range in the key at frame 44" in note
+        for note in done.notes
+    )
+    assert torch.equal(done.motion.local_quat_xyzw[44, knee], quats[44, knee])
+    free = tween(bent, Keys((0, Key(44, half="upper"))), tiny_tweener(), settings=UNFINISHED)
+    assert not any("leftLowerLeg" in note for note in free.notes)
