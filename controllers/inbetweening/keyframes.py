@@ -17,7 +17,7 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Drawing, Key, Keys
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.motion import Motion
-from mapctl.retarget import RigMap, identify_rig, rig_joint_positions
+from mapctl.retarget import RigMap, as_rig, identify_rig, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, LIMBS
 
@@ -101,6 +101,8 @@ def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) ->
     loose = collect_loose_keys(wanted, source, rigmap)
     known = ~missing_between_keys(wanted, source, rigmap).joints
     rows, places = [], rig_joint_positions(made, rigmap)
+    # A drawing may have joints that are no more than an End Site on the rig.
+    seen = places if loose is None else to_canonical(made, as_rig(rigmap))[0].joint_positions()
     for key in wanted:
         row: dict[str, Any] = {"frame": key.frame, "what": key.what}
         if key.what == "limbs" and targets is not None:
@@ -108,7 +110,7 @@ def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) ->
             rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
             continue
         if loose is not None and key.what in ("place", "drawing"):
-            rows.append(row | _compute_loose_errors(places[key.frame], loose, key.frame))
+            rows.append(row | _compute_loose_errors(seen[key.frame], loose, key.frame))
             continue
         joints = [hips or 0] if key.what == "root" else known[key.frame].nonzero()[:, 0].tolist()
         row |= {"missed_cm": float(distance[key.frame, joints].max())}

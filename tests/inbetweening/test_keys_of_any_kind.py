@@ -181,7 +181,7 @@ def test_drawings_from_other_sides_are_told_as_far_as_they_show():
         assert float(seen.places[frame, 0, 0]) == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 120)])
+@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("cmu", 120)])
 def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
     canonical = to_canonical(motion)[0]
