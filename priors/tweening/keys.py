@@ -9,8 +9,8 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.inbetweening import PositionImage
+from mapctl.inbetweening.loose_keys import lead_over_places
 from mapctl.inbetweening.partial_motion import PartialMotion
-from mapctl.numerics.intervals import fill_missing, fill_missing_angle
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
 
@@ -67,9 +67,7 @@ def lead_reference(
     heading to told heading. Where a sequence tells no heading, it looks along its way."""
     # What is drawn stands where its hips are, also if only one axis of these is told.
     shown = told.axes[..., 0, :].any(dim=-1)
-    way = fill_missing(ground, shown)
-    facing = fill_missing_angle(heading, told.heading)
-    facing = torch.where(told.heading.any(dim=1, keepdim=True), facing, _look_along(way, shown))
+    way, facing = lead_over_places(ground, heading, placed=shown, faced=told.heading)
     drawn = torch.isfinite(told.view)[:, None]
     return way, torch.where(drawn, torch.nan_to_num(told.view)[:, None], facing)
 
@@ -81,13 +79,3 @@ def see_contacts(
     off = torch.zeros_like(known[:, :1])
     beside = torch.cat([off, known[:, :-1]], dim=1) | torch.cat([known[:, 1:], off], dim=1)
     return torch.where((known & beside)[..., None], contacts, 0.5)
-
-
-def _look_along(way: Float[Tensor, "batch frames 2"], shown: Bool[Tensor, "batch frames"]) -> Tensor:
-    """Return headings along a way of straight lines: at a corner that between both, from corner to corner evenly."""
-    line = torch.nn.functional.normalize(torch.diff(way, dim=1), dim=-1)
-    none = torch.zeros_like(way[:, :1])
-    along = torch.cat([none, line], dim=1) + torch.cat([line, none], dim=1)
-    moves = along.norm(dim=-1) > 1e-3
-    at = shown & moves
-    return fill_missing_angle(torch.atan2(along[..., 0], along[..., 1]), at) * moves.any(dim=1, keepdim=True)
