@@ -175,3 +175,76 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(tween, folder, c
     assert told.err.count("\n") == 1
     assert said in told.err
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.*")} == before
+
+
+PARTS = """
+body = "walk.bvh"
+[[key]]
+frame = 0
+root_only = "place"
+place = [0, 0]
+[[key]]
+frame = 20
+drawing = "pose.csv"
+view_deg = 90
+[[key]]
+frame = 40
+pose_frame = 40
+half = "lower"
+"""
+DRAWING = "joint,x,y\nHips,3,98\nHead,4,160\nHand_L,30,130\nrightHand,0,80\nFoot_L,10,12\nFoot_R,-8,12\n"
+
+
+@pytest.mark.parametrize("method", ["tweener", pytest.param("map", marks=pytest.mark.slow)])
+def test_keys_that_are_not_whole_are_met_in_the_file(models, folder, method):
+    """The first of them tells but a place."""
+    (folder / "keys" / "keys.toml").write_text(PARTS)
+    (folder / "keys" / "pose.csv").write_text(DRAWING)
+    more = ["--method", "tweener", "--no-finish"] if method == "tweener" else models["map"]
+    words = [folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", "r.json", "--quiet"]
+    assert run("tween", *words, *more) == 0
+    first, drawn, half = json.loads(Path("r.json").read_text())["keys"]
+    assert [row["what"] for row in (first, drawn, half)] == ["place", "drawing", "half"]
+    assert first["missed_cm"] < 0.1
+    assert half["missed_cm"] < 0.1
+    assert drawn["drawn_cm"] < 3
+    made, walked = mapctl.load("out.bvh"), mapctl.load(folder / "keys" / "walk.bvh")
+    canonical = [retarget.to_canonical(each)[0] for each in (made, walked)]
+    assert canonical[0].root_position[0, ::2].tolist() == pytest.approx([0, 0], abs=1e-4)
+    legs = [number for number, name in enumerate(canonical[0].skeleton.names) if "Leg" in name]
+    turns = [each.local_quat_xyzw[40, legs] for each in canonical]
+    assert (turns[0] * turns[1]).sum(dim=-1).abs().min() > 1 - 1e-6
+
+
+@pytest.mark.parametrize(
+    ("keys", "drawing", "said"),
+    [
+        (PARTS, DRAWING.replace("Hand_L", "Hnad_L"), "key[1].drawing: no joint 'Hnad_L' that could be drawn; "),
+        (PARTS, DRAWING.replace("130", "nan"), "line 4: y must be a finite number, got 'nan'"),
+        (PARTS, "joint,x,y\n", "key[1].drawing: "),
+        (PARTS, "joint,x,y\nHips,1,1\nHead,1,1\n", "the drawing has all joints at one point"),
+        (PARTS, "joint,x,y\nHips,1,1\nhips,1,2\n", "is drawn twice"),
+        (PARTS.replace("pose.csv", "gone.csv"), DRAWING, "gone.csv"),
+        (PARTS + 'drawing = "pose.csv"\n', DRAWING, "key[2].half: half and drawing are 2 kinds of keys; choose one"),
+        (PARTS + 'root_only = "place"\n', DRAWING, "key[2].half: half and root_only are 2 kinds of keys; choose one"),
+        (PARTS.replace('"lower"', '"left"'), DRAWING, "key[2].half: input should be 'upper' or 'lower'"),
+    ],
+    ids=range(9),
+)
+def test_what_is_wrong_with_parts_is_said_in_a_line(tween, folder, capsys, keys, drawing, said):
+    (folder / "keys" / "keys.toml").write_text(keys)
+    (folder / "keys" / "pose.csv").write_text(drawing)
+    assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", "r.json") == 2
+    told = capsys.readouterr()
+    assert told.err.startswith("mapctl: ")
+    assert told.err.count("\n") == 1
+    assert said in told.err
+    assert not Path("out.bvh").exists()
+    assert not Path("r.json").exists()
+
+
+def test_a_drawing_is_not_written_over(tween, folder, capsys):
+    (folder / "keys" / "keys.toml").write_text(PARTS)
+    (folder / "keys" / "pose.csv").write_text(DRAWING)
+    assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", folder / "keys" / "pose.csv") == 2
+    assert "would be written over what it is made from" in capsys.readouterr().err
