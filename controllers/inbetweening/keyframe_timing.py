@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from mapctl.errors import RequestError
 from mapctl.inbetweening.pose_pairs import (
     TRAVELLING_DISTANCE,
     TimingModel,
@@ -80,9 +81,11 @@ class KeyInterval:
 
 def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig | None = None) -> list[KeyInterval]:
     """Suggest the time between neighbouring keyframes that are whole poses; others may lie between. RequestError for
-    keys that do not fit the motion.
+    keys that do not fit the motion, and for fewer than two such poses.
     """
     key_frames = [key.frame for key in keys.checked(motion) if key.what == "pose"]
+    if len(key_frames) < 2:
+        raise RequestError(f"timing is suggested between whole poses; the keys have {len(key_frames)}, it takes two")
     canonical = to_canonical(_select_frames(motion, key_frames), rig)[0]
     scale, fps = leg_length(canonical.skeleton) / leg_length(CANONICAL), float(motion.fps)
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)

@@ -248,3 +248,10 @@ def test_a_drawing_is_not_written_over(tween, folder, capsys):
     (folder / "keys" / "pose.csv").write_text(DRAWING)
     assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", folder / "keys" / "pose.csv") == 2
     assert "would be written over what it is made from" in capsys.readouterr().err
+
+
+def test_timing_is_not_suggested_where_no_two_keys_are_whole(tween, folder, capsys):
+    (folder / "keys" / "keys.toml").write_text(PARTS)
+    (folder / "keys" / "pose.csv").write_text(DRAWING)
+    assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", "--suggest-timing") == 2
+    assert "timing is suggested between whole poses; the keys have 0, it takes two" in capsys.readouterr().err

@@ -24,7 +24,7 @@ FLOORS = {
         "metrics",
         "commands",
     ),
-    "controllers": ("common", "denoising following generation inbetweening steering", "shots", "benchmarks"),
+    "controllers": ("common", "following", "denoising generation inbetweening steering", "shots", "benchmarks"),
 }
 """Rooms from the ground up: each imports only from those on lower floors, and its own."""
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.geometry.footholds import hold_planted
 from controllers.inbetweening.proposers.rolling import commit_before, insert_rollout, select_likeliest_density
+from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
@@ -96,7 +97,11 @@ class RolloutInbetweener(Inbetweener):
         return self.fallback.rough
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose a different motion for each sample; gaps too short or too long are left to the fallback."""
+        """Propose a different motion for each sample; gaps too short or too long are left to the fallback, and so are
+        loose keys but for places that are all that is told, which are walked over."""
+        if query.loose is not None:
+            walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
+            return walked or self.fallback.propose(query, generator=generator)
         base = self.fallback.propose(query, generator=generator)
         if not query.enclosed_gaps:
             return base

@@ -30,9 +30,9 @@ class WalkedPlaces:
     """Arcs of the frames and of a window beyond them, metres."""
 
     @staticmethod
-    def of(query: GapQuery, density: Density, ahead: int) -> "WalkedPlaces | None":
+    def of(query: GapQuery, fastest: float, ahead: int) -> "WalkedPlaces | None":
         """Lay a curve through the places of a query of which they are all that is told, from its first frame to its
-        last; None where there are others, or where nobody would walk so slowly or so fast."""
+        last; None where there are others, where somebody would stand, or be faster than `fastest`, m/s."""
         loose = query.loose
         if loose is None or not query.only_places:
             return None
@@ -42,7 +42,7 @@ class WalkedPlaces:
         places = loose.ground[frames].double() / query.scale
         ways = torch.diff(places, dim=0).norm(dim=-1)
         speeds = ways * PRIOR_FPS / torch.diff(frames)
-        if float(ways.min()) < _LEAST_WAY or float(speeds.max()) > density.limits.fastest:
+        if float(ways.min()) < _LEAST_WAY or float(speeds.max()) > fastest:
             return None
         curve = curves.through(places)
         at = _find_arcs(curve, places)
@@ -69,7 +69,7 @@ class PlaceWalker:
         if not self.densities:
             return None
         density, ahead = self.densities[0], self.settings.window.frames
-        walked = WalkedPlaces.of(query, density, ahead)
+        walked = WalkedPlaces.of(query, density.limits.fastest, ahead)
         if walked is None:
             return None
         frames = query.motion.num_frames

@@ -1,0 +1,72 @@
+"""Places that are all that keys tell: a curve through them in time, and who walks it."""
+
+import pytest
+import torch
+from captures import on_rig
+from tiny_prior import save_tiny_prior
+from tiny_tweener import tiny_tweener
+
+import priors
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
+from controllers.inbetweening.proposers.walked import WalkedPlaces
+from controllers.inbetweening.tween import measure_keyframe_errors, tween
+from mapctl.inbetweening import GapQuery
+from mapctl.inbetweening.loose_keys import LooseKeys
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.intent.keyframes import Key, Keys
+from mapctl.skeleton import CANONICAL
+
+FRAMES = (0, 30, 75, 90)
+WAY = ((0.0, 0.0), (0.5, 1.2), (0.5, 2.6), (-0.4, 3.0))
+FASTEST = 2.0  # m/s
+
+
+def query_of(frames=FRAMES, way=WAY, *, drawn=False):
+    loose = LooseKeys.none(91, CANONICAL.num_joints)
+    loose.placed[list(frames)] = True
+    loose.ground[list(frames)] = torch.tensor(way).double()
+    loose.drawn[0] = drawn
+    missing = MissingMask.of_frames(torch.ones(91, dtype=torch.bool), CANONICAL.num_joints)
+    return GapQuery(on_rig("canonical", 91), missing, torch.arange(91).double() / 30, loose=loose)
+
+
+def test_the_curve_is_at_every_place_in_its_frame_and_goes_on():
+    walked = WalkedPlaces.of(query_of(), FASTEST, 20)
+    assert len(walked.arcs) == 111
+    assert (torch.diff(walked.arcs) > 0).all()
+    found = walked.curve.ground_point(walked.arcs[list(FRAMES)])
+    torch.testing.assert_close(found, torch.tensor(WAY).double(), atol=0.02, rtol=0)
+
+
+def test_a_place_that_is_come_by_twice_is_told_apart_by_time():
+    way = ((0.0, 0.0), (0.0, 1.5), (1.0, 0.75), (-0.5, 0.7))  # crosses its beginning
+    walked = WalkedPlaces.of(query_of(way=way), 2 * FASTEST, 5)
+    found = walked.curve.ground_point(walked.arcs[list(FRAMES)])
+    torch.testing.assert_close(found, torch.tensor(way).double(), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        query_of(drawn=True),
+        query_of((0, 30, 75), WAY[:3]),  # the end is open
+        query_of(way=((0.0, 0.0), (0.5, 1.2), (0.5, 1.3), (-0.4, 1.5))),  # stands in between
+        query_of(way=((0.0, 0.0), (0.5, 1.2), (0.5, 2.6), (-0.4, 9.0))),  # faster than anybody in the data
+    ],
+    ids=["drawn", "open", "stands", "too fast"],
+)
+def test_what_is_no_walk_is_left_to_others(query):
+    assert WalkedPlaces.of(query, FASTEST, 5) is None
+
+
+def test_auto_walks_over_places_where_a_density_does_and_says_so(tmp_path):
+    motion = on_rig("bandai", 60)
+    keys = Keys((Key(0, root_only="place"), Key(59, root_only="place")))
+    density = priors.load(str(save_tiny_prior(tmp_path / "prior.safetensors")))
+    auto = AutoInbetweener(SlerpInbetweener(), [density], tweener=tiny_tweener())
+    made = tween(motion, keys, auto, settings=InfillSettings(finish=False))
+    assert all(row["missed_cm"] < 1e-6 for row in measure_keyframe_errors(made.motion, motion, keys))
+    assert made.gap_notes[0].startswith("frames 0:60: walk of ")
+    whole = tween(motion, Keys((0, keys.each[1])), auto, settings=InfillSettings(finish=False))
+    assert not any("walk of" in note for note in whole.gap_notes)
