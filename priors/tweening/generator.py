@@ -49,7 +49,8 @@ class GeneratorConfig(NetworkConfig):
     style: int = 128
     """Numbers of the vector that a motion's style becomes."""
     skips: bool = True
-    """Whether the decoder's stages also see what the encoder was given at their rate, which the paper's do not."""
+    """Whether the decoder's stages also see the style, and what the encoder was given at their rate, which the paper's
+    do not."""
 
     keys: str = "dense"
     """`dense` copies the nearest key into every frame; `sparse` tells keys in their own frames alone (figure 7)."""
@@ -133,6 +134,8 @@ class GeneratorNetwork(nn.Module):
         self.skips = nn.ModuleList(
             nn.Conv1d(ins, outs, 1) for ins, outs in zip(seen, self.config.up_widths, strict=True) if self.config.skips
         )
+        # Through the middle alone a style has to pass what the keys dictate, and is soon left aside.
+        self.styles = nn.ModuleList(nn.Linear(style, outs) for outs in self.config.up_widths if self.config.skips)
         # Without a PReLU, which would halve the angles on one side.
         rows = POSE_ROWS + (_ROOT_ROWS if self.config.architecture == "one-stage" else 0)
         self.last = nn.Conv1d(self.config.up_widths[-1], rows, 3, padding=1)
@@ -169,6 +172,7 @@ class GeneratorNetwork(nn.Module):
                     hidden = layer(hidden, responses)
                 if self.config.skips:
                     hidden = (hidden + self.skips[stage](levels[_STAGES - 1 - stage])) / math.sqrt(2)
+                    hidden = hidden + self.styles[stage](style)[..., None]
         # Angles need more than the eight bits of bfloat16, or who stands trembles.
         return self.last(hidden.to(rows.dtype))[..., :frames], tuple(responses)
 

@@ -92,11 +92,11 @@ class Tweener(Inbetweener):
         """
         shown, missing, splits = query.motion, query.missing, list(find_splits(query))
         told = self._tell_poses(query, splits)
-        made, origin = self._make(query, told)
+        made, way, origin = self._make(query, told)
         met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
         quats = torch.where(missing.joints[..., None], met, shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
-        body, logits = self._lead(body, query, origin)
+        body, logits = self._lead(body, query, way, origin)
         motion = query.to_character(body)
         root = torch.where(missing.root[:, None], motion.root_position, shown.root_position)
         motion = replace(motion, root_position=root)
@@ -108,14 +108,16 @@ class Tweener(Inbetweener):
 
     def _make(
         self, query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]
-    ) -> tuple[Float[Tensor, "frames joints 4"], Float[Tensor, " 3"]]:
+    ) -> tuple[Float[Tensor, "frames joints 4"], Float[Tensor, "frames 3"] | None, Float[Tensor, " 3"]]:
         """Make rotations of all frames, near what is known and near poses that are told by frame, metres, world; also
-        returns where the network's origin is."""
+        returns the hips' way if the network makes that itself, from where its origin is, and that."""
         image, origin = _show(query, told)
         style = torch.zeros(self.network.config.style) if self.style is None else self.style.vector
         wide = image.extended(_MARGIN)
-        local = self.network(wide, style[None]).turn_to_world(wide).local_matrix[0, _MARGIN:-_MARGIN]
-        return rotations.from_matrix(local.double()), origin
+        made, inside = self.network(wide, style[None]), slice(_MARGIN, -_MARGIN)
+        local = made.turn_to_world(wide).local_matrix[0, inside]
+        way = None if made.root is None else wide.to_world(made.root[..., None, :])[0, inside, 0].double()
+        return rotations.from_matrix(local.double()), way, origin
 
     def _tell_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
         """Choose the poses that split gaps, by frame, at their places in a motion of unit size, metres, world."""
@@ -140,15 +142,15 @@ class Tweener(Inbetweener):
             yield GapSource(split.start, split.stop, self.source, reason)
 
     def _lead(
-        self, body: Motion, query: GapQuery, origin: Float[Tensor, " 3"]
+        self, body: Motion, query: GapQuery, way: Float[Tensor, "frames 3"] | None, origin: Float[Tensor, " 3"]
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Lead the hips by how the body moves, from known place to known place, at unit size; also returns the
-        contacts' logits."""
+        """Lead the hips by how the body moves, or on a way that was made with it, from known place to known place, at
+        unit size; also returns the contacts' logits."""
         facing = heading(body.local_quat_xyzw[:, 0])
         still = replace(body, root_position=torch.zeros_like(body.root_position))
         seen = still.joint_positions().float()[None]
         predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
-        way = predicted.integrate(facing.float()[None])[0].double()
+        way = predicted.integrate(facing.float()[None])[0].double() if way is None else way
         loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
         led = lead_over_keys(way, body.root_position - origin, query.missing.root, loose)
         told = ~query.missing.root if loose is None else ~query.missing.root | loose.placed

@@ -18,7 +18,7 @@ from priors.training.recipes.tweener import TweenerSettings, TweenerTrainer
 from priors.training.recipes.tweener_critic import CriticisedTrainer, CriticSettings
 
 SETTINGS = TweenerSettings(steps=6, batch=300, layout=KeySettings(longest=60.0))
-CRITIC = CriticSettings(begin=2, batch=4, history=8, frames=100, ramp=2)
+CRITIC = CriticSettings(begin=2, batch=4, history=8, frames=100)
 
 
 @pytest.fixture(scope="module")

@@ -42,8 +42,8 @@ class CriticSettings:
 
     begin: int = 0
     """Step at which it joins."""
-    ramp: int = 2000
-    """Steps over which its weight rises from a tenth to the whole."""
+    ramp: float = 0.2
+    """Share of the steps from then on over which its weight rises from a tenth to the whole."""
     weight: float = 1.0
     """Weight of what the generator wants to hear (Eq. 8)."""
     generator_rate: float = 1e-4
@@ -73,7 +73,7 @@ class CriticSettings:
 
     def __post_init__(self):
         require_at_least(self, _STRIDE, "frames")
-        require_at_least(self, 1, "batch", "history", "penalised", "ramp")
+        require_at_least(self, 1, "batch", "history", "penalised")
 
 
 class CriticisedTrainer(Trainer[GeneratorNetwork]):
@@ -151,12 +151,17 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
         if step > self.settings.begin:
             self.learner.shortest = self.settings.frames + 2
 
+    @property
+    def _done(self) -> float:
+        """Share of the steps with the critic that are done."""
+        return (self.step - self.settings.begin) / max(1, self.steps - self.settings.begin)
+
     def _improve(self) -> dict[str, float]:
         """One update of the generator, and of its running mean."""
         self._made = []
         settings, heard = self.settings, []
         weights = replace(self.learner.settings.weights, half=settings.half, far=settings.far)
-        share = 0.1 + 0.9 * min(1.0, (self.step - settings.begin) / settings.ramp)
+        share = 0.1 + 0.9 * min(1.0, self._done / settings.ramp)
 
         def judge(motion: LocalMotion, trajectory: RootTrajectory) -> Tensor:
             rows = body_motion.show(motion, trajectory)
@@ -196,8 +201,8 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
         if not torch.isfinite(loss):
             raise make_divergence_error(self.step + 1, f"the loss is {loss.item()}")
         if optimiser is self.optimiser:
-            done = (self.step - self.settings.begin) / max(1, self.steps - self.settings.begin)
-            optimiser.param_groups[0]["lr"] = self.settings.generator_rate * 0.5 * (1 + math.cos(math.pi * done))
+            rate = self.settings.generator_rate * 0.5 * (1 + math.cos(math.pi * self._done))
+            optimiser.param_groups[0]["lr"] = rate
         for each in (self.optimiser, self.critic_optimiser):
             each.zero_grad(set_to_none=True)
         loss.backward()
