@@ -104,6 +104,10 @@ MODELS = {
         _windowed(pose_transformer.PoseTransformerRecipe, tiny_transformer.CONFIG),
     ),
     "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
+    "recurrent infiller": Model(
+        infiller.InfillerTrainer,
+        _windowed(infiller.InfillerRecipe, replace(tiny_infiller.CONFIG, architecture="recurrent")),
+    ),
     "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
     "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
     "tweener": Model(tweener.TweenerTrainer, _windowed(tweener.TweenerRecipe, tiny_tweener.CONFIG)),

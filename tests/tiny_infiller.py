@@ -27,22 +27,22 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFI
     return made.eval().requires_grad_(False)
 
 
-def card() -> checkpoints.Card:
+def card(config: InfillerConfig = CONFIG) -> checkpoints.Card:
     """Of the tiny infiller."""
     return checkpoints.Card(
-        "infiller", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
+        "infiller", config.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
     )
 
 
-def tiny_infiller(*, drawn: float = 0.0, seed: int = 0) -> ConvInfiller:
+def tiny_infiller(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFIG) -> ConvInfiller:
     """As the controllers take it."""
-    return ConvInfiller("tiny", network(drawn=drawn, seed=seed), card())
+    return ConvInfiller("tiny", network(drawn=drawn, seed=seed, config=config), card(config))
 
 
-def save_tiny_infiller(path: Path, *, drawn: float = 0.0) -> Path:
+def save_tiny_infiller(path: Path, *, drawn: float = 0.0, config: InfillerConfig = CONFIG) -> Path:
     """Write the weights and the card; returns the path for --inbetweener."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
+    checkpoints.save(network(drawn=drawn, config=config).state_dict(), card(config), path)
     return path
 
 

@@ -32,16 +32,8 @@ def propose_from_positions(
     """
     shown, missing = query.motion, query.missing
     body = query.to_unit_size(shown)
-    positions = body.joint_positions()
-    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS)
-    image = PositionImage.of_world(
-        positions.float()[None],
-        heading(shown.local_quat_xyzw[:, 0]).float()[None],
-        planted.float()[None],
-        known=query.known_positions[None],
-        present=torch.ones(1, len(positions), dtype=torch.bool),
-        toes=TOE_JOINTS,
-    )
+    planted = contacts.detect_contacts(body.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS)
+    image = make_position_image(query)
     answer = complete(image)
     wanted = image.to_world(_remove_jitter(answer.places, image))[0].double()
     if query.keep_trajectory:
@@ -59,6 +51,20 @@ def propose_from_positions(
     logits = torch.where(slow, answer.contacts[0], -contacts.CERTAIN_LOGIT)
     known = image.known[0][:, list(TOE_JOINTS)]
     return Proposal(motion, torch.where(known, contacts.to_logits(planted), logits), source)
+
+
+def make_position_image(query: GapQuery) -> PositionImage:
+    """Make the image of a query, of unit size, in a batch of one."""
+    positions = query.to_unit_size(query.motion).joint_positions()
+    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS)
+    return PositionImage.of_world(
+        positions.float()[None],
+        heading(query.motion.local_quat_xyzw[:, 0]).float()[None],
+        planted.float()[None],
+        known=query.known_positions[None],
+        present=torch.ones(1, len(positions), dtype=torch.bool),
+        toes=TOE_JOINTS,
+    )
 
 
 def _select_limbs(missing: Bool[Tensor, "frames joints"]) -> list[Limb]:

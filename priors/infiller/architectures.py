@@ -3,7 +3,8 @@
 All are given an image as rows over time, and give the rows of the whole motion. That of Kaufmann et al. 2020, section
 3.2, treats them as a picture, with filters over rows and frames, and makes the motion anew. Ours has the same five
 encoding and five decoding units, but its filters run over time alone and see all rows at once; it is given the mask of
-known joints, keeps these, changes linear interpolation in the gaps, and passes details across by skips.
+known joints, keeps these, changes linear interpolation in the gaps, and passes details across by skips. The recurrent
+one is in `transitions.py`.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, max_pool1d, max_pool2d, relu
 
-Architecture = Literal["skips", "image", "vanilla", "manifold"]
+Architecture = Literal["skips", "image", "vanilla", "manifold", "recurrent"]
 _LEAK = 0.2
 
 

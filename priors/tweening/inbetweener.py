@@ -141,26 +141,39 @@ class Tweener(Inbetweener):
             reason += f"split at {times} s by poses of {by}" if times else "give more keys"
             yield GapSource(split.start, split.stop, self.source, reason)
 
+    @torch.no_grad()
+    def propose_raw(self, query: GapQuery) -> Float[Tensor, "frames joints 3"]:
+        """Propose positions, world, metres at unit size, as the networks make them: keys are missed as they miss them,
+        and the way leads from the first frame on without looking at any (Zhou et al. 2020, table 4)."""
+        made, way, _ = self._make(query, self._tell_poses(query, list(find_splits(query))))
+        body = query.to_unit_size(replace(query.motion, local_quat_xyzw=made))
+        return replace(body, root_position=self._walk(body)[0] if way is None else way).joint_positions()
+
+    def _walk(self, body: Motion) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 2"]]:
+        """Lead the hips by how the body moves, from the origin on, metres at unit size; also the contacts' logits."""
+        facing = heading(body.local_quat_xyzw[:, 0])
+        still = replace(body, root_position=torch.zeros_like(body.root_position))
+        seen = still.joint_positions().float()[None]
+        predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
+        return predicted.integrate(facing.float()[None])[0].double(), predicted.contacts[0]
+
     def _lead(
         self, body: Motion, query: GapQuery, way: Float[Tensor, "frames 3"] | None, origin: Float[Tensor, " 3"]
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
         """Lead the hips by how the body moves, or on a way that was made with it, from known place to known place, at
         unit size; also returns the contacts' logits."""
-        facing = heading(body.local_quat_xyzw[:, 0])
-        still = replace(body, root_position=torch.zeros_like(body.root_position))
-        seen = still.joint_positions().float()[None]
-        predicted = self.path.predict(LocalMotion.of_world(seen, facing.float()[None]))
-        way = predicted.integrate(facing.float()[None])[0].double() if way is None else way
+        walked, logits = self._walk(body)
+        way = walked if way is None else way
         loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
         led = lead_over_keys(way, body.root_position - origin, query.missing.root, loose)
         told = ~query.missing.root if loose is None else ~query.missing.root | loose.placed
         calm = smooth_between(led, told, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
         if query.keep_trajectory:
             calm = torch.cat([body.root_position[:, :1], calm[:, 1:2], body.root_position[:, 2:]], dim=-1)
-            return replace(body, root_position=calm), predicted.contacts[0]
+            return replace(body, root_position=calm), logits
         made = replace(body, root_position=calm)
-        share = torch.sigmoid(predicted.contacts[0]).double()
-        return keep_feet(made, led + origin - calm, share, query), predicted.contacts[0]
+        share = torch.sigmoid(logits).double()
+        return keep_feet(made, led + origin - calm, share, query), logits
 
 
 def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:

@@ -85,6 +85,15 @@ MODELS = (
         (("--architecture", "manifold"), InfillerConfig(architecture="manifold")),
     ),
     Model(
+        InfillerRecipe,
+        InfillerTrainer,
+        priors.load_infiller,
+        replace(tiny_infiller.CONFIG, architecture="recurrent"),
+        replace(tiny_infiller.CONFIG, architecture="recurrent", kernel=5),
+        InfillerSettings(),
+        (("--architecture", "recurrent"), InfillerConfig(architecture="recurrent")),
+    ),
+    Model(
         PoseTransformerRecipe,
         PoseTransformerTrainer,
         priors.load_transformer,

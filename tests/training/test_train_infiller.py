@@ -70,7 +70,7 @@ def test_frames_that_are_not_there_cost_nothing():
     assert short.present.all()
 
 
-@pytest.mark.parametrize("architecture", ["skips", "image", "vanilla", "manifold"])
+@pytest.mark.parametrize("architecture", ["skips", "image", "vanilla", "manifold", "recurrent"])
 def test_a_few_steps_are_taken_with_any_network(architecture):
     trainer = InfillerTrainer(replace(CONFIG, architecture=architecture), replace(SETTINGS, batch=2), corpus(2, 40))
     before = {name: value.clone() for name, value in trainer.network.state_dict().items()}
@@ -139,8 +139,9 @@ def test_recipes_that_cannot_be_are_refused(wrong):
         replace(SETTINGS, **wrong)
 
 
-def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
-    words = ["--steps", 2, "--batch", 2, "--window", 32, "--architecture", "manifold", "--quiet"]
+@pytest.mark.parametrize("architecture", ["manifold", "recurrent"])
+def test_what_the_command_line_trains_fills_gaps(tmp_path, data, architecture):
+    words = ["--steps", 2, "--batch", 2, "--window", 32, "--architecture", architecture, "--quiet"]
     assert run("train", "infiller", "--data", data, "-o", tmp_path / "run", *words) == 0
     on_rig("daz", 45).save(tmp_path / "in.bvh")
     words = ["--gap", "20:30", "--inbetweener", tmp_path / "run", "--quiet"]

@@ -12,7 +12,8 @@ from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
-from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
+from priors.infiller.transitions import FRAMES_AFTER, PAST_FRAMES
+from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask, sample_transition
 from priors.training.corpus import Corpus, Split
 from priors.training.recipe import NetworkRecipe
 from priors.training.trainer import GradientTrainer
@@ -78,7 +79,13 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         window, progress = self.windows.draw(self.settings.batch, self.generator), self.step / self.settings.steps
-        known = sample_observation_mask(window.present, self.settings.gaps, progress=progress, generator=self.generator)
+        gaps, generator = self.settings.gaps, self.generator
+        if self.network.recurrent:
+            known = sample_transition(
+                window.present, gaps, progress=progress, generator=generator, past=PAST_FRAMES, after=FRAMES_AFTER
+            )
+        else:
+            known = sample_observation_mask(window.present, gaps, progress=progress, generator=generator)
         return compute_infiller_losses(self.network, window, known, self.settings)
 
     @torch.no_grad()
