@@ -9,7 +9,8 @@ from helpers import run, walk
 from tiny_path import save_tiny_path
 from tiny_tweener import card, network
 
-from controllers.benchmarks.tweener.long_gaps import Method, benchmark_long_gaps, cut_middle, measure_key_jerk
+from controllers.benchmarks.tweener.gap_measures import Method, measure_key_jerk
+from controllers.benchmarks.tweener.long_gaps import benchmark_long_gaps, cut_middle
 from controllers.inbetweening.pipeline import InfillSettings
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import estimate_contact_logits
@@ -82,11 +83,11 @@ def test_the_command_compares_in_betweeners_on_held_out_clips(tmp_path, capsys):
     held = {"path": compute_hash(predictor), "held_out": {"validation": ["bandai/a_walk_1.bvh"], "test": []}}
     saved = tmp_path / "tweener.safetensors"
     checkpoints.save(network().state_dict(), replace(card(), data=held), saved)
-    words = ["--tweener", saved, "--path", predictor, "--seconds", "1,2", "--raw", "--json"]
+    words = ["--part", "gaps", "--tweener", saved, "--path", predictor, "--seconds", "1,2", "--raw", "--json"]
     assert run("bench", "tweener", "--data", data, *words) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["seconds"], row["by"]) for row in rows] == [
         (seconds, by) for seconds in (1, 2) for by in ("slerp", str(saved))
     ]
-    assert run("bench", "tweener", "--data", data, *words[:4], "--seconds", "long") == 2
+    assert run("bench", "tweener", "--data", data, *words[:6], "--seconds", "long") == 2
     assert "--seconds takes numbers" in capsys.readouterr().err

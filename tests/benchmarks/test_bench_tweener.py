@@ -81,9 +81,9 @@ def test_the_command_measures_the_clips_that_the_card_holds_out(tmp_path, capsys
     walk(70).save(data / "bandai" / "a_walk_1.bvh")
     held = {"validation": ["bandai/a_walk_1.bvh"], "test": []}
     path = save_tiny_path(tmp_path / "path.safetensors", held)
-    assert run("bench", "tweener", "--data", data, "--path", path, "--json") == 0
+    assert run("bench", "tweener", "--part", "path", "--data", data, "--path", path, "--json") == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["kind"], row["clips"]) for row in rows[:3]] == [("walks", 1)] * 3
     missing = save_tiny_path(tmp_path / "other.safetensors", {"validation": ["bandai/gone.bvh"]})
-    assert run("bench", "tweener", "--data", data, "--path", missing) == 2
+    assert run("bench", "tweener", "--part", "path", "--data", data, "--path", missing) == 2
     assert "does not hold the clips kept from training" in capsys.readouterr().err

@@ -154,6 +154,23 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
     assert classifier.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
 
 
+def test_who_can_tell_prefers_mocap_and_who_cannot_tell_prefers_neither():
+    walks = clip_set(8)
+    still = [replace(clip, local_quat_xyzw=clip.local_quat_xyzw[:1].expand(61, -1, -1)) for clip in clip_set(8, seed=1)]
+    told = classifier.judge_held_out(windows_of(still), windows_of(walks), generator=generator(5), settings=SMALL)
+    assert told.accuracy > 0.9
+    assert told.preferred < 0.1
+    same = windows_of(walks)
+    alike = classifier.judge_held_out(same, same, generator=generator(5), settings=SMALL)
+    assert 0.2 < alike.preferred < 0.8
+
+
+def test_preference_counts_pairs_and_halves_the_even_ones():
+    made, mocap = torch.tensor([0.0, 2.0, 5.0]), torch.tensor([1.0, 2.0])
+    wins = sum((one < other) + 0.5 * (one == other) for one in made.tolist() for other in mocap.tolist())
+    assert classifier._share_preferred(made, mocap) == pytest.approx(wins / 6)
+
+
 def test_no_clip_is_both_learnt_and_held_out():
     """Clips marked by their own channel can be learnt by heart, which must not help on clips that were not seen."""
     marked = torch.zeros(8, 3, 30, 16)

@@ -142,28 +142,38 @@ class Tween(MocapTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Tweener(Table):
-    """The tables of Zhou et al. 2020 over clips that training did not see: how well the hips' trajectory is told, and
-    long gaps between two whole poses."""
+    """The tables of Zhou et al. 2020 over clips that training did not see, all or some of them: how well the hips'
+    trajectory is told, long gaps, keys that are missed, seconds told from mocap, and speed."""
 
     work = "mapctl.commands.bench.tweener.run"
 
     data: options.DataFolder
     """The folder that was trained on, for the clips that were held out."""
+    part: Annotated[str, arg(metavar="PART,PART,...")] = "all"
+    """Tables to measure: path (table 2), gaps (between two poses of a clip), keys (table 4, before they are made exact,
+    and gaps with a past), apart (made seconds told from mocap's), dna (the same keys under that of several clips),
+    speed (table 3)."""
     count: options.Count = 300
     """Clips, spread over the kinds."""
     path: options.Name = "path"
     """The bundled path predictor, or the file or run folder of a trained one."""
-    tweener: options.MaybeName = None
-    """For long gaps: the bundled tweener, or the file or run folder of a trained one; without one the table is that of
-    the path predictor."""
+    tweener: options.Name = "tweener"
+    """The bundled tweener, or the file or run folder of a trained one."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
-    """Other in-betweeners to compare in long gaps, bundled or trained."""
+    """Other in-betweeners to compare, bundled or trained."""
     seconds: Annotated[str, arg(metavar="S,S,...")] = "6.4"
     """Long gaps, seconds."""
     dna: options.Count = 0
-    """Instead of long gaps: the same keys 8 s apart under motion DNA of so many clips of different content."""
+    """Clips of different content whose motion DNA the same keys 8 s apart are put under, 12 if 0; with a number
+    and no --part it is all that is measured."""
+    sequences: options.Count = 200
+    """Sequences of keys of several clips, each of --frames; a tenth as many are told apart from mocap."""
+    frames: options.Count = 2048
+    """Frames of each such sequence at 30 a second; the longest one whose speed is measured has twice as many."""
     raw: bool = False
     """Leave out the rows that a MAP stage finishes."""
+    markdown: bool = False
+    """Print rows as a page's table in Markdown holds them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,23 @@ def print_records(records: Sequence[Mapping[str, object]], *, title: str | None 
     print_table(columns, [[record.get(name) for name in columns] for record in records], title=title)
 
 
+def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
+    """A table of rows by column name as Markdown has it, with three digits; what a row lacks is left empty."""
+    columns = list(dict.fromkeys(name for record in records for name in record))
+    print(f"| {' | '.join(columns)} |")
+    print("|" + "---|" * len(columns))
+    for record in records:
+        print(f"| {' | '.join(_format_short(record.get(name)) for name in columns)} |")
+
+
+def _format_short(value: object) -> str:
+    if value is None or value != value:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return str(value)
+
+
 def format_cell(value: object) -> str:
     """One value as a table shows it."""
     if value is None or value != value:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.realism.classifier import ClassifierSettings, compute_held_out_accuracy
+from mapctl.metrics.realism.classifier import ClassifierSettings, HeldOutVerdict, judge_held_out
 from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
 from mapctl.metrics.realism.gait import GaitSpread, measure_gait_spread, spread_ratios
@@ -22,12 +22,14 @@ __all__ = [
     "ClassifierSettings",
     "Diversity",
     "GaitSpread",
+    "HeldOutVerdict",
     "Realism",
     "RealismSettings",
     "WindowSettings",
     "average_pairwise_distance",
     "canonical_positions",
     "cut_windows",
+    "judge_held_out",
     "measure_diversity",
     "measure_gait_spread",
     "measure_realism",
@@ -65,6 +67,10 @@ class Realism:
     """Balanced held-out accuracy of the network, made against mocap; 0.5 is perfect, 1 is told apart every time."""
     floor_accuracy: float
     """Balanced held-out accuracy of the network, one half of the mocap's clips against the other."""
+    preferred: float
+    """Share of pairs of a made and a mocap window in which the network rather takes the made one for mocap."""
+    floor_preferred: float
+    """The same for the halves of the mocap."""
     frechet: float
     """Frechet distance of made windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
     floor_frechet: float
@@ -110,13 +116,15 @@ def measure_window_realism(
     order = torch.randperm(len(mocap), generator=shuffled).tolist()
     halves = [mocap[i] for i in order[::2]], [mocap[i] for i in order[1::2]]
     tick = _make_tick(progress, 2 * settings.classifier.folds)
-    floor = compute_held_out_accuracy(*halves, generator=shuffled, settings=settings.classifier, tick=tick)
-    accuracy = compute_held_out_accuracy(made, mocap, generator=ours, settings=settings.classifier, tick=tick)
+    floor = judge_held_out(*halves, generator=shuffled, settings=settings.classifier, tick=tick)
+    verdict = judge_held_out(made, mocap, generator=ours, settings=settings.classifier, tick=tick)
     basis = Basis.of(torch.cat(list(mocap)), settings.dims)
     points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
     return Realism(
-        accuracy,
-        floor,
+        verdict.accuracy,
+        floor.accuracy,
+        verdict.preferred,
+        floor.preferred,
         frechet_distance(points[0], points[1]),
         frechet_distance(points[2], points[3]),
         made_windows=len(points[0]),

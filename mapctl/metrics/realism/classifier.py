@@ -39,6 +39,17 @@ class ClassifierSettings:
                 raise RequestError(f"{name} must be at least {least}, got {getattr(self, name)}")
 
 
+@dataclass(frozen=True)
+class HeldOutVerdict:
+    """What networks say of clips that their training did not see, mean over folds."""
+
+    accuracy: float
+    """Balanced accuracy, 0 to 1: the mean over both sets."""
+    preferred: float
+    """Share of pairs, one window of either set, in which the network gives that of the first set the higher probability
+    of being of the second; 0.5 where it cannot tell."""
+
+
 def compute_held_out_accuracy(
     first: Sequence[Float[Tensor, "_ frames channels"]],
     second: Sequence[Float[Tensor, "_ frames channels"]],
@@ -47,7 +58,19 @@ def compute_held_out_accuracy(
     settings: ClassifierSettings = ClassifierSettings(),
     tick: Callable[[], None] = lambda: None,
 ) -> float:
-    """Compute the balanced accuracy on clips that training did not see, 0 to 1: the mean over both sets and all folds.
+    """Compute the accuracy of `judge_held_out`."""
+    return judge_held_out(first, second, generator=generator, settings=settings, tick=tick).accuracy
+
+
+def judge_held_out(
+    first: Sequence[Float[Tensor, "_ frames channels"]],
+    second: Sequence[Float[Tensor, "_ frames channels"]],
+    *,
+    generator: torch.Generator,
+    settings: ClassifierSettings = ClassifierSettings(),
+    tick: Callable[[], None] = lambda: None,
+) -> HeldOutVerdict:
+    """Let networks learn to tell two sets apart, and judge clips that they did not see.
 
     Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap. The same generator state
     gives the same bits; torch's global generator and thread count are left as they were. `tick` is called after each
@@ -56,14 +79,16 @@ def compute_held_out_accuracy(
     if min(len(first), len(second)) < settings.folds:
         raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
     sets = [_split_folds(clips, settings.folds, generator) for clips in (first, second)]
-    scores = []
+    scores, shares = [], []
     for fold in range(settings.folds):
         training = [torch.cat([part for k, part in enumerate(parts) if k != fold]) for parts in sets]
         with _isolate_torch(generator):
             network = _train_network(training, settings)
-            scores.append(_balanced_accuracy(network, [parts[fold] for parts in sets]))
+            logits = [_score(network, parts[fold]) for parts in sets]
+        scores.append(_balanced_accuracy(*logits))
+        shares.append(_share_preferred(*logits))
         tick()
-    return sum(scores) / len(scores)
+    return HeldOutVerdict(sum(scores) / len(scores), sum(shares) / len(shares))
 
 
 def _split_folds(clips: Sequence[Tensor], folds: int, generator: torch.Generator) -> list[Tensor]:
@@ -123,7 +148,18 @@ def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings:
     return network.eval()
 
 
-def _balanced_accuracy(network: nn.Module, sets: Sequence[Float[Tensor, "_ frames channels"]]) -> float:
-    with torch.no_grad():
-        first, second = ((torch.cat([network(part) for part in windows.split(512)]) > 0) for windows in sets)
-    return (float(first.double().mean()) + 1 - float(second.double().mean())) / 2
+@torch.no_grad()
+def _score(network: nn.Module, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, " windows"]:
+    return torch.cat([network(part) for part in windows.split(512)])
+
+
+def _balanced_accuracy(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
+    return (float((first > 0).double().mean()) + 1 - float((second > 0).double().mean())) / 2
+
+
+def _share_preferred(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
+    """Count pairs in which the first window's logit of the first set is the lower one; even ones are half."""
+    ordered, _ = second.sort()
+    above = len(second) - torch.searchsorted(ordered, first, right=True)
+    even = torch.searchsorted(ordered, first, right=True) - torch.searchsorted(ordered, first)
+    return float((above + 0.5 * even).double().mean()) / len(second)
