@@ -104,14 +104,16 @@ MODELS = {
         _windowed(pose_transformer.PoseTransformerRecipe, tiny_transformer.CONFIG),
     ),
     "infiller": Model(infiller.InfillerTrainer, _windowed(infiller.InfillerRecipe, tiny_infiller.CONFIG)),
-    "recurrent infiller": Model(
-        infiller.InfillerTrainer,
-        _windowed(infiller.InfillerRecipe, replace(tiny_infiller.CONFIG, architecture="recurrent")),
-    ),
     "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
     "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
     "tweener": Model(tweener.TweenerTrainer, _windowed(tweener.TweenerRecipe, tiny_tweener.CONFIG)),
 }
 """By the names of their commands."""
-VARIANTS = {"tweener with a critic": Model(tweener_critic.CriticisedTrainer, _criticised)}
+VARIANTS = {
+    "tweener with a critic": Model(tweener_critic.CriticisedTrainer, _criticised),
+    "recurrent infiller": Model(
+        infiller.InfillerTrainer,
+        _windowed(infiller.InfillerRecipe, replace(tiny_infiller.CONFIG, architecture="recurrent")),
+    ),
+}
 """What those commands train with other options."""
