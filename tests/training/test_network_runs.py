@@ -271,9 +271,7 @@ def test_every_option_reaches_the_trainer(model):
 
 
 @pytest.mark.parametrize(
-    "words",
-    [["--density", "mine"], ["--components", "3"], ["--device", "cpu"]],
-    ids=lambda words: words[0],
+    "words", [["--density", "mine"], ["--components", "3"], ["--device", "cpu"]], ids=lambda words: words[0]
 )
 def test_options_of_other_models_are_unknown(model, words):
     with pytest.raises(RequestError, match=f"Unrecognized options: {words[0]}.* .see mapctl train {model.name} --help"):
