@@ -183,7 +183,7 @@ class GeneratorNetwork(nn.Module):
         sparse = self.config.keys == "sparse"
         places = torch.where(image.known_axes if sparse else told, (copied - self.mean) / self.std, 0.0)
         distances = image.known_axes.to(places) if sparse else _scale_frames(away)
-        times = torch.zeros_like(_encode_times(image)) if sparse else _encode_times(image)
+        times = _encode_times(image) * (not sparse)
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT

@@ -34,10 +34,9 @@ SOURCE = "tweener"
 """Name of the in-betweener in notes."""
 _MARGIN = 4
 """Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
-poses jump, by three times what mocap's do, and keys stand there."""
+poses jump, and keys stand there."""
 _TREMBLE_HZ = 7.0
-"""Frequency of which half is left in the hips' way: led by a body that was made they tremble with its toes, three
-times as much as mocap's."""
+"""Frequency of which half is left in the hips' way: led by a body that was made they tremble with its toes."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
