@@ -150,9 +150,9 @@ class Tweener(Table):
     data: options.DataFolder
     """The folder that was trained on, for the clips that were held out."""
     part: Annotated[str, arg(metavar="PART,PART,...")] = "all"
-    """Tables to measure: path (table 2), gaps (between two poses of a clip), keys (table 4, before they are made exact,
-    and gaps with a past), apart (made seconds told from mocap's), dna (the same keys under that of several clips),
-    speed (table 3)."""
+    """Tables to measure: path (table 2), gaps (between two poses of a clip), spectrum (speed by frequency in these
+    gaps, figure 8), keys (table 4, before they are made exact, and gaps with a past), apart (made seconds told from
+    mocap's), dna (the same keys under that of several clips), speed (table 3)."""
     count: options.Count = 300
     """Clips, spread over the kinds."""
     path: options.Name = "path"

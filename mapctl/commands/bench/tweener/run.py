@@ -11,6 +11,7 @@ from mapctl.errors import RequestError
 PARTS: Mapping[str, Callable[[Tweener], Mapping[str, list[Row]]]] = {
     "path": path.measure,
     "gaps": gaps.measure,
+    "spectrum": gaps.measure_spectrum,
     "keys": keys.measure_keys,
     "apart": keys.measure_apart,
     "dna": dna.measure,
