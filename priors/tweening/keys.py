@@ -12,6 +12,7 @@ from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.loose_keys import lead_over_places
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from priors.tweening.walked_way import bend_way
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +64,14 @@ def make_key_image(motion: PartialMotion, told: ToldParts) -> PositionImage:
 def lead_reference(
     ground: Float[Tensor, "batch frames 2"], heading: Float[Tensor, "batch frames"], told: ToldParts
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Lead the reference (ground, metres; heading, radians) straight from told place to told place, and from told
-    heading to told heading. Where a sequence tells no heading, it looks along its way."""
+    """Lead the reference (ground, metres; heading, radians) from told place to told place, and from told heading to told
+    heading: as who walks would (`bend_way`) where that is clear, else straight and evenly. Where a sequence tells no
+    heading, it looks along its way."""
     # What is drawn stands where its hips are, also if only one axis of these is told.
     shown = told.axes[..., 0, :].any(dim=-1)
     way, facing = lead_over_places(ground, heading, placed=shown, faced=told.heading)
     drawn = torch.isfinite(told.view)[:, None]
+    way, facing = bend_way(way, facing, shown & told.heading & ~drawn)
     return way, torch.where(drawn, torch.nan_to_num(told.view)[:, None], facing)
 
 
