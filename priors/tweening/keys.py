@@ -64,9 +64,9 @@ def make_key_image(motion: PartialMotion, told: ToldParts) -> PositionImage:
 def lead_reference(
     ground: Float[Tensor, "batch frames 2"], heading: Float[Tensor, "batch frames"], told: ToldParts
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Lead the reference (ground, metres; heading, radians) from told place to told place, and from told heading to told
-    heading: as who walks would (`bend_way`) where that is clear, else straight and evenly. Where a sequence tells no
-    heading, it looks along its way."""
+    """Lead the reference (ground, metres; heading, radians) from told place to told place, and from told heading to
+    told heading: as who walks would (`bend_way`) where that is clear, else straight and evenly. Where a sequence tells
+    no heading, it looks along its way."""
     # What is drawn stands where its hips are, also if only one axis of these is told.
     shown = told.axes[..., 0, :].any(dim=-1)
     way, facing = lead_over_places(ground, heading, placed=shown, faced=told.heading)

@@ -1,0 +1,87 @@
+"""The way between two keys: it bends for who walks, and for nobody else."""
+
+import math
+
+import pytest
+import torch
+
+from mapctl import rotations
+from priors.tweening.walked_way import bend_way
+
+FRAMES = 193
+
+
+def lead(displacement, first, last, frames=FRAMES, turn=0.0):
+    """Straight from the origin, evenly turning, between two keys; all of it turned; degrees."""
+    share = torch.linspace(0, 1, frames).double()[None]
+    headings = torch.deg2rad(first + (last - first) * share) + turn
+    end = rotations.rotate_ground(torch.tensor(displacement).double(), torch.tensor(turn).double())
+    told = torch.zeros(1, frames, dtype=torch.bool)
+    told[:, [0, -1]] = True
+    return share[..., None] * end, headings, told
+
+
+def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_other():
+    way, facing = bend_way(*lead((4.0, 4.0), 0.0, 90.0))
+    degrees = torch.rad2deg(facing[0])
+    assert degrees[:32].abs().max() < 15
+    assert (degrees[-32:] - 90).abs().max() < 15
+    assert degrees[FRAMES // 2] == pytest.approx(45, abs=1)
+    assert bool((torch.diff(degrees) > -0.01).all())
+    steps = torch.diff(way[0], dim=0)
+    assert torch.allclose(steps.norm(dim=-1), steps.norm(dim=-1).mean().expand(FRAMES - 1), rtol=0.03)
+    along = torch.atan2(steps[:, 0], steps[:, 1])
+    middle = (facing[0, 1:] + facing[0, :-1]) / 2
+    assert rotations.wrap_angle(along - middle).abs().max() < math.radians(2)
+
+
+@pytest.mark.parametrize(
+    ("displacement", "first", "last", "frames"),
+    [
+        ((0.5, 0.5), 0.0, 90.0, FRAMES),  # who turns on the spot
+        ((4.0, 4.0), 180.0, 225.0, FRAMES),  # who walks backwards
+        ((4.0, 0.0), 0.0, 0.0, FRAMES),  # and sideways
+        ((0.7, 0.7), 0.0, 90.0, 30),  # a second
+    ],
+)
+def test_the_way_stays_straight_for_who_does_not_walk_ahead_or_has_no_time(displacement, first, last, frames):
+    way, facing, told = lead(displacement, first, last, frames)
+    bent, turned = bend_way(way, facing, told)
+    assert torch.equal(bent, way)
+    assert torch.equal(turned, facing)
+
+
+def test_what_is_told_stays_and_a_way_turned_elsewhere_is_the_same_one():
+    way, facing, told = lead((3.0, 5.0), -10.0, 60.0)
+    bent, turned = bend_way(way, facing, told)
+    assert torch.equal(bent[told], way[told])
+    assert torch.equal(turned[told], facing[told])
+    assert (bent - way).norm(dim=-1).max() > 0.1
+    for turn in (1.0, 3.0, -2.5):
+        other, facing_other = bend_way(*lead((3.0, 5.0), -10.0, 60.0, turn=turn))
+        wanted = rotations.rotate_ground(bent, torch.tensor(turn).double().expand(1, FRAMES))
+        assert torch.allclose(other, wanted, atol=1e-9)
+        assert torch.allclose(facing_other, turned + turn, atol=1e-9)
+
+
+def test_of_several_sequences_and_keys_each_gap_bends_by_itself():
+    way, facing, told = lead((3.0, 5.0), -10.0, 60.0)
+    bent, turned = bend_way(way, facing, told)
+    both = torch.cat([way, torch.zeros_like(way)]), torch.cat([facing, facing]), torch.cat([told, told])
+    assert torch.equal(bend_way(*both)[0][:1], bent)
+    assert torch.equal(bend_way(*both)[0][1:], torch.zeros_like(way))
+    twice = [torch.cat([each, each[:, 1:]], dim=1) for each in (facing, told)]
+    there_and_on = torch.cat([way, way[:, -1:] + way[:, 1:]], dim=1)
+    first = bend_way(there_and_on, *twice)
+    assert torch.equal(first[0][:, :FRAMES], bent)
+    assert torch.equal(first[1][:, :FRAMES], turned)
+    nothing = bend_way(way, facing, torch.zeros_like(told))
+    assert torch.equal(nothing[0], way)
+
+
+def test_a_little_more_time_or_turn_bends_a_little_more():
+    most = 0.0
+    for degrees in torch.linspace(60, 100, 41).tolist():
+        one, other = (bend_way(*lead((0.0, 5.0), -each, each))[0] for each in (degrees, degrees + 0.1))
+        most = max(most, float((one - other).norm(dim=-1).max()))
+    assert 0 < most < 0.05
