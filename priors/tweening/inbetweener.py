@@ -29,6 +29,7 @@ from priors.tweening.keys import see_contacts
 from priors.tweening.partial_keys import show_loose_keys
 from priors.tweening.splitting import Split, find_splits, place_poses, show_edges
 from priors.tweening.styles import Style, read_classes
+from priors.tweening.walked_way import bend_motion
 
 SOURCE = "tweener"
 """Name of the in-betweener in notes."""
@@ -125,7 +126,7 @@ class Tweener(Inbetweener):
             own = None if self.style is None else self.style.poses
             poses = show_edges(query, split) if own is None else own
             if len(poses):
-                placed = place_poses(poses, query.to_unit_size(query.motion), split.frames)
+                placed = place_poses(poses, _walk_over(query), split.frames)
                 told |= dict(zip(split.frames, placed, strict=True))
         return told
 
@@ -178,7 +179,7 @@ class Tweener(Inbetweener):
 def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
     """Return the query, and poses that are told by frame, as the network takes it, of unit size and near the origin,
     and where that origin is."""
-    body, known = query.to_unit_size(query.motion), _find_told_joints(query)
+    body, known = _walk_over(query), _find_told_joints(query)
     placed = known[:, 0].nonzero()[:, 0]
     origin = body.root_position[placed[0] if len(placed) else 0] * torch.tensor([1.0, 0.0, 1.0]).double()
     places = body.joint_positions()
@@ -195,6 +196,12 @@ def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tup
         toes=TOE_JOINTS,
     )
     return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
+
+
+def _walk_over(query: GapQuery) -> Motion:
+    """Return the query's motion at unit size, in whose gaps the hips go as who walks would."""
+    missing = query.missing
+    return bend_motion(query.to_unit_size(query.motion), placed=~missing.root, faced=~missing.joints[:, 0])
 
 
 def _find_told_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:

@@ -71,7 +71,7 @@ def lead_reference(
     shown = told.axes[..., 0, :].any(dim=-1)
     way, facing = lead_over_places(ground, heading, placed=shown, faced=told.heading)
     drawn = torch.isfinite(told.view)[:, None]
-    way, facing = bend_way(way, facing, shown & told.heading & ~drawn)
+    way, facing = bend_way(way, facing, placed=shown, faced=told.heading & ~drawn)
     return way, torch.where(drawn, torch.nan_to_num(told.view)[:, None], facing)
 
 

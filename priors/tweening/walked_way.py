@@ -3,7 +3,7 @@ along that one's, and turns in between.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,6 +11,8 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
+from mapctl.kinematics import heading
+from mapctl.motion import Motion
 
 _SAMPLES = 129  # of a curve, to tell how long it is
 _SHORT, _WHOLE = 1.0, 2.0  # seconds: straight as long as the first, wholly curved from the second on
@@ -36,14 +38,17 @@ class _Legs:
 def bend_way(
     way: Float[Tensor, "batch frames 2"],
     facing: Float[Tensor, "batch frames"],
-    told: Bool[Tensor, "batch frames"],
+    *,
+    placed: Bool[Tensor, "batch frames"],
+    faced: Bool[Tensor, "batch frames"],
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Bend a way (x, z, metres) and headings (radians) that lead straight and evenly between frames in which both are
-    told. Wherever who walks forwards at an even pace gets from one to the other in at least a second, the way becomes a
-    cubic curve along both headings (Hermite) and the heading its tangent. It stays as it is at what is told, for who
-    stands, and between keys of which one looks away from the other; in between it bends the more, the clearer it is.
+    """Bend a way (x, z, metres) and headings (radians) that lead straight between frames in which a place is told, and
+    evenly between frames in which a heading is. Between neighbours that tell both, and that who walks forwards at an
+    even pace would take more than a second for, the way becomes a cubic curve along both headings (Hermite) and the
+    heading its tangent. It stays as it is at what is told, for who stands, and between keys of which one looks away
+    from the other; in between it bends the more, the clearer it is.
     """
-    legs = _find_legs(told)
+    legs = _find_legs(placed, faced)
     if not len(legs.row):
         return way, facing
     ends = legs.start + legs.frames
@@ -58,11 +63,24 @@ def bend_way(
     return _follow(way, facing, legs, share, (first, last, *tangents), towards + turns[0])
 
 
-def _find_legs(told: Bool[Tensor, "batch frames"]) -> _Legs:
-    """Find neighbouring told frames that are more than _SHORT apart."""
-    row, frame = told.nonzero(as_tuple=True)
-    frames = torch.diff(frame)
-    long = (torch.diff(row) == 0) & (frames > _SHORT * PRIOR_FPS)
+def bend_motion(motion: Motion, *, placed: Bool[Tensor, " frames"], faced: Bool[Tensor, " frames"]) -> Motion:
+    """Bend the hips' way and turn the body along it, in frames of a motion at PRIOR_FPS and of unit size between those
+    whose hips have a known place and heading."""
+    facing = rotations.unwrap_angle(heading(motion.local_quat_xyzw[:, 0]))
+    way, turned = bend_way(motion.root_position[None, :, ::2], facing[None], placed=placed[None], faced=faced[None])
+    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
+    root[:, ::2] = way[0]
+    bent = turned[0] != facing
+    quats[bent, 0] = rotations.multiply(rotations.about_y((turned[0] - facing)[bent]), quats[bent, 0])
+    return replace(motion, root_position=root, local_quat_xyzw=quats)
+
+
+def _find_legs(placed: Tensor, faced: Tensor) -> _Legs:
+    """Find frames that tell a place and a heading with more than _SHORT until the next that tells anything, and that
+    both as well."""
+    row, frame = (placed | faced).nonzero(as_tuple=True)
+    whole, frames = (placed & faced)[row, frame], torch.diff(frame)
+    long = (torch.diff(row) == 0) & (frames > _SHORT * PRIOR_FPS) & whole[:-1] & whole[1:]
     return _Legs(row[:-1][long], frame[:-1][long], frames[long])
 
 
@@ -77,7 +95,7 @@ def _follow(
     legs: _Legs,
     share: Float[Tensor, " legs"],
     curve: tuple[Tensor, Tensor, Tensor, Tensor],
-    heading: Float[Tensor, " legs"],
+    begins: Float[Tensor, " legs"],
 ) -> tuple[Tensor, Tensor]:
     """Follow the curves evenly, as far as each one's share; the curves begin at these headings."""
     bent, turned = way.clone(), facing.clone()
@@ -92,7 +110,7 @@ def _follow(
         own = tuple(each[leg : leg + 1] for each in curve)
         place, along = (each(own, parameter[None])[0] for each in (_place, _differentiate))
         # Evenly turning headings are unwrapped, and a curve's begin where they do.
-        begun = facing[row, start] + rotations.wrap_angle(torch.atan2(along[:, 0], along[:, 1]) - heading[leg])
+        begun = facing[row, start] + rotations.wrap_angle(torch.atan2(along[:, 0], along[:, 1]) - begins[leg])
         bent[row, inside] += share[leg] * (place - way[row, inside])
         turned[row, inside] += share[leg] * rotations.wrap_angle(begun - facing[row, inside])
     return bent, turned
