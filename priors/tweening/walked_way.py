@@ -18,6 +18,7 @@ _SAMPLES = 129  # of a curve, to tell how long it is
 _SHORT, _WHOLE = 1.0, 2.0  # seconds: straight as long as the first, wholly curved from the second on
 _SLOW, _WALKS = 0.3, 0.6  # metres a second from key to key, likewise
 _ASIDE, _AHEAD = math.radians(90.0), math.radians(70.0)  # between a key's heading and the other key, likewise
+_SWAYS, _TURNS = math.radians(10.0), math.radians(25.0)  # of that angle again: hips sway with every step
 _REACH, _REACH_A_SECOND, _LONGEST_REACH = 0.8, 0.3, 2.0
 """Length of the tangents over the distance of the keys, at first and more by the second: the longer there is time, the
 sharper is the turn for its way. Chosen on captured walks: a turn of 90 degrees takes about 2 s."""
@@ -45,8 +46,8 @@ def bend_way(
     """Bend a way (x, z, metres) and headings (radians) that lead straight between frames in which a place is told, and
     evenly between frames in which a heading is. Between neighbours that tell both, and that who walks forwards at an
     even pace would take more than a second for, the way becomes a cubic curve along both headings (Hermite) and the
-    heading its tangent. It stays as it is at what is told, for who stands, and between keys of which one looks away
-    from the other; in between it bends the more, the clearer it is.
+    heading its tangent. It stays as it is at what is told, for who stands or walks on straight, and between keys of
+    which one looks away from the other; in between it bends the more, the clearer it is.
     """
     legs = _find_legs(placed, faced)
     if not len(legs.row):
@@ -86,7 +87,8 @@ def _find_legs(placed: Tensor, faced: Tensor) -> _Legs:
 
 def _choose_share(legs: _Legs, length: Tensor, aside: Tensor) -> Float[Tensor, " legs"]:
     seconds = legs.frames / PRIOR_FPS
-    return _ramp(seconds, _SHORT, _WHOLE) * _ramp(length / seconds, _SLOW, _WALKS) * _ramp(aside, _ASIDE, _AHEAD)
+    ahead = _ramp(aside, _SWAYS, _TURNS) * _ramp(aside, _ASIDE, _AHEAD)
+    return _ramp(seconds, _SHORT, _WHOLE) * _ramp(length / seconds, _SLOW, _WALKS) * ahead
 
 
 def _follow(
