@@ -10,6 +10,9 @@ from mapctl import rotations
 from mapctl.features import GroundPose, integrate_steps
 from mapctl.inbetweening.position_image import mirror_positions
 
+TREMBLE_HZ = 7.0
+"""Frequency of which half is left in a way that is told by how the body moves: so led, hips tremble with its toes."""
+
 
 @dataclass(frozen=True, eq=False)
 class LocalMotion:

@@ -14,7 +14,7 @@ from mapctl.inbetweening import GapQuery, PositionImage, Proposal
 from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.inbetweening.path_closing import lead_over_keys
 from mapctl.inbetweening.query import GapSource
-from mapctl.inbetweening.root_trajectory import LocalMotion
+from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion
 from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
@@ -36,8 +36,6 @@ SOURCE = "tweener"
 _MARGIN = 4
 """Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
 poses jump, and keys stand there."""
-_TREMBLE_HZ = 7.0
-"""Frequency of which half is left in the hips' way: led by a body that was made they tremble with its toes."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
@@ -167,7 +165,7 @@ class Tweener(Inbetweener):
         loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
         led = lead_over_keys(way, body.root_position - origin, query.missing.root, loose)
         told = ~query.missing.root if loose is None else ~query.missing.root | loose.placed
-        calm = smooth_between(led, told, hertz=_TREMBLE_HZ, fps=PRIOR_FPS) + origin
+        calm = smooth_between(led, told, hertz=TREMBLE_HZ, fps=PRIOR_FPS) + origin
         if query.keep_trajectory:
             calm = torch.cat([body.root_position[:, :1], calm[:, 1:2], body.root_position[:, 2:]], dim=-1)
             return replace(body, root_position=calm), logits

@@ -6,13 +6,15 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.path_closing import close_path
 from mapctl.inbetweening.query import estimate_contact_logits
-from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
+from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, RootTrajectory
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
+from mapctl.numerics.smooth_offsets import smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
 
 SOURCE = "path"
@@ -22,7 +24,7 @@ SOURCE = "path"
 @dataclass(frozen=True, eq=False)
 class RetracedInbetweener(Inbetweener):
     """In-betweener that lets another propose the poses that are missing, and predicts the hips' trajectory wherever it
-    is lost while the body is known."""
+    is lost while the body is known: calmed, since hips that are told by how toes move tremble with these."""
 
     path: PathPredictor
     """Predictor of the trajectory."""
@@ -44,6 +46,7 @@ class RetracedInbetweener(Inbetweener):
         predicted = predict_trajectory(body, self.path)
         facing = heading(body.local_quat_xyzw[:, 0])
         root = close_path(predicted.integrate(facing[None].float())[0].double(), body.root_position, lost)
+        root = smooth_between(root, ~lost, hertz=TREMBLE_HZ, fps=PRIOR_FPS)
         motion = query.to_character(replace(body, root_position=root))
         logits = torch.where(lost[:, None], predicted.contacts[0], posed.contact_logits)
         return replace(posed, motion=motion, contact_logits=logits)
