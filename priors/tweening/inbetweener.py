@@ -36,6 +36,9 @@ SOURCE = "tweener"
 _MARGIN = 4
 """Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
 poses jump, and keys stand there."""
+_FLICKER_HZ, _FLICKER_SHARE = 14.0, 0.5
+"""Frequency of which half is taken from made rotations, and how far they follow: faster than 8 Hz they change more than
+mocap's, and slower less."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
@@ -115,7 +118,7 @@ class Tweener(Inbetweener):
         made, inside = self.network(wide, style[None]), slice(_MARGIN, -_MARGIN)
         local = made.turn_to_world(wide).local_matrix[0, inside]
         way = None if made.root is None else wide.to_world(made.root[..., None, :])[0, inside, 0].double()
-        return rotations.from_matrix(local.double()), way, origin
+        return calm_poses(rotations.from_matrix(local.double())), way, origin
 
     def _tell_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
         """Choose the poses that split gaps, by frame, at their places in a motion of unit size, metres, world."""
@@ -194,6 +197,14 @@ def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tup
         toes=TOE_JOINTS,
     )
     return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
+
+
+def calm_poses(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 4"]:
+    """Leave less of the fastest changes of rotations, which the network makes more of than performers do."""
+    even = rotations.make_sign_continuous(quats)
+    free = torch.zeros(len(even), dtype=torch.bool)
+    calm = smooth_between(even.flatten(1), free, hertz=_FLICKER_HZ, fps=PRIOR_FPS).unflatten(1, even.shape[1:])
+    return torch.nn.functional.normalize(torch.lerp(even, calm, _FLICKER_SHARE), dim=-1)
 
 
 def _walk_over(query: GapQuery) -> Motion:

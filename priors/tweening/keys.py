@@ -1,5 +1,4 @@
-"""What the generator is told: poses or parts of them at keys, seen from a reference that leads straight from key to
-key."""
+"""What the generator is told: poses or parts of them at keys, seen from a reference that leads from key to key."""
 
 from dataclasses import dataclass
 

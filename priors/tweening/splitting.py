@@ -2,7 +2,7 @@
 remedy).
 
 A pose is one of the style's, or of the keys beside the gap where no style brings any. It is told to the network like a
-key, at its place on the straight way from key to key and turned to the heading there; motion comes near it and need
+key, at its place on the reference's way from key to key and turned to the heading there; motion comes near it and need
 not meet it.
 """
 
@@ -62,7 +62,7 @@ def show_edges(query: GapQuery, split: Split) -> Float[Tensor, "poses joints 3"]
 def place_poses(
     poses: Float[Tensor, "poses joints 3"], body: Motion, frames: Sequence[int]
 ) -> Float[Tensor, "frames joints 3"]:
-    """Place poses in these frames of a body that goes straight from key to key, turned to its heading there, the lower
+    """Place poses in these frames of a body that is led from key to key, turned to its heading there, the lower
     toe on the floor; spread over all of them, or one after the other and all over again if there are fewer. Metres,
     world."""
     count, there_are = len(frames), len(poses)
