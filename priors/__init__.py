@@ -53,11 +53,18 @@ def load_infiller(name: str) -> ConvInfiller:
 def load_inbetweener(name: str = "transformer", path: str = "path") -> ConvInfiller | PoseTransformer | Tweener:
     """The bundled pose transformer or tweener, or a trained transformer, infiller or tweener by its file or run folder;
     CheckpointError for anything else. A tweener goes by the path predictor `path`."""
+    kind = find_inbetweener_kind(name)
+    return load_tweener(name, path) if kind == "tweener" else _INBETWEENERS[kind](name)
+
+
+def find_inbetweener_kind(name: str) -> str:
+    """The kind of a bundled or trained in-betweener, from its card: `pose-transformer`, `infiller` or `tweener`;
+    CheckpointError for anything else."""
     found = checkpoints.locate(name)
     kind = checkpoints.read_card(found.with_suffix(".json")).kind
     if kind not in (*_INBETWEENERS, "tweener"):
         raise CheckpointError(f"{found}: a {kind} is no in-betweener")
-    return load_tweener(name, path) if kind == "tweener" else _INBETWEENERS[kind](name)
+    return kind
 
 
 def load_transformer(name: str = "transformer") -> PoseTransformer:

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.pipeline import InfillSettings, fill
-from controllers.inbetweening.proposers.auto import ChoiceSettings, compute_artefact_cost
 from mapctl import contacts
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import worst_frame
@@ -18,6 +18,11 @@ from mapctl.skeleton import CANONICAL, TOES
 
 _CONTEXT = 16  # frames on either side that the in-betweener is shown
 _ACCELERATION_WEIGHT = 0.003  # m/s for a m/s^2 of the worst hand or toe
+_SKATE_WEIGHT = 0.5  # of skating toes beside sliding of the support
+_DETOUR_WEIGHT = 0.5  # of the trajectory's excess length over the straight one, m/s for m/s
+_UNSUPPORTED_WEIGHT = 0.5  # of the longest time on no planted foot, m/s for a second
+_SKATE_HEIGHT = 0.025  # metres
+_TOES = CANONICAL.indices(TOES)
 _EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
 
 
@@ -75,10 +80,32 @@ def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
 def judge(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
     """Judge a filled gap as a viewer would, m/s: sliding, skating, detours, time on no foot (see
     `compute_artefact_cost`), and the worst acceleration."""
-    cost = compute_artefact_cost(motion, contacts.to_logits(planted), gap, ChoiceSettings())
+    cost = compute_artefact_cost(motion, planted, gap)
     shown = motion.slice(max(0, gap[0] - 2), min(motion.num_frames, gap[1] + 2))
     peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
     return cost + _ACCELERATION_WEIGHT * peaks.acceleration
+
+
+def compute_artefact_cost(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
+    """Compute the cost of visible artefacts in a filled gap as a speed, m/s: sliding of the support, skating toes, a
+    detour, the longest unsupported time.
+    """
+    start, stop = gap[0] - 1, gap[1] + 1
+    positions, fps = motion.joint_positions()[start:stop], float(motion.fps)
+    toes, hips = positions[:, _TOES], positions[:, 0]
+    height = estimate_rest_height(motion, contacts.debounced(planted))
+    above, speeds = toes[1:, :, 1] - height, torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
+    slide = float(contacts.support_speed(above, speeds).mean())
+    skate = float((speeds * (1 - above / _SKATE_HEIGHT).clamp(0, 1)).mean())
+    ground = hips[:, ::2]
+    detour = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
+    unsupported = worst_frame.measure_longest_unsupported(toes, hips, fps)
+    return (
+        slide
+        + _SKATE_WEIGHT * skate
+        + _DETOUR_WEIGHT * detour * fps / len(positions)
+        + _UNSUPPORTED_WEIGHT * unsupported
+    )
 
 
 def join_across(before: Motion, after: Motion, transition: Transition) -> Motion:

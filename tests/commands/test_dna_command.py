@@ -4,11 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from captures import on_rig
 from helpers import run
 from tiny_path import save_tiny_path
 from tiny_prior import save_tiny_prior
 from tiny_tweener import save_tiny_tweener
+
+from mapctl import formats
 
 FRAMES = 70
 
@@ -165,3 +168,18 @@ def test_weights_without_classes_have_no_variations_to_draw(here, prior, tmp_pat
 def test_info_lists_classes_and_no_vectors(models, capsys):
     assert run("info", models[3], "--json") == 0
     assert json.loads(capsys.readouterr().out)["data"]["classes"] == {"walk": 1, "wave-left-hand": 1}
+
+
+def test_auto_takes_the_named_tweener_in_long_gaps_and_the_transformer_elsewhere(here, models, capsys):
+    """Only a walk that lasts has a long gap; its path predictor may be named with it."""
+    on_rig("bandai", 240).save("long.bvh")
+    named = models[2:6]
+    said = {}
+    for method in ("auto", "tweener"):
+        words = ["long.bvh", "-o", f"{method}.bvh", "--keyframes", "0,30,239", "--no-finish", "--method", method]
+        assert run("tween", *words, *named) == 0
+        said[method] = capsys.readouterr().out
+    assert "frames 1:30: transformer" in said["auto"]
+    assert "frames 31:239: tweener" in said["auto"]
+    auto, alone = (formats.load(f"{method}.bvh") for method in ("auto", "tweener"))
+    torch.testing.assert_close(auto.local_quat_xyzw[35:235], alone.local_quat_xyzw[35:235], atol=1e-4, rtol=0)

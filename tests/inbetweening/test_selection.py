@@ -1,4 +1,4 @@
-"""Who fills a gap: the infiller where it knows enough, nobody where one stands, else whoever slides least."""
+"""Who fills a gap: the network, whatever it slides, and nobody where one stands and it would wander off."""
 
 from dataclasses import replace
 
@@ -10,50 +10,42 @@ from tiny_infiller import tiny_infiller
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.error_estimates import estimate_error
 from controllers.inbetweening.geometry.footholds import hold_planted
-from controllers.inbetweening.proposers.auto import (
-    STANDING_STILL,
-    AutoInbetweener,
-    ChoiceSettings,
-    compute_artefact_cost,
-)
-from controllers.inbetweening.proposers.rollouts import RolloutSettings
+from controllers.inbetweening.proposers.auto import STANDING_STILL, AutoInbetweener
 from controllers.inbetweening.tween import tween
-from mapctl import contacts
+from mapctl import contacts, rotations
 from mapctl.inbetweening import Proposal
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
-from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
-from mapctl.solver.budget import Budget
-from mapctl.solver.lbfgs import LbfgsSettings
 
 TOES = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
-QUICK = ChoiceSettings(
-    tempos=(1.0, 0.9),
-    rolling=RolloutSettings(
-        temperature=0.0,
-        trajectory=0.2,
-        stage=30,
-        ahead=4,
-        method=LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=6)),
-    ),
-)
 
 
-class Lines(Inbetweener):
-    """Stands for the infiller: straight lines."""
+class Network(Inbetweener):
+    """Stands for a network: straight lines, along which the body sways aside by so many metres, and one hand waves."""
+
+    def __init__(self, sway=0.0, wave=0.0):
+        self.sway, self.wave = sway, wave
 
     def propose(self, query, *, generator=None):
-        return Proposal(query.motion, torch.zeros(query.motion.num_frames, 2), "infiller")
+        bump = torch.sin(torch.linspace(0, torch.pi, query.motion.num_frames).double())
+        root, quats = query.motion.root_position.clone(), query.motion.local_quat_xyzw.clone()
+        root[:, 0] += self.sway * query.missing.root * bump
+        shoulder, angle = CANONICAL.index("leftUpperArm"), torch.zeros(len(root), 3).double()
+        angle[:, 2] = self.wave * query.missing.root * bump
+        quats[:, shoulder] = rotations.multiply(quats[:, shoulder], rotations.from_rotation_vector(angle))
+        motion = replace(query.motion, root_position=root, local_quat_xyzw=quats)
+        return Proposal(motion, torch.zeros(query.motion.num_frames, 2), "network")
 
 
-def chosen(motion, start, stop, *, densities=(), settings=QUICK):
+def chosen(motion, start, stop, *, densities=(), network=None, **known):
     """The query of a motion that lacks frames, and what is proposed for it."""
     free = torch.zeros(motion.num_frames, dtype=torch.bool)
     free[start:stop] = True
     query = CanonicalClip.of(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)).query()
-    return query, AutoInbetweener(Lines(), densities, settings).propose(query)
+    query = replace(query, **known)
+    return query, AutoInbetweener(network or Network(), densities).propose(query)
 
 
 def still(frames):
@@ -62,16 +54,18 @@ def still(frames):
     return replace(motion, root_position=motion.root_position[first], local_quat_xyzw=motion.local_quat_xyzw[first])
 
 
-@pytest.mark.parametrize(
-    ("start", "stop", "asked"),
-    [(1, 31, False), (1, 33, True), (20, 78, False), pytest.param(20, 82, True, marks=pytest.mark.slow)],
-)
-def test_the_infiller_is_asked_alone_for_what_it_knows(start, stop, asked):
-    """Up to a second between bare poses, two between known motion."""
-    query, answer = chosen(walk(stop + (20 if start > 1 else 1)), start, stop, densities=[tiny_density()])
-    (source,) = answer.attribute(query)
-    assert (source.start, source.stop) == (start, stop)
-    assert (source.by == "infiller") or asked
+@pytest.mark.parametrize(("start", "stop"), [(1, 31), (1, 91), (20, 110), (1, 180)])
+def test_whatever_slides_the_network_is_kept_where_it_has_an_answer(start, stop):
+    """Poses of a walk that straight lines slide between: densities, which would step, do not take the gap, since behind
+    MAP they are farther from mocap."""
+    motion = walk(stop + (20 if start > 1 else 1))
+    network = Network(sway=0.2)
+    query, answer = chosen(motion, start, stop, densities=[tiny_density()], network=network)
+    alone = network.propose(query)
+    assert [(one.start, one.stop, one.by) for one in answer.attribute(query)] == [(start, stop, "network")]
+    assert torch.equal(answer.motion.root_position, alone.motion.root_position)
+    assert torch.equal(answer.motion.local_quat_xyzw, alone.motion.local_quat_xyzw)
+    assert torch.equal(answer.contact_logits, alone.contact_logits)
 
 
 @pytest.mark.parametrize("seconds", [2, 4, 8])
@@ -91,36 +85,25 @@ def test_somebody_who_is_on_the_move_beside_a_gap_does_not_just_stand():
     period = 30
     motion = replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]).double())
     start, stop = 20, 20 + 3 * period - 1
-    query, answer = chosen(motion, start, stop)
-    assert answer.attribute(query)[0].by == "infiller"
+    query, answer = chosen(motion, start, stop, network=Network(sway=0.2))
+    assert answer.attribute(query)[0].by == "network"
 
 
-def test_a_slide_costs_what_a_viewer_sees_and_a_walk_does_not():
-    motion = walk(90)
-    odds = torch.full((90, 2), -1.0)
-    sliding = replace(still(90), root_position=motion.root_position)
-    walks, slides = (compute_artefact_cost(each, odds, (1, 89), QUICK) for each in (motion, sliding))
-    assert slides > walks + 0.3
-    round_about = motion.root_position.clone()
-    round_about[:, 0] += torch.sin(torch.arange(90) / 89 * torch.pi) * 1.5
-    assert compute_artefact_cost(replace(motion, root_position=round_about), odds, (1, 89), QUICK) > walks
+@pytest.mark.parametrize(
+    ("sway", "frames", "by"), [(0.01, 90, "network"), (0.06, 90, STANDING_STILL), (0.06, 40, "network")]
+)
+def test_who_stands_may_gesture_but_not_wander(sway, frames, by):
+    motion = still(frames + 2)
+    query, answer = chosen(motion, 1, frames + 1, network=Network(sway=sway, wave=1.5))
+    assert [source.by for source in answer.attribute(query)] == [by]
+    hand = CANONICAL.index("leftHand")
+    moved = (answer.motion.joint_positions() - motion.joint_positions())[:, hand].norm(dim=-1)
+    assert (float(moved.max()) > 0.3) == (by == "network")
 
 
-def test_of_several_answers_the_one_that_costs_least_is_taken():
-    motion = walk(45)
-    costs = {}
-    for name, settings in (("rolled", QUICK), ("alone", replace(QUICK, acceptable_cost=1e9))):
-        _, answer = chosen(motion, 1, 44, densities=[tiny_density()], settings=settings)
-        costs[name] = compute_artefact_cost(answer.motion, answer.contact_logits, (1, 44), QUICK)
-    assert costs["rolled"] <= costs["alone"] + 1e-9
-
-
-def test_known_frames_stay_and_the_same_comes_twice():
-    motion, one_tempo = walk(35), replace(QUICK, tempos=(1.0,))
-    answers = [chosen(motion, 1, 34, densities=[tiny_density()], settings=one_tempo)[1] for _ in range(2)]
-    assert torch.equal(answers[0].motion.local_quat_xyzw, answers[1].motion.local_quat_xyzw)
-    for frame in (0, 34):
-        torch.testing.assert_close(answers[0].motion.joint_positions()[frame], motion.joint_positions()[frame])
+def test_nobody_is_held_who_was_told_a_way():
+    query, answer = chosen(still(92), 1, 91, network=Network(sway=0.5), keep_trajectory=True)
+    assert [source.by for source in answer.attribute(query)] == ["network"]
 
 
 def test_planted_toes_are_held_and_what_is_known_stays():

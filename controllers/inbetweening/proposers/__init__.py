@@ -25,7 +25,8 @@ class ModelLoaders:
     """Loaders of the models that an in-betweener needs, called when it needs them."""
 
     network: Callable[[str], Inbetweener]
-    """Loader of the network that a method asks for by its own name; of whichever is given for `auto`."""
+    """Loader of the network that a method asks for by its own name; of whichever is given for `rollouts`, and for
+    `auto` of whichever but a tweener."""
     densities: Callable[[], Sequence[Density]]
     """Loader of the densities for rollouts."""
     tweener: Callable[[], Inbetweener]
@@ -37,7 +38,7 @@ METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
     "transformer": lambda models: models.network("transformer"),
     "infiller": lambda models: models.network("infiller"),
     "tweener": lambda models: models.network("tweener"),
-    "rollouts": lambda models: RolloutInbetweener(models.densities(), models.network("auto")),
+    "rollouts": lambda models: RolloutInbetweener(models.densities(), models.network("rollouts")),
     "slerp": lambda models: SlerpInbetweener(),
 }
 """Builders of in-betweeners by the name of the method."""

@@ -43,6 +43,6 @@ def extrapolate_end(
         committed, count = commit_before(body, logits, first, density), min(settings.longest, stop - first)
         terms = (LatentPrior(settings.sigma_noise), settings.footing)
         window = solver.solve_window(committed, terms, count, generator=torch.Generator())
-        body, logits, _ = insert_rollout(body, logits, window, committed.place, (first, first + count))
+        body, logits = insert_rollout(body, logits, window, committed.place, (first, first + count))
     source = GapSource(start, stop, f"density {density.name}")
     return replace(proposal, motion=query.to_character(body), contact_logits=logits, others=(*proposal.others, source))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import contacts, rotations
@@ -59,28 +59,24 @@ def insert_rollout(
     window: SolvedWindow,
     ground_pose: GroundPose,
     gap: tuple[int, int],
-    *,
-    tempo: float = 1.0,
-) -> tuple[Motion, Float[Tensor, "frames 2"], float]:
+) -> tuple[Motion, Float[Tensor, "frames 2"]]:
     """Insert a rollout in its gap, corrected so that it arrives at the frame after it, if there is one; also return the
-    contact logits, and the error at that frame before the correction, mean distance of the joints, metres.
+    contact logits.
     """
     start, stop = gap
     made = decode(window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double()))
-    count, missed = stop - start, 0.0
-    made, planted = _warp_time(made, window.trial.contacts[0], max(1, round(count * tempo)), count)
+    count, planted = stop - start, window.trial.contacts[0]
     root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), contact_logits.clone()
     root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
     if count < len(made.root_position):
         there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
-        missed = float((there.joint_positions() - here.joint_positions()).norm(dim=-1).mean())
         root[start:stop], quats[start:stop] = _arrive(here, there, root[start:stop], quats[start:stop])
     new = torch.zeros(len(root), dtype=torch.bool)
     new[start:stop] = True
     root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
     quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
     logits[start:stop] = contacts.to_logits(planted[:count]).to(logits)
-    return replace(body, root_position=root, local_quat_xyzw=quats), logits, missed
+    return replace(body, root_position=root, local_quat_xyzw=quats), logits
 
 
 def _arrive(
@@ -98,19 +94,3 @@ def _arrive(
     offsets = interpolate_offsets(miss, firm, seconds=math.inf, fps=PRIOR_FPS)[2:-2]
     turns = rotations.from_rotation_vector(offsets[:, 3:].unflatten(1, (-1, 3)))
     return root + offsets[:, :3], rotations.multiply(quats, turns)
-
-
-def _warp_time(
-    made: Motion, planted: Bool[Tensor, "rolled 2"], own: int, count: int
-) -> tuple[Motion, Bool[Tensor, "frames 2"]]:
-    """Resample a motion of `own` frames, from the frame before to the one after them, to `count`; drop the rest."""
-    if own == count:
-        return made, planted
-    last = min(len(made.root_position) - 1, own)
-    at = (torch.arange(count + 1, dtype=torch.float64) + 1) * (own + 1) / (count + 1) - 1
-    at = at.clamp(0, last)
-    low, high = at.floor().long(), at.ceil().long()
-    share = (at - low)[:, None]
-    quats = rotations.slerp(made.local_quat_xyzw[low], made.local_quat_xyzw[high], share.expand(-1, made.num_joints))
-    root = torch.lerp(made.root_position[low], made.root_position[high], share)
-    return replace(made, root_position=root, local_quat_xyzw=quats), planted[at.round().long()]

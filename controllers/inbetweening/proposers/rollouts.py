@@ -22,9 +22,9 @@ from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import GapSource
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
-from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver
+from mapctl.problem.receding_horizon import RecedingHorizonSolver
 from mapctl.problem.warm_start import SteeringKnots, SwarmProposal
-from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow
+from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Density, DensityState, Inbetweener
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
@@ -54,14 +54,6 @@ class RolloutSettings:
     """Contact term."""
     shortest: int = 2
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
-    trajectory: float | None = None
-    """Sigma of the distance of the hips from the proposal's trajectory, metres; None leaves the trajectory free."""
-    stage: int = 0
-    """Frames that are solved first, then twice as many, and so on, each warm-started by the stage before: without that,
-    targets far ahead hardly turn the body. 0 solves all at once."""
-    tempo: float = 1.0
-    """Ratio of the rollout's length to the gap's before its time is warped to the gap's: below 1, it is slowed down.
-    Steps that would end too early or too late then end in time."""
     longest: int = 180
     """Frames of the longest gap that is rolled through; longer ones are left to the fallback."""
     method: LatentNoiseSolver = field(
@@ -126,8 +118,6 @@ class Rollout:
     """The whole motion at unit size, the gap filled."""
     contact_logits: Float[Tensor, "frames 2"]
     """Contact logits of the left and the right toe."""
-    missed: float
-    """Error at arrival before its correction, mean distance of the joints, metres."""
 
 
 @dataclass(eq=False)
@@ -164,16 +154,13 @@ class Roller:
         assert not isinstance(committed.state, tuple)
         self.state, self.done = committed.state, start
         arrival = self._build_arrival_target(start, stop, settings)
-        frames, targets = len(arrival.places), [arrival]
-        if settings.trajectory is not None:
-            targets.append(self._build_trajectory_target(start, stop, frames, settings))
-        solver = RecedingHorizonSolver(self.density, method=settings.method)
+        frames = len(arrival.places)
         noise = _sample_smooth_noise(frames, generator, settings)
-        window = _solve_in_stages(solver, committed, targets, noise, generator, settings)
-        body, logits, missed = insert_rollout(
-            self.body, self.contact_logits, window, committed.place, (start, stop), tempo=settings.tempo
-        )
-        return Rollout(start, self._hold_planted(body, logits, start, stop), logits, missed)
+        terms = (LatentPrior(settings.sigma_noise), settings.footing, arrival)
+        solver = RecedingHorizonSolver(self.density, method=settings.method)
+        window = solver.solve_window(replace(committed, warm_start=noise), terms, frames, generator=generator)
+        body, logits = insert_rollout(self.body, self.contact_logits, window, committed.place, (start, stop))
+        return Rollout(start, self._hold_planted(body, logits, start, stop), logits)
 
     def accept_rollout(self, rollout: Rollout) -> None:
         """Accept a rollout, from which later ones go on."""
@@ -187,23 +174,8 @@ class Roller:
         quats = torch.where(free[:, None, None], held.local_quat_xyzw, body.local_quat_xyzw)
         return replace(body, local_quat_xyzw=quats)
 
-    def _build_trajectory_target(self, start: int, stop: int, frames: int, settings: RolloutSettings) -> Keyframe:
-        """Build the target of the hips in the gap: the proposal's trajectory, in the rollout's own time."""
-        count = stop - start
-        own = max(1, round(count * settings.tempo))
-        at = (torch.arange(own) + 1) * (count + 1) / (own + 1) - 1
-        hips = self.body.root_position[start : start + count][at.round().long().clamp(0, count - 1)]
-        goals = torch.zeros(frames, CANONICAL.num_joints, 3)
-        asked = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
-        goals[:own, 0], asked[:own, 0] = hips.float(), True
-        return Keyframe(goals, asked, settings.trajectory or 1.0, name="trajectory")
-
     def _build_arrival_target(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
-        """Build the target of all joints in the known frames after the gap, and of effectors within it, in the
-        rollout's own time.
-        """
-        count = stop - start
-        own = max(1, round(count * settings.tempo))
+        """Build the target of all joints in the known frames after the gap, and of effectors within it."""
         part = slice(start, stop + settings.ahead)
         known = ~self.query.nothing_known[part]
         last = int(known.nonzero()[-1]) + 1
@@ -213,36 +185,7 @@ class Roller:
             own_targets = targets.wanted[part][:last]
             positions = torch.where(own_targets[..., None], targets.places[part][:last] / self.query.scale, positions)
             wanted = wanted | own_targets
-        if own == count:
-            return Keyframe(positions.float(), wanted, settings.sigma_arrival)
-        frames, joints = own + last - count, CANONICAL.num_joints
-        goals, asked = torch.zeros(frames, joints, 3), torch.zeros(frames, joints, dtype=torch.bool)
-        goals[own:], asked[own:] = positions[count:].float(), wanted[count:]
-        for frame in wanted[:count].any(dim=1).nonzero()[:, 0].tolist():
-            at = min(own - 1, round((frame + 1) * (own + 1) / (count + 1)) - 1)
-            goals[at], asked[at] = positions[frame].float(), wanted[frame]
-        return Keyframe(goals, asked, settings.sigma_arrival)
-
-
-def _solve_in_stages(
-    solver: RecedingHorizonSolver,
-    committed: CommittedFrames,
-    targets: Sequence[Keyframe],
-    noise: Tensor,
-    generator: torch.Generator,
-    settings: RolloutSettings,
-) -> SolvedWindow:
-    """Solve a rollout of as many frames as `noise` has towards the targets, the first frames alone first."""
-
-    def solve(frames: int) -> SolvedWindow:
-        part = slice(0, frames)
-        near = [replace(target, places=target.places[part], wanted=target.wanted[part]) for target in targets]
-        terms = (LatentPrior(settings.sigma_noise), settings.footing, *near)
-        return solver.solve_window(replace(committed, warm_start=noise[part]), terms, frames, generator=generator)
-
-    for frames in range(settings.stage, len(noise), settings.stage) if settings.stage else ():
-        noise = torch.cat([solve(frames).warm_start, noise[frames:]])
-    return solve(len(noise))
+        return Keyframe(positions.float(), wanted, settings.sigma_arrival)
 
 
 def _sample_smooth_noise(

@@ -32,10 +32,10 @@ class Chain(Command):
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
     inbetweener: options.MaybeName = None
-    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given."""
+    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
+    tweener is for long gaps, beside the bundled transformer."""
     path: options.MaybeName = None
-    """For --method tweener: the file or run folder of the path predictor that it was trained with; the bundled one if
-    not given."""
+    """The file or run folder of the path predictor that the tweener was trained with; the bundled one if not given."""
     video: options.MaybeFile = None
     """Film of the motion: .mp4, .gif or .png."""
     quiet: bool = False

@@ -20,7 +20,7 @@ def run(command: Chain) -> int:
     options.check_seed(command.seed)
     results.check_method(command.method, finish=not command.no_finish, inbetweener=command.inbetweener)
     results.check_destinations(command.out, command.video, given=command.clips)
-    if command.path is not None and command.method != "tweener":
+    if command.path is not None and not results.takes_path(command.method, command.inbetweener):
         raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
     dna = read_dna(command.dna, command.method)
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))

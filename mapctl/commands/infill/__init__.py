@@ -28,10 +28,9 @@ class Infill(Command):
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: options.Method = "auto"
-    """Method that proposes. auto: the transformer, a density's rollout through gaps in which it would slide, or a held
-    pose where the body stands still, the tweener through gaps of seconds; a note on each gap names it. transformer,
-    infiller, tweener: that network alone. rollouts: a density's rollouts, wherever nothing is known. slerp:
-    interpolation."""
+    """Method that proposes. auto: the transformer, the tweener through gaps of more than 6 s, or a held pose where the
+    body stands still; a note on each gap names it. transformer, infiller, tweener: that network alone. rollouts: a
+    density's rollouts, wherever nothing is known. slerp: interpolation."""
     dna: options.MaybeDna = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
     gaps with --method tweener, in those of 2 s and more without parts with auto."""
@@ -43,10 +42,10 @@ class Infill(Command):
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     inbetweener: options.MaybeName = None
-    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given."""
+    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
+    tweener is for long gaps, beside the bundled transformer."""
     path: options.MaybeName = None
-    """For --way and --method tweener: the file or run folder of a trained path predictor; the bundled one if not
-    given."""
+    """For --way and the tweener: the file or run folder of a trained path predictor; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier. It extrapolates a gap at the end (`auto` if none is

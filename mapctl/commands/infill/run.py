@@ -41,7 +41,7 @@ def _check(command: Infill) -> None:
     options.check_seed(command.seed)
     if command.way and command.curve is not None:
         raise RequestError("--way and --curve both say where the hips go; choose one")
-    if command.path is not None and not command.way and command.method != "tweener":
+    if command.path is not None and not command.way and not results.takes_path(command.method, command.inbetweener):
         raise RequestError("--path predicts the hips' place for --way and for --method tweener; leave it out")
     if command.curve is not None and command.method in ("slerp", "rollouts"):
         raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")

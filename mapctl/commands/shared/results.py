@@ -43,12 +43,24 @@ def check_method(method: str, *, finish: bool, prior: str | None = None, inbetwe
         raise RequestError("--method slerp knows no network; leave --inbetweener out")
 
 
+def takes_path(method: str, inbetweener: str | None) -> bool:
+    """Return whether a method may ask a path predictor: tweeners do, and the one that `auto` is given."""
+    return method == "tweener" or (method == "auto" and _is_tweener(inbetweener))
+
+
+def _is_tweener(inbetweener: str | None) -> bool:
+    return inbetweener is not None and priors.find_inbetweener_kind(inbetweener) == "tweener"
+
+
 def load_models(
     inbetweener: str | None, prior: str | None, path: str | None = None, dna: Sequence[Example] = ()
 ) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones, tweeners in a style if there is one; RequestError
-    for a network that is not of the kind that the method asks for, and for classes that are not known.
+    for a network that is not of the kind that the method asks for, and for classes that are not known. A named tweener
+    is, for `auto`, the one that it takes in long gaps.
     """
+
+    is_tweener = _is_tweener(inbetweener)
 
     def load_network(method: str) -> Inbetweener:
         if method == "infiller" and inbetweener is None:
@@ -56,7 +68,9 @@ def load_models(
                 "no infiller is bundled; name one that `mapctl train infiller` made by --inbetweener RUN"
             )
         usual = "tweener" if method == "tweener" else "transformer"
-        network = priors.load_inbetweener(inbetweener or usual, path or "path")
+        # Of a named tweener `auto` makes its own for long gaps.
+        named = None if method == "auto" and is_tweener else inbetweener
+        network = priors.load_inbetweener(named or usual, path or "path")
         kinds = {"infiller": "infiller", "transformer": "pose-transformer", "tweener": "tweener"}
         wanted = kinds.get(method, network.card.kind)
         if network.card.kind != wanted:
@@ -64,7 +78,7 @@ def load_models(
         return tell_style(network, dna)
 
     def load_tweener() -> Inbetweener:
-        return tell_style(priors.load_tweener(), dna)
+        return tell_style(priors.load_tweener((is_tweener and inbetweener) or "tweener", path or "path"), dna)
 
     return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"), load_tweener)
 

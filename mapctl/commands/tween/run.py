@@ -91,7 +91,7 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
         raise RequestError(f"{unused[0]} is for motion files; {command.source} says itself what its keys are")
     if not _is_key_file(command) and command.keyframes is None:
         raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-    if command.path is not None and command.method != "tweener":
+    if command.path is not None and not results.takes_path(command.method, command.inbetweener):
         raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
     variations.check_answers(command, given)
     # Variations are rollouts of a density with every method.

@@ -64,7 +64,7 @@ def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) ->
     """Make several motions and keep the one with the lowest energy."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("answers", quiet=command.quiet) as progress:
-        rollouts = RolloutInbetweener(models.densities(), models.network("auto"))
+        rollouts = RolloutInbetweener(models.densities(), models.network("rollouts"))
         return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
 
 
@@ -77,7 +77,7 @@ def run_variations(
         first = build_inbetweener(command.method, models)
         # Where there are styles the density only tells energies.
         styles = _prepare_styles(command, first, dna)
-        rollouts = RolloutInbetweener(models.densities(), first if styles else models.network("auto"))
+        rollouts = RolloutInbetweener(models.densities(), first if styles else models.network("rollouts"))
         found = sample_variations(
             make, first, rollouts, command.variations, generator=generator, styles=styles, progress=progress
         )
