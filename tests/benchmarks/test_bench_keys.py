@@ -194,7 +194,10 @@ def test_the_command_measures_the_parts_that_are_asked_for(tmp_path, capsys):
     assert run("bench", "tweener", *words, *small, "--part", "apart") == 2
     assert "ask for more --sequences" in capsys.readouterr().err
     assert run("bench", "tweener", *words, "--part", "keys,price") == 2
-    assert "--part takes path, gaps, spectrum, keys, apart, dna, speed or all; got price" in capsys.readouterr().err
+    assert (
+        "--part takes path, gaps, spectrum, keys, partial, apart, dna, speed or all; got price"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_command_prints_rows_for_a_page(tmp_path, capsys):

@@ -94,11 +94,19 @@ def measure_gap(clip: Motion, method: Method, known: Bool[Tensor, " frames"]) ->
     """Measure what a method makes of the frames that are not known, of a canonical clip at PRIOR_FPS."""
     keys = Keys(tuple(known.nonzero()[:, 0].tolist()))
     done = tween(clip, keys, method.inbetweener, settings=method.settings)
-    true, made, inside = _see(clip), _see(done.motion), ~known
-    off = (done.motion.root_position - clip.root_position)[inside][:, ::2].norm(dim=-1)
+    return compare_with_mocap(done.motion, clip, ~known, seconds=done.seconds)
+
+
+def compare_with_mocap(
+    motion: Motion, clip: Motion, inside: Bool[Tensor, " frames"], *, seconds: float = 0.0
+) -> GapSums:
+    """Measure a motion that was made in so many seconds beside mocap of the same frames, errors and liveliness in the
+    frames that are inside gaps."""
+    true, made = _see(clip), _see(motion)
+    off = (motion.root_position - clip.root_position)[inside][:, ::2].norm(dim=-1)
     last = (made - true)[inside][-1].norm(dim=-1)
     ours, theirs = (
-        ToeMeasurements.of(each.joint_positions()[:, list(TOE_JOINTS)], float(each.fps)) for each in (done.motion, clip)
+        ToeMeasurements.of(each.joint_positions()[:, list(TOE_JOINTS)], float(each.fps)) for each in (motion, clip)
     )
     lost = inside.nonzero()[:, 0].tolist()
     return GapSums(
@@ -112,8 +120,8 @@ def measure_gap(clip: Motion, method: Method, known: Bool[Tensor, " frames"]) ->
         true_planted=float(theirs.planted[1:].sum()),
         sliding=100 * float(ours.speed[ours.planted[1:]].sum()),
         true_sliding=100 * float(theirs.speed[theirs.planted[1:]].sum()),
-        key_jerk=measure_key_jerk(done.motion, clip, (lost[0], lost[-1] + 1)),
-        seconds=done.seconds,
+        key_jerk=measure_key_jerk(motion, clip, (lost[0], lost[-1] + 1)),
+        seconds=seconds,
     )
 
 

@@ -143,7 +143,7 @@ class Tween(MocapTable):
 @dataclass(frozen=True, kw_only=True)
 class Tweener(Table):
     """The tables of Zhou et al. 2020 over clips that training did not see, all or some of them: how well the hips'
-    trajectory is told, long gaps, keys that are missed, seconds told from mocap, and speed."""
+    trajectory is told, long gaps, keys that are missed or no whole poses, seconds told from mocap, and speed."""
 
     work = "mapctl.commands.bench.tweener.run"
 
@@ -151,8 +151,9 @@ class Tweener(Table):
     """The folder that was trained on, for the clips that were held out."""
     part: Annotated[str, arg(metavar="PART,PART,...")] = "all"
     """Tables to measure: path (table 2), gaps (between two poses of a clip), spectrum (speed by frequency in these
-    gaps, figure 8), keys (table 4, before they are made exact, and gaps with a past), apart (made seconds told from
-    mocap's), dna (the same keys under that of several clips), speed (table 3)."""
+    gaps, figure 8), keys (table 4, before they are made exact, and gaps with a past), partial (halves, places and
+    drawings every 2 s), apart (made seconds told from mocap's), dna (the same keys under that of several clips), speed
+    (table 3)."""
     count: options.Count = 300
     """Clips, spread over the kinds."""
     path: options.Name = "path"

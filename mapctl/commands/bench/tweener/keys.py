@@ -1,13 +1,17 @@
-"""Table 4: keys before they are made exact, gaps with a past, and made seconds told from mocap's."""
+"""Table 4: keys before they are made exact, gaps with a past, and made seconds told from mocap's; and keys that are no
+whole poses."""
 
 import priors
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.shared.tables import Row
+from controllers.benchmarks.tweener.gap_measures import Method
 from controllers.benchmarks.tweener.gaps_with_past import benchmark_gaps_with_past
+from controllers.benchmarks.tweener.partial_keys import benchmark_partial_keys
 from controllers.benchmarks.tweener.spliced_keys import benchmark_spliced_keys
 from controllers.benchmarks.tweener.told_apart import benchmark_told_apart
+from controllers.inbetweening.pipeline import InfillSettings
 from mapctl.commands.bench import Tweener
-from mapctl.commands.bench.tweener.methods import list_methods
+from mapctl.commands.bench.tweener.methods import build_auto, list_methods
 from mapctl.commands.bench.tweener.sequences import LONG_GAPS, SINGLE_KEYS, HeldOutClips
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.features import PRIOR_FPS
@@ -36,6 +40,16 @@ def measure_apart(table: Tweener) -> dict[str, list[Row]]:
     with show_progress("told apart") as progress:
         rows = benchmark_told_apart(sequences, held.clips, list(list_methods(table)), progress=progress)
     return {"told apart": rows}
+
+
+def measure_partial(table: Tweener) -> dict[str, list[Row]]:
+    """Measure keys that are halves, places or drawings: by the tweener alone, and by what `--method auto` does."""
+    tweener = priors.load_tweener(table.tweener, table.path)
+    methods = [Method(table.tweener, tweener, InfillSettings(finish=False))]
+    methods += [] if table.raw else [build_auto(table)]
+    with show_progress("partial keys") as progress:
+        rows = benchmark_partial_keys(load_kinds(table), methods, progress=progress)
+    return {"partial keys": rows}
 
 
 def load_kinds(table: Tweener) -> dict[str, list[Motion]]:

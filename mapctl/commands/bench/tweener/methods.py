@@ -20,8 +20,13 @@ def list_methods(table: Tweener, *, auto: bool = False) -> Iterator[Method]:
         if not table.raw:
             yield Method(f"{each}, and MAP", inbetweener)
     if auto and not table.raw and table.baselines:
-        tweener, network = priors.load_tweener(table.tweener, table.path), priors.load_inbetweener()
-        yield Method("auto", AutoInbetweener(network, priors.load_choice("auto"), tweener=tweener))
+        yield build_auto(table)
+
+
+def build_auto(table: Tweener) -> Method:
+    """Build what `--method auto` does, with the tweener that is measured."""
+    tweener, network = priors.load_tweener(table.tweener, table.path), priors.load_inbetweener()
+    return Method("auto", AutoInbetweener(network, priors.load_choice("auto"), tweener=tweener))
 
 
 def _find_raw(inbetweener: Inbetweener) -> RawProposal | None:

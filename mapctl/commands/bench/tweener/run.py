@@ -13,6 +13,7 @@ PARTS: Mapping[str, Callable[[Tweener], Mapping[str, list[Row]]]] = {
     "gaps": gaps.measure,
     "spectrum": gaps.measure_spectrum,
     "keys": keys.measure_keys,
+    "partial": keys.measure_partial,
     "apart": keys.measure_apart,
     "dna": dna.measure,
     "speed": speed.measure,
