@@ -42,8 +42,8 @@ class KeySums:
     """The same of an interpolation between whole poses at these keys."""
     missed: float
     """Largest distance of what a key tells in the world, cm."""
-    off: tuple[float, float, float]
-    """Sums over drawings of mean distances of joints, from the hips, cm: in the plane, in space, and of a flat pose."""
+    off: tuple[float, ...]
+    """Three sums over drawings of mean distances of joints, from the hips, cm: in the plane, in space, and of a flat pose."""
     drawings: int
     """How many drawings."""
     step: float
