@@ -43,7 +43,7 @@ class KeySums:
     missed: float
     """Largest distance of what a key tells in the world, cm."""
     off: tuple[float, ...]
-    """Three sums over drawings of mean distances of joints, from the hips, cm: in the plane, in space, and of a flat pose."""
+    """Sums over drawings of mean distances of joints, from the hips, cm: in the plane, in space, and of a flat pose."""
     drawings: int
     """How many drawings."""
     step: float

@@ -1,8 +1,8 @@
 """Choice of the proposer of each gap: a network, a tweener where the gap is longer than that network fills, a held pose
 where the body stands still.
 
-Rollouts of a density have no part in it: their feet slide less as proposed, but the MAP stage plants the feet of either,
-and then the pose transformer's answer is nearer to mocap in all that it fills.
+Rollouts of a density have no part in it: their feet slide less as proposed, but the MAP stage plants the feet of
+either, and then the pose transformer's answer is nearer to mocap in all that it fills.
 """
 
 from collections.abc import Sequence
