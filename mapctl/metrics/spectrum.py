@@ -20,9 +20,8 @@ def measure_speed_by_band(places: Float[Tensor, "frames joints 3"], fps: float) 
     if len(places) < 3:
         raise ValueError(f"a spectrum takes 3 frames at least, got {len(places)}")
     velocities = 100 * fps * numpy.diff(places.detach().double().numpy(), axis=0)
-    frequencies, power = signal.periodogram(
-        velocities, fps, window="hann", detrend=False, scaling="density", axis=0
-    )  # (cm/s)^2 a Hz
+    density = signal.periodogram(velocities, fps, "hann", detrend=False, axis=0)  # pyright: ignore[reportArgumentType]
+    frequencies, power = density  # (cm/s)^2 a Hz
     by_frequency = power.sum(axis=-1).mean(axis=-1) * (frequencies[1] - frequencies[0])
     edges = numpy.array([low for low, _ in BANDS_HZ])
     bands = numpy.searchsorted(edges, frequencies, side="right") - 1

@@ -96,7 +96,7 @@ def _follow(
     facing: Tensor,
     legs: _Legs,
     share: Float[Tensor, " legs"],
-    curve: tuple[Tensor, Tensor, Tensor, Tensor],
+    curve: tuple[Tensor, ...],
     begins: Float[Tensor, " legs"],
 ) -> tuple[Tensor, Tensor]:
     """Follow the curves evenly, as far as each one's share; the curves begin at these headings."""
