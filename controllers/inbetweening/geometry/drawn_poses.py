@@ -59,13 +59,15 @@ def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool, settings: Fit
 
 def measure_drawing_error(places: Float[Tensor, "joints 3"], loose: LooseKeys, frame: int) -> float:
     """Measure how far drawn joints are on average from where they are drawn, metres, the drawing moved and scaled to
-    the best fit."""
+    the best fit, and all as large as the body is in space: one that folds up to look small is no nearer for it."""
     drawn = loose.drawn[frame]
     seen = places[drawn].double() @ view_axes(loose.view[frame]).double().mT
     sketch = loose.sketch[frame, drawn].double()
     seen, sketch = seen - seen.mean(dim=0), sketch - sketch.mean(dim=0)
     scale = (seen * sketch).sum() / sketch.square().sum().clamp_min(1e-12)
-    return float((seen - scale * sketch).norm(dim=-1).mean())
+    body = places[drawn].double()
+    size = (body - body.mean(dim=0)).norm() / seen.norm().clamp_min(1e-12)
+    return float(size * (seen - scale * sketch).norm(dim=-1).mean())
 
 
 @dataclass(frozen=True, eq=False)
