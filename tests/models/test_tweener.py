@@ -16,6 +16,7 @@ from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.auto import ChoiceSettings
 from mapctl import motion_dna, rotations
 from mapctl.errors import CheckpointError
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
@@ -167,6 +168,26 @@ def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     assert {source.by for source in plain.propose(query).attribute(query)} == {"slerp"}
     still = query_of(standing(200), (1, 199))
     assert [source.by for source in auto.propose(still).attribute(still)] == ["standing still"]
+
+
+def test_auto_leaves_long_gaps_to_it_that_have_partial_keys_within():
+    """A network that fills less would leap to the hand, or away from it."""
+    motion, told = walk(200), (1, 190)
+    auto = AutoInbetweener(SlerpInbetweener(), settings=ChoiceSettings(long=75), tweener=tiny_tweener())
+    query = query_of(motion, told)
+    wanted = torch.zeros(200, 21, dtype=torch.bool)
+    wanted[90, CANONICAL.index("leftHand")] = True
+    handed = replace(query, effector_targets=EffectorTargets(motion.joint_positions() + 0.1, wanted))
+    made = auto.propose(handed)
+    assert [source.by for source in made.attribute(handed)] == ["tweener"]
+    free = auto.propose(query).motion.joint_positions()
+    assert float((made.motion.joint_positions() - free)[90].norm(dim=-1).max()) > 1e-3
+    joints, root = query.missing.joints.clone(), query.missing.root.clone()
+    joints[90, 0] = root[90] = False
+    hips = replace(query, missing=MissingMask(joints, root))
+    made = auto.propose(hips)
+    assert [source.by for source in made.attribute(hips)] == ["tweener", "tweener"]
+    assert float((made.motion.root_position - motion.root_position)[90, ::2].abs().max()) < 1e-9
 
 
 def test_it_goes_with_the_path_predictor_that_it_was_trained_with(tmp_path):

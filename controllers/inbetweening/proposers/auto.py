@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from controllers.inbetweening.proposers.extrapolation import extrapolate_end
+from controllers.inbetweening.proposers.partial_keys import hide_partial_keys, propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
@@ -31,7 +32,7 @@ class ChoiceSettings:
     """Lengths of gaps from which others than the network propose, and what counts as standing still."""
 
     long: int = 181
-    """Frames of the shortest gap between whole poses that is a tweener's."""
+    """Frames of the shortest gap between whole poses, with partial keys in it or none, that is a tweener's."""
     styled: int = 60
     """And where the tweener was told a style: in less than 2 s there is no room for one."""
     held: int = 46
@@ -85,16 +86,16 @@ class AutoInbetweener(Inbetweener):
             walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
             return walked or (self.tweener or self.network).propose(query, generator=generator)
         made = self.network.propose(query, generator=generator)
-        long = [gap for gap in query.enclosed_gaps if self._is_tweeners(query, *gap)]
+        long = [gap for gap in hide_partial_keys(query).enclosed_gaps if self._is_tweeners(query, *gap)]
         if long and self.tweener is not None:
-            made = _fill_from(self.tweener.propose(query, generator=generator), made, long)
+            made = _fill_from(propose_through_keys(query, self.tweener, generator)[0], made, query, long)
         for gap in query.enclosed_gaps:
             # Who was told to move in a style moves; tweeners let others tremble.
-            held = not self.has_style if gap in long else _goes_astray(query, made, gap, self.settings)
+            held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap, self.settings)
             if held and _is_standing_still(query, *gap, self.settings):
                 made = _hold_pose(query, made, gap)
         if self.has_style:
-            made = _note_no_style(query, made, [gap for gap in query.enclosed_gaps if gap not in long])
+            made = _note_no_style(query, made, [gap for gap in query.enclosed_gaps if not _is_within(gap, long)])
         return extrapolate_end(query, made, self.densities, RolloutSettings())
 
     def _is_tweeners(self, query: GapQuery, start: int, stop: int) -> bool:
@@ -102,18 +103,21 @@ class AutoInbetweener(Inbetweener):
         if self.tweener is None or query.keep_trajectory:
             return False
         shortest = self.settings.styled if self.has_style else self.settings.long
-        return stop - start >= shortest and not _has_partial_keys(query, start, stop)
+        return stop - start >= shortest and not _is_beside_part(query, start, stop)
 
 
-def _has_partial_keys(query: GapQuery, start: int, stop: int) -> bool:
-    """Return whether a hand or a foot has a target in a gap, or a frame beside it is known in part."""
-    targets, missing = query.effector_targets, query.missing
+def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
+    """Return whether a frame beside a gap is known in part."""
     edges = [start - 1, stop]
-    partly = missing.joints[edges].any() | missing.root[edges].any()
-    return bool(partly) or (targets is not None and bool(targets.wanted[start:stop].any()))
+    return bool(query.missing.joints[edges].any() | query.missing.root[edges].any())
 
 
-def _fill_from(proposal: Proposal, made: Proposal, gaps: Sequence[tuple[int, int]]) -> Proposal:
+def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
+    """Return whether a gap is one of others, or between partial keys in one of them."""
+    return any(start <= gap[0] and gap[1] <= stop for start, stop in gaps)
+
+
+def _fill_from(proposal: Proposal, made: Proposal, query: GapQuery, gaps: Sequence[tuple[int, int]]) -> Proposal:
     """Fill gaps as another proposal has them."""
     root, quats = made.motion.root_position.clone(), made.motion.local_quat_xyzw.clone()
     logits = made.contact_logits.clone()
@@ -122,7 +126,8 @@ def _fill_from(proposal: Proposal, made: Proposal, gaps: Sequence[tuple[int, int
         root[part], quats[part] = proposal.motion.root_position[part], proposal.motion.local_quat_xyzw[part]
         logits[part] = proposal.contact_logits[part].to(logits)
     reasons = {other.start: other.reason for other in proposal.others}
-    others = tuple(GapSource(*gap, proposal.source, reasons.get(gap[0], "")) for gap in gaps)
+    filled = [gap for gap in query.enclosed_gaps if _is_within(gap, gaps)]
+    others = tuple(GapSource(*gap, proposal.source, reasons.get(gap[0], "")) for gap in filled)
     motion = replace(made.motion, root_position=root, local_quat_xyzw=quats)
     return replace(made, motion=motion, contact_logits=logits, others=(*made.others, *others))
 
@@ -131,7 +136,9 @@ def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceS
     """Return whether the body has the same whole pose and position before and after a gap, and is at rest in known
     frames beside it.
     """
-    if stop - start < settings.held or query.keep_trajectory or _has_partial_keys(query, start, stop):
+    targets = query.effector_targets
+    told = targets is not None and bool(targets.wanted[start:stop].any())
+    if stop - start < settings.held or query.keep_trajectory or told or _is_beside_part(query, start, stop):
         return False
     positions, unknown = query.motion.joint_positions(), query.missing.frames
     apart = float((positions[stop] - positions[start - 1]).norm(dim=-1).mean())
@@ -154,7 +161,7 @@ def _hold_pose(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> Proposa
     part, logits = slice(*gap), made.contact_logits.clone()
     toes = query.motion.joint_positions()[part, _TOES, 1]
     logits[part] = contacts.to_logits(toes < toes.amin() + _PLANTED_HEIGHT).to(logits)
-    return _fill_from(Proposal(query.motion, logits, STANDING_STILL), made, [gap])
+    return _fill_from(Proposal(query.motion, logits, STANDING_STILL), made, query, [gap])
 
 
 def _note_no_style(query: GapQuery, made: Proposal, gaps: Sequence[tuple[int, int]]) -> Proposal:

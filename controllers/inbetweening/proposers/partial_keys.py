@@ -48,8 +48,16 @@ _TRUNK = [joint for joint in range(CANONICAL.num_joints) if joint not in _ARMS] 
 _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
+def hide_partial_keys(query: GapQuery) -> GapQuery:
+    """Return a query in which keys that give only positions of hands, feet or hips are missing like what is about
+    them."""
+    hips = _find_root_only_keys(query)
+    joints = query.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
+    return replace(query, missing=MissingMask(joints, query.missing.root | hips), effector_targets=None)
+
+
 def propose_through_keys(
-    query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator
+    query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator | None
 ) -> tuple[Proposal, EffectorTargets | None]:
     """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
     return the targets, moved within reach where they are not.
@@ -60,9 +68,7 @@ def propose_through_keys(
         return inbetweener.propose(query, generator=generator), targets
     if inbetweener.takes_partial_keys:
         return _reach_exactly(query, inbetweener.propose(query, generator=generator), wanted)
-    joints = query.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
-    blind = replace(query, missing=MissingMask(joints, query.missing.root | hips), effector_targets=None)
-    guided = blind
+    blind = guided = hide_partial_keys(query)
     if bool(query.missing.root.any()):
         first = inbetweener.rough.propose(blind, generator=generator).motion
         guided = _interpolate_trajectory(query, blind, first, targets, hips)
