@@ -161,3 +161,27 @@ def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*b
         ],
         dim=-1,
     )
+
+
+def reversed_features(features: Float[Tensor, "*batch frames size"]) -> Float[Tensor, "*batch frames size"]:
+    """Return the features of the motion run backwards, as `encode` finds them in it, in units of LAYOUT.
+
+    A frame's step, turn and contacts tell how it was reached, so backwards the frame after it tells them: the step as
+    -R(-turn) step, in the heading at which it ended, the turn as its negative, the contacts as they are. All else stays
+    with its frame. The first frame repeats the second's, as in `encode`; how the given first frame was reached is
+    dropped, and is all that twice does not give back. The motion begins at `GroundPose.before` of the given last ground
+    pose, by the first step and turn that are returned.
+
+    Equal to `encode` of the reversed motion but for contacts, now and then, at the frame where one begins or ends: how
+    low a toe is belongs to the frame, how slow it is to the way there, and features hold only whether it is both. For
+    the side that walks back from the target (Ren et al. 2024, section 3.2). Raises MapctlError for fewer than two
+    frames.
+    """
+    if features.shape[-2] < 2:
+        raise MapctlError("features of a motion run backwards need at least two frames")
+    back = features.flip(-2)
+    left = torch.cat([back[..., :1, :], back[..., :-1, :]], dim=-2)  # how the frame after was reached
+    turn = LAYOUT.pick(left, "heading_change")
+    step = -rotations.rotate_ground(LAYOUT.pick(left, "root_displacement_heading"), -turn[..., 0])
+    held = back[..., LAYOUT.slices["root_height"].start : LAYOUT.continuous]
+    return torch.cat([step, -turn, held, LAYOUT.pick(left, "contacts")], dim=-1)
