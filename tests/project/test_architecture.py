@@ -16,7 +16,7 @@ PROCESSES = {"joblib", "joblib.Parallel", "joblib.delayed"}  # of an unpickler, 
 MAX_LINES = 400
 FLOORS = {
     "mapctl": (
-        "joint_ranges mesh numerics solver",
+        "contacts joint_ranges mesh numerics solver",
         "formats kinematics",
         "curves retarget",
         "intent motion_dna recording terms",

@@ -1,0 +1,157 @@
+"""Local phases on steps whose period, order and stillness are known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import CADENCE, walk
+
+from mapctl.contacts.phases import REACH, compute_phases, mirror_phases, reversed_phases
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, encode, mirror_features, reversed_features
+
+PERIODS = [(30, 0.6), (33, 0.6), (22, 0.35), (40, 0.65)]
+each_gait = pytest.mark.parametrize(("period", "duty"), PERIODS)
+
+
+def steps(frames, period, duty, begin=0.0):
+    """Two toes that stand this share of each period, the right one half a period after the left; the left toe is put
+    down at frame `begin`."""
+    share = ((torch.arange(frames)[:, None] - begin) / period - torch.tensor([0.0, 0.5])) % 1
+    return share < duty
+
+
+def angles(phases):
+    """Phases of both toes, degrees, unwrapped along frames."""
+    pairs = phases.unflatten(-1, (2, 2)).numpy()
+    return np.degrees(np.unwrap(np.arctan2(pairs[..., 1], pairs[..., 0]), axis=0))
+
+
+def amplitudes(phases):
+    return phases.unflatten(-1, (2, 2)).norm(dim=-1)
+
+
+def apart(first, second):
+    """Angles between phases, degrees, in 0 to 180."""
+    return np.abs((first - second + 180) % 360 - 180)
+
+
+@each_gait
+def test_a_period_is_360_degrees(period, duty):
+    angle = angles(compute_phases(steps(8 * period, period, duty)))
+    inner = slice(2 * period, 5 * period + 1, period)
+    np.testing.assert_allclose(np.diff(angle[inner], axis=0), 360, atol=4)
+    middle = angle[2 * period : 6 * period]
+    assert (np.diff(middle, axis=0) > 0).all()
+    line = middle[:1] + 360 * np.arange(4 * period)[:, None] / period
+    assert np.abs((middle - line) - (middle - line).mean(axis=0)).max() < 20
+
+
+@each_gait
+def test_the_phase_is_0_amid_the_stance_and_180_amid_the_swing(period, duty):
+    angle = angles(compute_phases(steps(8 * period, period, duty)))[:, 0]
+    frame = np.arange(len(angle))
+    begins = 3 * period - 0.5  # half a frame before the first planted one
+    stance, swing = begins + duty * period / 2, begins + (1 + duty) * period / 2
+    assert apart(np.interp(stance, frame, angle), 0) < 8
+    assert apart(np.interp(swing, frame, angle), 180) < 8
+
+
+@each_gait
+def test_toes_of_a_walk_are_half_a_period_apart(period, duty):
+    angle = angles(compute_phases(steps(8 * period, period, duty)))[2 * period : 6 * period]
+    # an odd period has no half in whole frames, and a stance runs ahead where the other's swing runs behind
+    assert abs(apart(angle[:, 0], angle[:, 1]).mean() - 180) < 25
+    shift = period // 2
+    if period % 2 == 0:
+        assert apart(angle[shift:, 1], angle[:-shift, 0]).max() < 5
+
+
+def test_the_procedural_walk_steps_at_its_cadence():
+    for cadence in (0.8 * CADENCE, CADENCE):
+        planted = LAYOUT.pick(encode(walk(240, turn_rate=0.4, cadence=cadence))[0], "contacts")
+        angle = angles(compute_phases(planted))[45:-45]
+        slope = np.polyfit(np.arange(len(angle)), angle, 1)[0]
+        np.testing.assert_allclose(slope, 360 * cadence / 30, rtol=0.02)
+        assert apart(angle[:, 0], angle[:, 1]).mean() > 140
+
+
+@pytest.mark.parametrize("frames", [1, 2, 30, 61, 200])
+@pytest.mark.parametrize("bit", [False, True])
+def test_a_foot_that_only_stands_or_never_stands_has_none(frames, bit):
+    assert not compute_phases(torch.full((frames, 2), bit)).any()
+
+
+def test_standing_before_and_after_steps_has_none_and_it_fades_without_a_leap():
+    planted = torch.ones(260, 2, dtype=torch.bool)
+    planted[100:160] = steps(60, 30, 0.6)
+    planted[:, 1] = True  # the right toe stands throughout
+    phases = compute_phases(planted)
+    size = amplitudes(phases)
+    assert not size[:, 1].any()
+    still = 12 + REACH  # the Gaussian ends four deviations from a change
+    assert not size[: 100 - still].any()
+    assert not size[160 + still :].any()
+    assert float(size[110:150, 0].min()) > 0.7
+    assert float(size[80:100, 0].max()) > 0.1
+    assert float(phases.diff(dim=0).abs().max()) < 0.6  # 1.7 of amplitude at 12 degrees a frame is 0.4
+
+
+@each_gait
+def test_in_a_window_cut_out_they_differ_near_its_ends_alone(period, duty):
+    """What the docstring says of the ends, over all ways to cut."""
+    whole = compute_phases(steps(12 * period, period, duty))
+    wrong = []
+    for begin in range(4 * period, 5 * period):
+        cut = slice(begin, begin + 3 * REACH)
+        found = compute_phases(steps(12 * period, period, duty)[cut])
+        wrong.append(apart(angles(found), angles(whole[cut]))[:, 0])
+    error = np.sqrt(np.square(wrong).mean(axis=0))
+    assert error[0] < 65
+    assert error[5:-5].max() < 27
+    assert error[20:-20].max() < 10
+
+
+def test_backwards_the_phase_runs_the_other_way():
+    planted = steps(150, 30, 0.6, begin=7.0)
+    there, back = compute_phases(planted), compute_phases(planted.flip(0))
+    torch.testing.assert_close(back, there.flip(0) * torch.tensor([1.0, -1, 1, -1]).double(), atol=1e-9, rtol=0)
+    assert (np.diff(angles(back)[REACH:-REACH], axis=0) > 0).all()  # it is a walk, too
+    assert (np.diff(angles(reversed_phases(there))[REACH:-REACH], axis=0) > 0).all()
+
+
+def test_beside_reversed_features_they_are_reversed_phases():
+    features = encode(walk(240, turn_rate=0.4))[0]
+    there, back = (compute_phases(LAYOUT.pick(each, "contacts")) for each in (features, reversed_features(features)))
+    found = reversed_phases(there)
+    assert torch.equal(found[0], found[1])
+    torch.testing.assert_close(found[REACH:-REACH], back[REACH:-REACH], atol=0.06, rtol=0)
+    assert float((there.flip(0) - back)[REACH:-REACH].abs().max()) > 0.3  # which the frames in reverse are not
+    batch = torch.stack([there, mirror_phases(there)])
+    assert torch.equal(reversed_phases(batch)[0], found)
+    torch.testing.assert_close(reversed_phases(found)[1:], there[1:])
+
+
+def test_mirroring_exchanges_the_toes():
+    features = encode(walk(120, turn_rate=0.4))[0]
+    there = compute_phases(LAYOUT.pick(features, "contacts"))
+    mirrored = compute_phases(LAYOUT.pick(mirror_features(features), "contacts"))
+    torch.testing.assert_close(mirror_phases(there), mirrored, atol=1e-12, rtol=0)
+    assert torch.equal(mirrored, there[:, [2, 3, 0, 1]])
+    assert not torch.equal(mirrored, there)
+
+
+def test_the_same_contacts_give_the_same_bytes_whatever_their_type():
+    planted = steps(100, 30, 0.6)
+    once = compute_phases(planted)
+    assert torch.equal(compute_phases(planted), once)
+    assert torch.equal(compute_phases(planted.float()), once)
+    assert once.dtype == torch.float64
+    assert once.shape == (100, 4)
+
+
+@pytest.mark.parametrize("wrong", [torch.zeros(0, 2), torch.tensor([[0.0, math.nan], [1.0, 1.0]])])
+def test_no_frames_and_contacts_that_are_not_finite_are_refused(wrong):
+    with pytest.raises(RequestError, match="at least one frame of finite contacts"):
+        compute_phases(wrong)
