@@ -15,6 +15,7 @@ from mapctl.commands.train.options import TrainOptions
 from mapctl.commands.train.path import TrainPath
 from mapctl.commands.train.pose_transformer import TrainPoseTransformer
 from mapctl.commands.train.refiner import TrainRefiner
+from mapctl.commands.train.stitcher import TrainStitcher
 from mapctl.commands.train.tweener import TrainTweener
 
 MODELS: tuple[type[TrainOptions], ...] = (
@@ -26,6 +27,7 @@ MODELS: tuple[type[TrainOptions], ...] = (
     TrainKeyframeTiming,
     TrainPath,
     TrainTweener,
+    TrainStitcher,
 )
 """Whatever can be trained: the options of each recipe in `priors.training.recipes`."""
 

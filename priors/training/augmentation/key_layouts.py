@@ -85,7 +85,7 @@ def draw_windows(
     """Draw windows of single clips, half of them up to the share `tempo` slower or faster, and keys in them."""
     varied = torch.rand(batch, generator=generator) < 0.5
     pace = torch.where(varied, 1 + tempo * (2 * torch.rand(batch, generator=generator) - 1), 1.0)
-    clip, first = windows.pick(1 + ((frames - 1) * pace).ceil().long(), generator)
+    clip, first = windows.picker.pick(1 + ((frames - 1) * pace).ceil().long(), generator)
     motion = windows.at(clip, first, frames, pace)
     rolls = _roll(generator)
     known = torch.zeros(batch, frames, dtype=torch.bool)
@@ -162,7 +162,7 @@ def _splice(
 
 def _begin(windows: PoseWindows, settings: KeySettings, rolls: Iterator[float], generator: torch.Generator) -> _Part:
     run = _draw_run(settings, rolls)
-    clip, first = (int(each) for each in windows.pick(torch.tensor([run]), generator))
+    clip, first = (int(each) for each in windows.picker.pick(torch.tensor([run]), generator))
     turn = 2 * math.pi * next(rolls)
     shift = -rotations.rotate_ground(windows.ground[windows.starts[clip] + first], torch.tensor(turn))
     return _Part(clip, 0, first, 0, run, 0, turn, shift)

@@ -39,39 +39,17 @@ class Variation:
     """Share of windows that vary."""
 
 
-class PoseWindows:
-    """Draws windows from a corpus."""
+class WindowPicker:
+    """Picks where windows begin in a corpus, clips of every kind alike."""
 
     def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
         """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
         frames, 1 the same number of each kind.
         """
-        self.lengths, self.starts = corpus.locate_clips()
-        self.ground, self.heading = corpus.integrate_roots()
-        self.height = LAYOUT.pick(corpus.features, "root_height")
-        self.contacts = LAYOUT.pick(corpus.features, "contacts")
-        poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
-        self.quats = torch.cat([rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses])
+        self.lengths = corpus.locate_clips()[0]
         kind = torch.tensor([find_kind(name, kinds) for name in corpus.names])
         share = torch.zeros(len(kinds) + 1).index_add(0, kind, self.lengths.float())
         self.weights = share[kind] ** -evenness
-
-    def draw(
-        self, batch: int, frames: int, generator: torch.Generator, *, variation: Variation | None = None
-    ) -> PartialMotion:
-        """So many windows of so many frames, of which everything is known; RequestError where no clip is so long."""
-        tempo = torch.ones(batch)
-        if variation is not None:
-            chosen = torch.rand(batch, generator=generator) < variation.share
-            change = variation.tempo * (2 * torch.rand(batch, generator=generator) - 1)
-            tempo = torch.where(chosen, 1 + change, 1.0)
-        clip, first = self.pick(1 + ((frames - 1) * tempo).ceil().long(), generator)
-        window = self.at(clip, first, frames, tempo)
-        mirrored = torch.rand(batch, generator=generator) < 0.5
-        window = choose_rows(mirrored, window.mirrored(), window)
-        if variation is None:
-            return window
-        return _reshape_bodies(window, variation, generator)
 
     def pick(
         self, span: Int[Tensor, " batch"], generator: torch.Generator
@@ -83,6 +61,39 @@ class PoseWindows:
             raise RequestError(f"no clip is as long as the window of {int(span.max())} frames")
         clip = torch.multinomial(room * self.weights, len(span), replacement=True, generator=generator)
         return clip, (torch.rand(len(span), generator=generator) * (self.lengths[clip] - span + 1)).long()
+
+
+class PoseWindows:
+    """Draws windows from a corpus."""
+
+    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
+        """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
+        frames, 1 the same number of each kind.
+        """
+        self.picker = WindowPicker(corpus, kinds=kinds, evenness=evenness)
+        self.lengths, self.starts = corpus.locate_clips()
+        self.ground, self.heading = corpus.integrate_roots()
+        self.height = LAYOUT.pick(corpus.features, "root_height")
+        self.contacts = LAYOUT.pick(corpus.features, "contacts")
+        poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
+        self.quats = torch.cat([rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses])
+
+    def draw(
+        self, batch: int, frames: int, generator: torch.Generator, *, variation: Variation | None = None
+    ) -> PartialMotion:
+        """So many windows of so many frames, of which everything is known; RequestError where no clip is so long."""
+        tempo = torch.ones(batch)
+        if variation is not None:
+            chosen = torch.rand(batch, generator=generator) < variation.share
+            change = variation.tempo * (2 * torch.rand(batch, generator=generator) - 1)
+            tempo = torch.where(chosen, 1 + change, 1.0)
+        clip, first = self.picker.pick(1 + ((frames - 1) * tempo).ceil().long(), generator)
+        window = self.at(clip, first, frames, tempo)
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        window = choose_rows(mirrored, window.mirrored(), window)
+        if variation is None:
+            return window
+        return _reshape_bodies(window, variation, generator)
 
     def at(
         self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], frames: int, tempo: Float[Tensor, " batch"]

@@ -1,0 +1,40 @@
+"""`mapctl train stitcher`: the options of a stitcher."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from mapctl.commands.train.options import ParallelOptions
+
+if TYPE_CHECKING:
+    from priors.training.recipes.stitcher import StitcherRecipe
+
+
+@dataclass(frozen=True)
+class TrainStitcher(ParallelOptions):
+    """Train the stitcher, which makes many motions from one pose to another; --batch is in transitions."""
+
+    model = "stitcher"
+    used_by = "use it with --stitcher"
+
+    without: str = ""
+    """Parts of Ren et al. 2024, table 6, to leave out, with commas between: bs (bi-directional scheme), sl (stitching
+    loss), li (latent interpolation), ba (bi-directional aligning), pm (phase modulation), d (critics), lstm (the
+    encoder's)."""
+
+    def recipe(self) -> "StitcherRecipe":
+        """The options as the trainer takes them; RequestError for numbers that make no sense."""
+        from priors.training.recipes.stitcher import StitcherConfig, StitcherRecipe, StitcherSettings
+
+        parts = tuple(part.strip() for part in self.without.split(",") if part.strip())
+        given = self.select_given("steps", "batch", "seed", "learning_rate")
+        settings = replace(StitcherSettings(), bfloat16=self.bfloat16, **given)
+        if "sl" in parts:
+            settings = replace(settings, weights=replace(settings.weights, stitching=0.0))
+        return StitcherRecipe(
+            **self.common(),
+            config=StitcherConfig(without=parts),
+            settings=settings,
+            skip_first=self.skip_first,
+            init=self.init,
+            processes=self.processes,
+        )

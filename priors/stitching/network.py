@@ -1,0 +1,274 @@
+"""Networks of dual posture stitching (Ren et al. 2024, sections 3.3 and 4.1), both sides at once.
+
+Each side sees its current frame, how far the frame is to which it goes, that frame, and when it is to be there. An
+LSTM encodes them, heads tell the distribution of the latent now and on arrival, and a decoder LSTM with experts gated by
+the phase makes the next frame. Departures from the printed sizes and inputs, kept out by `StitcherConfig.printed`:
+
+- The paper's encoder sees the two frames and never what comes between, so that its latent can tell nothing of it. Here
+  a posterior, in training alone, sees the true in-between, and the paper's encoder is the prior that it is held to.
+- Half of the latent belongs to the whole transition and is the same for both sides, so that they agree on which foot
+  goes first by construction; the other half, a frame's, changes slowly.
+- What the network makes is added to the step that would lead to the target at an even pace. Untrained, it interpolates.
+- The decoder is given the offset and the encoder's output too, not the embeddings and the latent alone.
+- Features of `mapctl.features` (68) replace root positions and quaternions; the head has 68 numbers, not 88.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT
+from priors.config import NetworkConfig
+from priors.stitching.layers import SIDES, SidedExperts, SidedLayers, SidedLstm
+
+PARTS = ("bs", "sl", "li", "ba", "pm", "d", "lstm")
+"""Parts that can be left out, as in table 6: the bi-directional scheme, stitching loss, latent interpolation,
+bi-directional aligning, phase modulation, critics, the encoder's LSTM."""
+PHASES = 4
+"""Numbers of the two toes' phases."""
+POSE = slice(LAYOUT.slices["root_height"].start, LAYOUT.continuous)
+"""Columns of the pose among features; before it are the step and the turn, after it the contacts."""
+PACE = slice(0, POSE.start)
+"""Columns of the step over the ground and of the turn."""
+SEEN_FUTURE = 5
+"""True frames ahead that the posterior sees of a frame."""
+_POSE_SIZE, _STATE, _OFFSET = POSE.stop - POSE.start, LAYOUT.size + 1, POSE.stop - POSE.start + 3
+_CLAMP = 5.0  # spreads of a pose's change from frame to frame, beyond which no change goes
+_WAVE_BASE = 10_000.0  # of the sinusoids of time to arrival, as in the paper
+_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA = -5.0, 1.0
+
+
+@dataclass(frozen=True)
+class StitcherConfig(NetworkConfig):
+    """Shape of one side's networks; the other's is the same."""
+
+    embedding: tuple[int, ...] = (192, 192, 96)
+    """Layers of the encoders of state, offset and target; the last is even."""
+    encoder: int = 192
+    """Width of the encoder LSTM."""
+    head: int = 192
+    """Width of the layer before the distributions."""
+    shared: int = 8
+    """Numbers of the latent that both sides share over a transition."""
+    own: int = 8
+    """Numbers of the latent of each frame."""
+    decoder: int = 256
+    """Width of the decoder LSTM."""
+    experts: int = 4
+    """Experts that the phase gates."""
+    expert: tuple[int, ...] = (224, 160)
+    """Hidden layers of an expert."""
+    gate: tuple[int, ...] = (64, 32)
+    """Hidden layers of the gate."""
+    phase: int = 128
+    """Width of the two hidden layers of the phase's networks."""
+    longest: int = 61
+    """Frames from one pose to the other in the longest transition."""
+    without: tuple[str, ...] = ()
+    """Parts that are left out (see PARTS)."""
+
+    def __post_init__(self):
+        unknown = [part for part in self.without if part not in PARTS]
+        if unknown:
+            raise RequestError(f"a stitcher has no part {unknown[0]!r}; parts are {', '.join(PARTS)}")
+        if self.embedding[-1] % 2 or self.longest < 2:
+            raise RequestError("a stitcher's embedding is even, and its longest transition of 2 frames at least")
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What both sides know of one frame; features are in physical units, in each side's own sense of time."""
+
+    features: Float[Tensor, "2 batch size"]
+    """Of the current frames."""
+    paced: Float[Tensor, "2 batch"]
+    """1 where step, turn and contacts of the current frame are known."""
+    target: Float[Tensor, "2 batch size"]
+    """Features of the frames that they go to, whose step, turn and contacts tell how motion goes on from there."""
+    target_paced: Float[Tensor, "2 batch"]
+    """1 where these are known."""
+    place: Float[Tensor, "2 batch 2"]
+    """Where the target is, seen from the current frame in its heading frame, metres."""
+    turn: Float[Tensor, "2 batch"]
+    """By how much the target's heading is another, radians in -pi to pi."""
+    left: Float[Tensor, "2 batch"]
+    """Frames to the target."""
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What the sides remember from frame to frame."""
+
+    encoder: tuple[Tensor, Tensor]
+    decoder: tuple[Tensor, Tensor]
+    phase: Float[Tensor, "2 batch 4"]
+    """Amplitude times cosine and sine of both toes' phases."""
+
+    def keep(self, before: "Memory", active: Float[Tensor, "2 batch"]) -> "Memory":
+        """Return this memory where a side is active, and the one before elsewhere."""
+        on = active[..., None]
+
+        def pick(now: Tensor, then: Tensor) -> Tensor:
+            return on * now + (1 - on) * then
+
+        encoder = pick(self.encoder[0], before.encoder[0]), pick(self.encoder[1], before.encoder[1])
+        decoder = pick(self.decoder[0], before.decoder[0]), pick(self.decoder[1], before.decoder[1])
+        return Memory(encoder, decoder, pick(self.phase, before.phase))
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian:
+    """A normal distribution with independent numbers."""
+
+    mean: Float[Tensor, "*batch latent"]
+    log_sigma: Float[Tensor, "*batch latent"]
+
+    @staticmethod
+    def of(raw: Float[Tensor, "*batch twice"]) -> "Gaussian":
+        """Read one from a head."""
+        mean, log_sigma = raw.chunk(2, dim=-1)
+        return Gaussian(mean, log_sigma.clamp(_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA))
+
+    def draw(self, noise: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch latent"]:
+        """Return what standard normal noise becomes."""
+        return self.mean + self.log_sigma.exp() * noise
+
+    def blend(self, other: "Gaussian", share: Float[Tensor, "*batch"]) -> "Gaussian":
+        """Blend means and standard deviations: Ren et al. 2024, Eq. 1, which blends densities."""
+        share = share[..., None]
+        sigma = torch.lerp(self.log_sigma.exp(), other.log_sigma.exp(), share)
+        return Gaussian(torch.lerp(self.mean, other.mean, share), sigma.log())
+
+    def diverge(self, prior: "Gaussian") -> Float[Tensor, "*batch latent"]:
+        """Compute the Kullback-Leibler divergence from a prior, nats a dimension."""
+        ratio = 2 * (self.log_sigma - prior.log_sigma)
+        away = ((self.mean - prior.mean) * (-prior.log_sigma).exp()).square()
+        return 0.5 * (ratio.exp() + away - 1 - ratio)
+
+
+class StitcherNetwork(nn.Module):
+    """Both generators; untrained they interpolate from one pose to the other."""
+
+    mean: Tensor
+    std: Tensor
+    change: Tensor
+
+    def __init__(self, config: StitcherConfig):
+        super().__init__()
+        self.config = config
+        last, seen = config.embedding[-1], 3 * config.embedding[-1]
+        self.state = SidedLayers(_STATE, *config.embedding)
+        self.offset = SidedLayers(_OFFSET, *config.embedding)
+        self.target = SidedLayers(_STATE, *config.embedding)
+        self.lstm = "lstm" not in config.without
+        self.encoder = SidedLstm(seen, config.encoder) if self.lstm else SidedLayers(seen, 2 * config.encoder, config.encoder)
+        self.now = SidedLayers(config.encoder, config.head, 2 * config.own)
+        self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
+        self.decoder = SidedLstm(seen + config.encoder + config.shared + config.own, config.decoder)
+        experts = 1 if "pm" in config.without else config.experts
+        self.experts = SidedExperts(experts, (config.decoder, *config.expert, LAYOUT.size))
+        self.gate = SidedLayers(PHASES, *config.gate, experts)
+        self.first_phase = SidedLayers(seen, config.phase, PHASES)
+        self.next_phase = SidedLayers(LAYOUT.size + PHASES, config.phase, config.phase, PHASES)
+        self.prior = nn.Sequential(
+            nn.Linear(SIDES * seen, config.head), nn.ELU(), nn.Linear(config.head, 2 * config.shared)
+        )
+        for layer in (self.experts.layers[-1], self.next_phase.layers[-1], self.now.layers[-1], self.arrived.layers[-1]):
+            with torch.no_grad():
+                layer.weight.mul_(0.1)
+        self.register_buffer("mean", torch.zeros(LAYOUT.size))
+        self.register_buffer("std", torch.ones(LAYOUT.size))
+        self.register_buffer("change", torch.ones(LAYOUT.size))
+        waves = _WAVE_BASE ** (-torch.arange(0, last, 2) / last)
+        self.register_buffer("waves", waves, persistent=False)
+
+    def embed(self, now: Situation) -> Float[Tensor, "2 batch seen"]:
+        """Embed state, offset and target, each with the time to arrival (Eq. 11 and 12)."""
+        time = self._wave(now.left)
+        pose = (now.target - now.features)[..., POSE] / self.std[POSE]
+        offset = torch.cat([now.place, now.turn[..., None], pose], dim=-1)
+        return torch.cat(
+            [
+                self.state(self._normalise(now.features, now.paced)) + time,
+                self.offset(offset) + time,
+                self.target(self._normalise(now.target, now.target_paced)) + time,
+            ],
+            dim=-1,
+        )
+
+    def begin(self, seen: Float[Tensor, "2 batch seen"]) -> Memory:
+        """Return the memory before the first frame."""
+        shape = seen.shape[:2]
+
+        def still(width: int) -> tuple[Tensor, Tensor]:
+            return seen.new_zeros(*shape, width), seen.new_zeros(*shape, width)
+
+        return Memory(still(self.config.encoder), still(self.config.decoder), self.first_phase(seen))
+
+    def tell_shared(self, seen: Float[Tensor, "2 batch seen"]) -> Gaussian:
+        """Tell the distribution of what both sides share, from what they see at first."""
+        return Gaussian.of(self.prior(seen.transpose(0, 1).flatten(1)))
+
+    def encode(
+        self, seen: Float[Tensor, "2 batch seen"], now: Situation, memory: Memory, done: Float[Tensor, "2 batch"]
+    ) -> tuple[Float[Tensor, "2 batch width"], tuple[Tensor, Tensor], Gaussian]:
+        """Encode a frame of which `done` frames are behind the side's own end; also returns the LSTM's memory and the
+        prior's distribution of the frame's latent: that of now, and more of that on arrival the nearer this is (Eq. 1
+        and 2)."""
+        if not self.lstm:
+            output = self.encoder(seen)
+            memory_after = memory.encoder
+        else:
+            output, cell = self.encoder(seen, memory.encoder)
+            memory_after = (output, cell)
+        prior = Gaussian.of(self.now(output))
+        if "li" in self.config.without:
+            return output, memory_after, prior
+        # As if it were there: the target in place of the current frame, from the memory before this frame.
+        there = self.embed(
+            Situation(
+                now.target, now.target_paced, now.target, now.target_paced,
+                torch.zeros_like(now.place), torch.zeros_like(now.turn), torch.zeros_like(now.left),
+            )
+        )
+        arrival = self.encoder(there, memory.encoder)[0] if self.lstm else self.encoder(there)
+        return output, memory_after, prior.blend(Gaussian.of(self.arrived(arrival)), done / (done + now.left))
+
+    def decode(
+        self,
+        seen: Float[Tensor, "2 batch seen"],
+        encoded: Float[Tensor, "2 batch width"],
+        latent: Float[Tensor, "2 batch latent"],
+        now: Situation,
+        memory: Memory,
+        encoder: tuple[Tensor, Tensor],
+    ) -> tuple[Float[Tensor, "2 batch size"], Float[Tensor, "2 batch 2"], Memory, Float[Tensor, "2 batch experts"]]:
+        """Make the next frame's features, contacts as probabilities; also returns the contacts' logits, the memory
+        after it, and the experts' shares."""
+        output, cell = self.decoder(torch.cat([seen, encoded, latent], dim=-1), memory.decoder)
+        share = torch.softmax(self.gate(memory.phase.detach()), dim=-1)
+        made = self.experts(output, share)
+        even = 1 / now.left.clamp_min(1)[..., None]
+        pace = torch.cat([now.place, now.turn[..., None]], dim=-1) * even + made[..., PACE] * self.std[PACE]
+        change = made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
+        pose = now.features[..., POSE] + (now.target - now.features)[..., POSE] * even + change
+        logits = made[..., POSE.stop :]
+        features = torch.cat([pace, pose, torch.sigmoid(logits)], dim=-1)
+        step = self.next_phase(torch.cat([(features.detach() - self.mean) / self.std, memory.phase], dim=-1))
+        return features, logits, Memory(encoder, (output, cell), memory.phase + step), share
+
+    def _normalise(
+        self, features: Float[Tensor, "2 batch size"], paced: Float[Tensor, "2 batch"]
+    ) -> Float[Tensor, "2 batch state"]:
+        """Return features in units of their spread, what is unknown of a bare pose at zero, and whether it is."""
+        known = paced[..., None]
+        scaled = (features - self.mean) / self.std
+        return torch.cat([scaled[..., PACE] * known, scaled[..., POSE], scaled[..., POSE.stop :] * known, known], dim=-1)
+
+    def _wave(self, left: Float[Tensor, "2 batch"]) -> Float[Tensor, "2 batch embedding"]:
+        """Return sinusoids of the frames to arrival, no more than the longest transition."""
+        angle = left.clamp_max(float(self.config.longest))[..., None] * self.waves
+        return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(-2)

@@ -1,0 +1,45 @@
+"""The posterior of a transition's latent, which sees the truth: in training alone, and in no file of weights.
+
+Ren et al. 2024 have none: their encoder (section 3.3) sees the ends, and nothing of what comes between.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mapctl.features import LAYOUT
+from priors.stitching.layers import SIDES, SidedLayers
+from priors.stitching.network import SEEN_FUTURE, Gaussian, StitcherConfig
+
+_WIDTH = 128
+_MOMENTS = 4  # quarters of the way at which the whole is looked at
+
+
+class PosteriorNetwork(nn.Module):
+    """Distributions of what both sides share, and of each frame's latent."""
+
+    def __init__(self, config: StitcherConfig):
+        super().__init__()
+        seen = 3 * config.embedding[-1]
+        self.frame = nn.Sequential(nn.Linear(LAYOUT.size, _WIDTH), nn.ELU(), nn.Linear(_WIDTH, _WIDTH), nn.ELU())
+        self.whole = nn.Sequential(
+            nn.Linear((_MOMENTS + 1) * _WIDTH + SIDES * seen, 2 * _WIDTH),
+            nn.ELU(),
+            nn.Linear(2 * _WIDTH, 2 * config.shared),
+        )
+        self.next = SidedLayers(SEEN_FUTURE * LAYOUT.size + config.encoder, 2 * _WIDTH, 2 * config.own)
+
+    def tell_shared(
+        self, truth: Float[Tensor, "batch frames size"], seen: Float[Tensor, "2 batch seen"]
+    ) -> Gaussian:
+        """Tell it from the whole way from pose to pose, normalised features forwards."""
+        frames = self.frame(truth)
+        at = torch.linspace(0, frames.shape[1] - 1, _MOMENTS).round().long()
+        parts = [frames.mean(dim=1), frames[:, at].flatten(1), seen.transpose(0, 1).flatten(1)]
+        return Gaussian.of(self.whole(torch.cat(parts, dim=-1)))
+
+    def tell_own(
+        self, ahead: Float[Tensor, "2 batch frames size"], encoded: Float[Tensor, "2 batch width"]
+    ) -> Gaussian:
+        """Tell a frame's from the true frames ahead, normalised, in each side's sense of time."""
+        return Gaussian.of(self.next(torch.cat([ahead.flatten(-2), encoded], dim=-1)))

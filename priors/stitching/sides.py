@@ -1,0 +1,176 @@
+"""Both sides of a transition, walked towards each other (Ren et al. 2024, section 3.2 and Eq. 3).
+
+Both step at once, each towards the other's latest frame, so that one call serves both; the paper has them in turn. Once
+they have met, each goes on towards the true far end for the frames of the overlap. Features of the backward side are
+those of the motion run backwards (`mapctl.features.reversed_features`).
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.features import LAYOUT, GroundPose
+from priors.stitching.network import Gaussian, Memory, Situation, StitcherNetwork
+
+_OVERLAP_SHARE, _MOST_OVERLAP = 8, 6  # K is so much of the frames, and no more
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """What is known of a transition: its two ends, and frames before the one and after the other."""
+
+    features: Float[Tensor, "2 batch context size"]
+    """Frames up to each side's end, which is the last, in the side's own sense of time."""
+    present: Float[Tensor, "2 batch context"]
+    """1 where there is such a frame; the last always is, and those before it without a gap."""
+    paced: Float[Tensor, "2 batch"]
+    """1 where step, turn and contacts of the end are known; of a bare pose they are not."""
+    place: Float[Tensor, "batch 2"]
+    """Where the second end is over the ground, seen from the first in its heading frame, metres."""
+    turn: Float[Tensor, "batch"]
+    """By how much its heading is another, radians."""
+
+
+class Latents(Protocol):
+    """Where latents come from."""
+
+    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
+        """What both sides share over the transition."""
+        ...
+
+    def own(
+        self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int
+    ) -> Float[Tensor, "2 batch own"]:
+        """A frame's, of both sides."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """What both sides made, each from its own end on."""
+
+    frames: int
+    """From one pose to the other."""
+    features: Float[Tensor, "2 batch made size"]
+    """In each side's own sense of time; contacts are probabilities."""
+    logits: Float[Tensor, "2 batch made 2"]
+    """Of the contacts."""
+    place: Float[Tensor, "2 batch made 2"]
+    """Of the hips over the ground, metres, seen from the first end."""
+    heading: Float[Tensor, "2 batch made"]
+    """Of the hips, radians, likewise."""
+    phases: Float[Tensor, "2 batch made 4"]
+    """Of the frames made."""
+    shares: Float[Tensor, "2 batch made experts"]
+    """Of the experts."""
+    at_ends: Float[Tensor, "2 batch 4"]
+    """Phases of the ends themselves."""
+    alone: bool = False
+    """Whether the forward side walks the whole way, and the other counts nothing: without the bi-directional scheme."""
+
+    @property
+    def overlap(self) -> tuple[int, int]:
+        """First and last frame, counted from the first pose, that both sides made; none if the first is the later."""
+        made = self.features.shape[2]
+        return self.frames - made, made
+
+
+def count_made(network: StitcherNetwork, frames: int) -> int:
+    """Count the frames that each side of a transition makes: up to the middle and K beyond it, an eighth of the
+    transition and 6 at most, which the paper leaves open; one at least is made by both."""
+    if "bs" in network.config.without:
+        return frames - 1
+    beyond = min(round(frames / _OVERLAP_SHARE), _MOST_OVERLAP)
+    return min(max(frames // 2 + beyond, (frames + 1) // 2), frames - 1)
+
+
+def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Sides:
+    """Walk both sides of a transition of so many frames from pose to pose until they overlap."""
+    without = network.config.without
+    made = count_made(network, frames)
+    now, memory, shared, at = _enter(network, ends, frames, latents)
+    at_ends, far, far_at, far_paced = memory.phase, now, at, ends.paced
+    paced, rows = ends.paced, []
+    for step in range(made):
+        left = frames - 2 * step
+        aligned = left >= 1 and "ba" not in without
+        target, target_at = (now, at) if aligned else (far, far_at)
+        target_paced = paced if aligned else far_paced
+        situation = _look(
+            now, paced, at, target, target_paced, target_at, float(left if aligned else frames - step)
+        )
+        seen = network.embed(situation)
+        encoded, encoder, prior = network.encode(seen, situation, memory, torch.full_like(paced, float(step)))
+        own = latents.own(prior, encoded, step)
+        latent = torch.cat([shared.expand(2, -1, -1), own], dim=-1)
+        now, logits, memory, share = network.decode(seen, encoded, latent, situation, memory, encoder)
+        at = at.displace(*_pick_pace(now))
+        paced = torch.ones_like(paced)
+        rows.append((now, logits, at.position_xz, at.heading, memory.phase, share))
+    return Sides(frames, *(torch.stack(column, dim=2) for column in zip(*rows, strict=True)), at_ends, "bs" in without)
+
+
+def reverse_sense(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
+    """Return single frames as who walks the other way reads them: the step and turn that led there lead on from
+    there."""
+    step, turn = _pick_pace(features)
+    back = -rotations.rotate_ground(step, -turn)
+    return torch.cat([back, -turn[..., None], features[..., LAYOUT.slices["root_height"].start :]], dim=-1)
+
+
+def _enter(
+    network: StitcherNetwork, ends: Ends, frames: int, latents: Latents
+) -> tuple[Float[Tensor, "2 batch size"], Memory, Float[Tensor, "batch shared"], GroundPose]:
+    """Walk through the frames before each end; returns the end itself, the memory there, what is shared and where the
+    ends are."""
+    context = ends.features.shape[2]
+    zero = torch.zeros_like(ends.place)
+    at = GroundPose(torch.stack([zero, ends.place]), torch.stack([zero[:, 0], ends.turn]))
+    grounds = [at]
+    for number in range(context - 1, 0, -1):
+        grounds.insert(0, grounds[0].before(*_pick_pace(ends.features[:, :, number])))
+    end = ends.features[:, :, -1]
+
+    def look(number: int, paced: Tensor) -> Situation:
+        left = float(frames + context - 1 - number)
+        return _look(ends.features[:, :, number], paced, grounds[number], end, ends.paced, at, left)
+
+    first = network.embed(look(context - 1, ends.paced))
+    shared = latents.share(network.tell_shared(first), first)
+    memory, before = network.begin(first), torch.zeros_like(ends.paced)
+    for number in range(context - 1):
+        there = ends.present[:, :, number]
+        situation = look(number, before)
+        seen = network.embed(situation)
+        memory = network.begin(seen).keep(memory, 1 - before)
+        encoded, encoder, prior = network.encode(seen, situation, memory, torch.zeros_like(there))
+        latent = torch.cat([shared.expand(2, -1, -1), prior.mean], dim=-1)
+        after = network.decode(seen, encoded, latent, situation, memory, encoder)[2]
+        memory, before = after.keep(memory, there), there
+    if context > 1:
+        memory = network.begin(first).keep(memory, 1 - before)
+    return end, memory, shared, at
+
+
+def _look(
+    now: Tensor, paced: Tensor, at: GroundPose, target: Tensor, target_paced: Tensor, target_at: GroundPose, left: float
+) -> Situation:
+    """Tell each side what it knows: of the other it sees the frame given for it."""
+    away = target_at.position_xz.flip(0) - at.position_xz
+    return Situation(
+        features=now,
+        paced=paced,
+        target=reverse_sense(target.flip(0)),
+        target_paced=target_paced.flip(0),
+        place=rotations.rotate_ground(away, -at.heading),
+        turn=rotations.wrap_angle(target_at.heading.flip(0) - at.heading),
+        left=torch.full_like(paced, left),
+    )
+
+
+def _pick_pace(features: Float[Tensor, "*batch size"]) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+    return LAYOUT.pick(features, "root_displacement_heading"), LAYOUT.pick(features, "heading_change")[..., 0]

@@ -1,0 +1,178 @@
+"""Training of the stitcher: both ways between two poses of mocap, longer and longer ones."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, mirror_features
+from priors.config import require_at_least
+from priors.stitching.layers import multiply_in_bfloat16
+from priors.stitching.network import StitcherConfig, StitcherNetwork
+from priors.stitching.posterior import PosteriorNetwork
+from priors.training.augmentation.transition_windows import Known, TransitionWindows
+from priors.training.corpus import Corpus, Split
+from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
+from priors.training.recipes.stitcher_losses import LossWeights, compute_stitcher_losses
+from priors.training.stitcher_quality import measure_transitions
+from priors.training.trainer import GradientTrainer
+
+_SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
+_CONTEXT = 10  # frames told before or after, at most
+_LENGTH_GROWTH, _NATS_GROWTH = 0.5, 0.35  # shares of training in which these grow
+_AVERAGE = 0.999
+_LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
+_MAX_NORM = 1.0
+
+
+@dataclass(frozen=True)
+class StitcherSettings:
+    """How a stitcher is trained."""
+
+    steps: int = 20_000
+    """Updates."""
+    batch: int = 64
+    """Transitions an update, all of one length."""
+    learning_rate: float = 1e-3
+    """At its highest; it falls to nothing along a cosine."""
+    informed: float = 0.4
+    """Share of transitions whose latents come from the posterior, which has seen the truth."""
+    calm: float = 0.4
+    """Share whose latents are the prior's mean; the rest is drawn."""
+    weights: LossWeights = field(default_factory=LossWeights)
+    """Of what is learnt."""
+    evenness: float = 0.85
+    """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
+    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
+    """Kinds, as patterns of names; clips of none of these are another kind."""
+    bfloat16: bool = False
+    """Layers multiply in bfloat16; weights, all else and the loss stay in float32."""
+    seed: int = 1
+    """Seed of weights, windows and latents."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps", "batch")
+        if not 0 < self.informed + self.calm <= 1:
+            raise RequestError("shares of informed and calm transitions are 0 to 1 together, and more than nothing")
+
+
+class StitcherTrainer(GradientTrainer[StitcherNetwork]):
+    """Draws transitions, hides what is between their ends, and brings both sides nearer to it."""
+
+    def __init__(self, config: StitcherConfig, settings: StitcherSettings, corpus: Corpus):
+        self.settings = settings
+        self.windows = TransitionWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
+        self.longest = min(config.longest, max(corpus.lengths) - 2 * _CONTEXT - 1)
+        if self.longest < _SHORTEST:
+            raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
+        super().__init__(
+            lambda: self._make(config),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
+        _set_moments(self.network, corpus)
+        self.average = copy.deepcopy(self.network).requires_grad_(False)
+        """Moving average of the weights: what is measured and exported."""
+
+    def _make(self, config: StitcherConfig) -> StitcherNetwork:
+        network = StitcherNetwork(config)
+        self.posterior = PosteriorNetwork(config)
+        return network
+
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """AdamW with a short memory."""
+        return {"optimiser": torch.optim.AdamW(self._weights(), lr=self.learning_rate, betas=(0.5, 0.9))}
+
+    def limit_gradients(self) -> None:
+        """Clip those of the posterior too."""
+        nn.utils.clip_grad_norm_(self._weights(), _MAX_NORM)
+
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        return super().networks() | {"posterior": self.posterior, "average": self.average}
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch."""
+        settings, done = self.settings, self.step / self.steps
+        longest = _FIRST_LONGEST + (self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
+        longest = max(_SHORTEST, min(round(longest), self.longest))
+        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
+        truth = self.windows.draw(settings.batch, frames, self._draw_known(), self.generator)
+        weights = replace(settings.weights, latent=settings.weights.latent * min(1.0, done / _NATS_GROWTH))
+        shares = settings.informed, settings.calm
+        with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
+            return compute_stitcher_losses(self.network, self.posterior, truth, shares, weights, self.generator)
+
+    def train_step(self) -> dict[str, float]:
+        """Take one update, and bring the average nearer."""
+        parts = super().train_step()
+        keep = min(_AVERAGE, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(weight, 1 - keep)
+        return parts
+
+    @torch.no_grad()
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Measure transitions of unseen clips."""
+        windows = TransitionWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
+        return measure_transitions(self.average, self.posterior, windows)
+
+    def _weights(self) -> list[nn.Parameter]:
+        return [*self.network.parameters(), *self.posterior.parameters()]
+
+    def _draw_known(self) -> Known:
+        """Two bare poses in half of the cases; their pace in a quarter; up to 10 frames before, and after or not, in
+        the rest."""
+        share = float(torch.rand((), generator=self.generator))
+        if share < 0.75:
+            return Known(paced=share >= 0.5)
+        before, after = torch.randint(0, _CONTEXT + 1, (2,), generator=self.generator).tolist()
+        return Known(max(1, before) if share < 0.85 else _CONTEXT, after if share < 0.875 else 0)
+
+
+@dataclass(frozen=True)
+class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTrainer]):
+    """What to train a stitcher on, and how."""
+
+    kind = "stitcher"
+    config: StitcherConfig = field(default_factory=StitcherConfig)
+    """The networks."""
+    settings: StitcherSettings = field(default_factory=StitcherSettings)
+    """How they are trained."""
+
+    def make_untaught(self, parts: Split) -> StitcherTrainer:
+        """The trainer, its weights drawn."""
+        return StitcherTrainer(self.config, self.settings, parts.train)
+
+    def make_trainer(self, parts: Split) -> StitcherTrainer:
+        """As it is before the first step."""
+        trainer = super().make_trainer(parts)
+        trainer.average.load_state_dict(trainer.network.state_dict())
+        return trainer
+
+    def export(self, trainer: StitcherTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """What is written at the end: the average of the weights."""
+        return replace(super().export(trainer, gathered, curve), tensors=trainer.average.state_dict())
+
+    def format_shape(self) -> list[str]:
+        """The parts that are left out."""
+        return [f"--without {','.join(self.config.without)}"] if self.config.without else []
+
+
+def _set_moments(network: StitcherNetwork, corpus: Corpus) -> None:
+    """Set mean and spread of features, and of how they change from frame to frame, to those of the data and its mirror
+    image; contacts count by halves."""
+    both = torch.cat([corpus.features, mirror_features(corpus.features)])
+    change = torch.cat([torch.diff(clip, dim=0) for clip in corpus.clips()]).std(dim=0)
+    network.mean.copy_(both.mean(dim=0))
+    for spread, buffer in ((both.std(dim=0), network.std), (change, network.change)):
+        for block in LAYOUT.slices.values():
+            typical = spread[block].square().mean().sqrt()
+            buffer[block] = spread[block].clamp_min(float(_LEAST_SPREAD * typical) or 1e-6)
+    network.mean[LAYOUT.slices["contacts"]] = network.std[LAYOUT.slices["contacts"]] = 0.5

@@ -1,0 +1,118 @@
+"""What a stitcher does between poses of unseen clips: how near it comes, how far its sides are apart, and how its
+answers differ."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl.kinematics import forward_kinematics
+from mapctl.skeleton import CANONICAL
+from priors.stitching.joining import Joined, join_sides
+from priors.stitching.latents import DrawnLatents
+from priors.stitching.network import StitcherNetwork
+from priors.stitching.posterior import PosteriorNetwork
+from priors.stitching.sides import Latents, count_made, walk_sides
+from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
+from priors.training.recipes.stitcher_losses import TaughtLatents, interpolate
+
+VALIDATED_GAPS = (5, 15, 30, 45)
+"""Frames between the two poses."""
+_WINDOWS, _DRAWS = 96, 8
+_DRAWN_GAP = 30
+_ACTIVE = 0.01  # variance of a posterior's mean from which on a dimension is in use
+
+
+@torch.no_grad()
+def measure_transitions(
+    network: StitcherNetwork, posterior: PosteriorNetwork, windows: TransitionWindows
+) -> dict[str, float]:
+    """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
+    distance of joints; and in a gap of 30 frames what the latents do.
+
+    Distances are in cm: `apart` of the sides before they are joined, `spread` of 8 draws from each other. `informed`,
+    `draw` and `best` are errors of an answer with the posterior's latents, of one draw and of the best of 8; `jitter`
+    is the mean acceleration over mocap's; `active` counts latent dimensions, `nats` a transition's divergence.
+    """
+    row: dict[str, float] = {}
+    for name, known in (("bare", Known()), ("past", Known(before=10))):
+        for gap in VALIDATED_GAPS:
+            if gap + 13 > max(windows.picker.lengths.tolist()) or gap + 1 > network.config.longest:
+                continue
+            truth = windows.draw(_WINDOWS, gap + 1, known, torch.Generator().manual_seed(gap))
+            places, guess = _true_places(truth)
+            joined = answer(network, truth, make_calm(network, truth))
+            error = (place(joined) - places).norm(dim=-1).mean()
+            row[f"{name}_{gap}"] = float(error / (guess - places).norm(dim=-1).mean())
+            if known == Known():
+                row[f"apart_{gap}_cm"] = 100 * float(joined.apart.mean())
+            if known == Known() and gap == _DRAWN_GAP:
+                row |= _measure_draws(network, posterior, truth, places)
+    return row
+
+
+def answer(network: StitcherNetwork, truth: Transition, latents: Latents) -> Joined:
+    """Return what a stitcher makes of the ends of transitions."""
+    ends = truth.ends()
+    return join_sides(walk_sides(network, ends, truth.frames, latents), ends)
+
+
+def make_calm(network: StitcherNetwork, truth: Transition) -> DrawnLatents:
+    """Make latents at the mean."""
+    config = network.config
+    return DrawnLatents.calm(len(truth.features), count_made(network, truth.frames), config.shared, config.own)
+
+
+def place(joined: Joined) -> Float[Tensor, "batch frames joints 3"]:
+    """Place the joints, metres, seen from the first pose."""
+    return forward_kinematics(CANONICAL.offsets.float(), CANONICAL.parents, joined.root_position, joined.quats)[0]
+
+
+def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
+    """Places of joints between the poses, true and interpolated."""
+    bodies = interpolate(truth)
+    true, guess = (body.joints_world()[:, :-1] for body in bodies)
+    return true, guess
+
+
+def _measure_draws(
+    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, places: Tensor
+) -> dict[str, float]:
+    config, generator = network.config, torch.Generator().manual_seed(0)
+    batch, made = len(truth.features), count_made(network, truth.frames)
+    latents = TaughtLatents(
+        posterior,
+        (truth.truth() - network.mean) / network.std,
+        torch.ones(batch, dtype=torch.bool),
+        torch.zeros(batch, config.shared),
+        torch.zeros(2, batch, made, config.own),
+    )
+    informed = place(answer(network, truth, latents))
+    draws = torch.stack(
+        [
+            place(answer(network, truth, DrawnLatents.sample(batch, made, config.shared, config.own, generator)))
+            for _ in range(_DRAWS)
+        ]
+    )
+    errors = (draws - places).norm(dim=-1).mean(dim=(2, 3))
+    pairs = [(a - b).norm(dim=-1).mean() for n, a in enumerate(draws) for b in draws[:n]]
+    active = [(means.var(dim=0) > _ACTIVE).sum() for means in (latents.means[0], torch.cat(latents.means[1:]))]
+    shares = walk_sides(network, truth.ends(), truth.frames, make_calm(network, truth)).shares
+    return {
+        "informed_cm": 100 * float((informed - places).norm(dim=-1).mean()),
+        "draw_cm": 100 * float(errors[0].mean()),
+        "best_cm": 100 * float(errors.amin(dim=0).mean()),
+        "spread_cm": 100 * float(torch.stack(pairs).mean()),
+        "jitter": float(_measure_acceleration(draws[0]) / _measure_acceleration(places)),
+        "calm_jitter": float(
+            _measure_acceleration(place(answer(network, truth, make_calm(network, truth))))
+            / _measure_acceleration(places)
+        ),
+        "active_shared": float(active[0]),
+        "active_own": float(active[1]),
+        "nats": float(latents.count_nats().mean()),
+        "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
+    }
+
+
+def _measure_acceleration(places: Float[Tensor, "batch frames joints 3"]) -> Tensor:
+    return torch.diff(places, n=2, dim=1).norm(dim=-1).mean()
