@@ -14,6 +14,8 @@ from priors.pose_transformer import inbetweener as pose_transformer
 from priors.pose_transformer.inbetweener import PoseTransformer
 from priors.refiner import network as refiner_network
 from priors.refiner.network import LstmRefiner
+from priors.stitching import inbetweener as stitching
+from priors.stitching.inbetweener import Stitcher
 from priors.tweening import inbetweener as tweening
 from priors.tweening import path as path_network
 from priors.tweening.inbetweener import Tweener
@@ -76,6 +78,11 @@ def load_tweener(name: str = "tweener", path: str = "path") -> Tweener:
     """The bundled generator of long in-betweens, or a trained one by its file or run folder, with the path predictor
     that it was trained with."""
     return tweening.load(name, path)
+
+
+def load_stitcher(name: str = "stitcher") -> Stitcher:
+    """The bundled stitcher, which fills short gaps in many ways, or a trained one by its file or run folder."""
+    return stitching.load(name)
 
 
 def load_path(name: str = "path") -> ConvPathPredictor:

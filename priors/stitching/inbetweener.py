@@ -1,0 +1,214 @@
+"""The stitcher as an in-betweener: short gaps between whole poses, in as many ways as are drawn."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import contacts, rotations
+from mapctl.features import PRIOR_FPS, encode, mirror_features, reversed_features
+from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.query import GapSource
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from priors import checkpoints
+from priors.stitching.joining import Joined, join_sides
+from priors.stitching.latents import DrawnLatents
+from priors.stitching.network import StitcherConfig, StitcherNetwork
+from priors.stitching.sides import Ends, count_made, walk_sides
+
+SOURCE = "stitcher"
+"""Name of the in-betweener in notes."""
+MAX_CONTEXT = 10
+"""Frames before a gap, and after it, that are looked at."""
+_CHUNK = 8  # draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count
+_PARTNERS = CANONICAL.mirror_partners()
+
+
+@dataclass(frozen=True, eq=False)
+class Stitcher(Inbetweener):
+    """A trained stitcher (Ren et al. 2024)."""
+
+    name: str
+    """Name under which it was loaded."""
+    network: StitcherNetwork
+    """Network in evaluation mode."""
+    card: checkpoints.Card
+    """Card of the weights."""
+    drawn: bool = False
+    """Whether `propose` draws one of many answers; the calm answer otherwise, with the latent at its mean."""
+    temperature: float = 1.0
+    """Standard deviation of the noise that is drawn."""
+
+    @property
+    def longest(self) -> int:
+        """Frames of the longest gap that it fills."""
+        return self.network.config.longest - 1
+
+    def drawing(self, temperature: float = 1.0) -> "Stitcher":
+        """Return the in-betweener that draws its answers."""
+        return replace(self, drawn=True, temperature=temperature)
+
+    @torch.no_grad()
+    def draw(
+        self, ends: Ends, frames: int, *, count: int, generator: torch.Generator, temperature: float = 1.0
+    ) -> Joined:
+        """Draw so many answers to one pair of poses, `frames` from the one to the other; the first ones do not depend
+        on the count."""
+        network, config = self.network, self.network.config
+        ends = _repeat(ends, _CHUNK)
+        made, rows = count_made(network, frames), []
+        for _ in range(-(-count // _CHUNK)):
+            latents = DrawnLatents.sample(_CHUNK, made, config.shared, config.own, generator)
+            latents = DrawnLatents(temperature * latents.shared, temperature * latents.slow)
+            rows.append(join_sides(walk_sides(network, ends, frames, latents), ends))
+        return Joined(
+            *(torch.cat([getattr(row, name) for row in rows])[:count] for name in Joined.__dataclass_fields__)
+        )
+
+    @torch.no_grad()
+    def answer(self, ends: Ends, frames: int) -> Joined:
+        """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image."""
+        config, batch = self.network.config, len(ends.place)
+        both = Ends(
+            torch.cat([ends.features, mirror_features(ends.features)], dim=1),
+            torch.cat([ends.present, ends.present], dim=1),
+            torch.cat([ends.paced, ends.paced], dim=1),
+            torch.cat([ends.place, ends.place * ends.place.new_tensor([-1.0, 1.0])]),
+            torch.cat([ends.turn, -ends.turn]),
+        )
+        calm = DrawnLatents.calm(2 * batch, count_made(self.network, frames), config.shared, config.own)
+        joined = join_sides(walk_sides(self.network, both, frames, calm), both)
+        return _average_mirrored(joined, batch)
+
+    @torch.no_grad()
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose motion for gaps between whole poses of up to `longest` frames; all else stays interpolated, and the
+        proposal says so. Frames beside a gap that are wholly known, up to MAX_CONTEXT of them, are looked at."""
+        body = query.to_unit_size(query.motion)
+        toes = body.joint_positions()[:, list(TOE_JOINTS)]
+        root, quats = body.root_position.clone(), body.local_quat_xyzw.clone()
+        logits = contacts.to_logits(contacts.detect_contacts(toes, PRIOR_FPS)).float()
+        generator = generator or torch.Generator().manual_seed(0)
+        others = []
+        for start, stop in query.enclosed_gaps:
+            reason = self._refuse(query, start, stop)
+            if reason:
+                others.append(GapSource(start, stop, "interpolation", reason))
+                continue
+            ends, frames = see_ends(body, query.missing.frames, start, stop), stop - start + 1
+            if self.drawn:
+                found = self.draw(ends, frames, count=1, generator=generator, temperature=self.temperature)
+            else:
+                found = self.answer(ends, frames)
+            part = slice(start, stop)
+            root[part], quats[part] = _place(found, body, start)
+            logits[part] = found.contacts[0]
+        if (partly := _find_partly_known(query)) is not None:
+            others.append(partly)
+        moved = replace(body, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
+        return Proposal(query.to_character(moved), logits, SOURCE, tuple(others))
+
+    def _refuse(self, query: GapQuery, start: int, stop: int) -> str:
+        """Return why a gap is not stitched; empty where it is."""
+        if stop - start > self.longest:
+            return f"longer than the {self.longest} frames that the {SOURCE} fills"
+        edges = query.missing.joints[[start - 1, stop]].any() | query.missing.root[[start - 1, stop]].any()
+        targets = query.effector_targets
+        told = targets is not None and bool(targets.wanted[start:stop].any())
+        if bool(edges) or told or query.loose is not None:
+            return f"known in part, where the {SOURCE} takes whole poses"
+        return f"on a given way, which the {SOURCE} knows nothing of" if query.keep_trajectory else ""
+
+
+def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:
+    """See the ends of a gap in a canonical motion of unit size, and whole frames beside it, of which `missing` has
+    none."""
+    features, present, paced = [], [], []
+    before, after = _count_known(missing, start - 1, -1), _count_known(missing, stop, 1)
+    context = 1 + max(before, after)
+    there = _encode(body, start - 1 - before, start)
+    back = reversed_features(_encode(body, stop, stop + 1 + after))
+    for rows, count in ((there[-1 - before :], before), (back[-1 - after :], after)):
+        lead = context - 1 - count
+        features.append(torch.cat([rows[:1].expand(lead, -1), rows])[None])
+        present.append((torch.arange(context) >= lead).float()[None])
+        paced.append(torch.full((1,), float(count > 0)))
+    heading = rotations.split_heading(body.local_quat_xyzw[[start - 1, stop], 0])[0]
+    away = (body.root_position[stop] - body.root_position[start - 1])[[0, 2]]
+    place = rotations.rotate_ground(away, -heading[0]).float()[None]
+    turn = rotations.wrap_angle(heading[1] - heading[0]).float()[None]
+    return Ends(torch.stack(features).float(), torch.stack(present), torch.stack(paced), place, turn)
+
+
+def _count_known(missing: Tensor, at: int, step: int) -> int:
+    """Count whole frames beyond one, up to MAX_CONTEXT."""
+    count = 0
+    while count < MAX_CONTEXT and 0 <= at + step < len(missing) and not bool(missing[at + step]):
+        at, count = at + step, count + 1
+    return count
+
+
+def _encode(body: Motion, start: int, stop: int) -> Float[Tensor, "frames size"]:
+    """Encode frames; a single one stands still, which nobody looks at."""
+    part = body.slice(start, stop)
+    if stop - start == 1:
+        part = replace(
+            part,
+            root_position=part.root_position.expand(2, -1),
+            local_quat_xyzw=part.local_quat_xyzw.expand(2, -1, -1),
+        )
+    return encode(part)[0]
+
+
+def _place(joined: Joined, body: Motion, start: int) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
+    """Place an answer after the pose before a gap, double precision."""
+    facing = rotations.split_heading(body.local_quat_xyzw[start - 1 : start, 0])[0]
+    at = body.root_position[start - 1] * torch.tensor([1.0, 0.0, 1.0]).double()
+    root, quats = joined.root_position[0].double(), joined.quats[0].double().clone()
+    turn = rotations.about_y(facing).expand(len(root), 4)
+    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
+    return rotations.rotate(turn, root) + at, quats
+
+
+def _average_mirrored(joined: Joined, batch: int) -> Joined:
+    """Average answers and, mirrored back, those to the mirror image."""
+    flip, turned = joined.root_position.new_tensor([-1.0, 1.0, 1.0]), joined.quats.new_tensor([1.0, -1.0, -1.0, 1.0])
+    root = (joined.root_position[:batch] + flip * joined.root_position[batch:]) / 2
+    one, other = joined.quats[:batch], turned * joined.quats[batch:, :, _PARTNERS]
+    quats = rotations.slerp(one, other, one.new_full(one.shape[:-1], 0.5))
+    logits = (joined.contacts[:batch] + joined.contacts[batch:].flip(-1)) / 2
+    return Joined(root, quats, logits, (joined.apart[:batch] + joined.apart[batch:]) / 2)
+
+
+def _repeat(ends: Ends, count: int) -> Ends:
+    """Repeat the one pair of poses."""
+    return Ends(
+        ends.features.expand(-1, count, -1, -1).contiguous(),
+        ends.present.expand(-1, count, -1).contiguous(),
+        ends.paced.expand(-1, count).contiguous(),
+        ends.place.expand(count, -1).contiguous(),
+        ends.turn.expand(count).contiguous(),
+    )
+
+
+def _find_partly_known(query: GapQuery) -> GapSource | None:
+    """Find frames that are known in part, or have nothing known on one side."""
+    enclosed = torch.zeros(query.motion.num_frames, dtype=torch.bool)
+    for start, stop in query.enclosed_gaps:
+        enclosed[start:stop] = True
+    rest = (query.missing.frames & ~enclosed).nonzero()[:, 0]
+    if not len(rest):
+        return None
+    reason = f"known in part or on one side alone, where the {SOURCE} takes whole poses"
+    return GapSource(int(rest[0]), int(rest[-1]) + 1, "interpolation", reason)
+
+
+def load(name: str = "stitcher") -> Stitcher:
+    """Load the bundled stitcher, or a trained one by its file or run folder; CheckpointError for anything else."""
+    with checkpoints.open_checkpoint(name, "stitcher") as (tensors, card):
+        network = StitcherNetwork(StitcherConfig.of_card(card.config))
+        network.load_state_dict(tensors)
+    return Stitcher(name, network.eval().requires_grad_(False), card)
