@@ -179,6 +179,8 @@ class StitcherNetwork(nn.Module):
         for layer in (self.experts.layers[-1], self.next_phase.layers[-1], self.now.layers[-1], self.arrived.layers[-1]):
             with torch.no_grad():
                 layer.weight.mul_(0.1)
+        with torch.no_grad():  # few numbers among many: at the usual size they would be learnt to be ignored
+            self.decoder.gates.weight[:, seen + config.encoder : seen + config.encoder + config.shared + config.own] *= 4
         self.register_buffer("mean", torch.zeros(LAYOUT.size))
         self.register_buffer("std", torch.ones(LAYOUT.size))
         self.register_buffer("change", torch.ones(LAYOUT.size))

@@ -31,7 +31,8 @@ def measure_transitions(
 
     Distances are in cm: `apart` of the sides before they are joined, `spread` of 8 draws from each other. `informed`,
     `draw` and `best` are errors of an answer with the posterior's latents, of one draw and of the best of 8; `jitter`
-    is the mean acceleration over mocap's; `active` counts latent dimensions, `nats` a transition's divergence.
+    is the mean acceleration over mocap's; `active` counts latent dimensions, `nats` a
+    transition's divergence.
     """
     row: dict[str, float] = {}
     for name, known in (("bare", Known()), ("past", Known(before=10))):
@@ -109,7 +110,8 @@ def _measure_draws(
         ),
         "active_shared": float(active[0]),
         "active_own": float(active[1]),
-        "nats": float(latents.count_nats().mean()),
+        "shared_nats": float(latents.count_nats()[0].sum(dim=1).mean()),
+        "own_nats": float(latents.count_nats()[1].sum(dim=1).mean()),
         "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
     }
 

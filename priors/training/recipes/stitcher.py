@@ -23,7 +23,8 @@ from priors.training.trainer import GradientTrainer
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
 _CONTEXT = 10  # frames told before or after, at most
-_LENGTH_GROWTH, _NATS_GROWTH = 0.5, 0.35  # shares of training in which these grow
+_LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
+_NATS_FREE, _NATS_GROWTH = 0.1, 0.4  # shares of training in which latents cost nothing, and then more and more
 _AVERAGE = 0.999
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 _MAX_NORM = 1.0
@@ -65,6 +66,8 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def __init__(self, config: StitcherConfig, settings: StitcherSettings, corpus: Corpus):
         self.settings = settings
+        self.grown = False
+        """Whether transitions are as long as they get from the first step on."""
         self.windows = TransitionWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         self.longest = min(config.longest, max(corpus.lengths) - 2 * _CONTEXT - 1)
         if self.longest < _SHORTEST:
@@ -98,12 +101,14 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        settings, done = self.settings, self.step / self.steps
+        settings, done = self.settings, 1.0 if self.grown else self.step / self.steps
         longest = _FIRST_LONGEST + (self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(settings.batch, frames, self._draw_known(), self.generator)
-        weights = replace(settings.weights, latent=settings.weights.latent * min(1.0, done / _NATS_GROWTH))
+        growth = min(1.0, max(0.0, done - _NATS_FREE) / _NATS_GROWTH)
+        weights = settings.weights
+        weights = replace(weights, shared=growth * weights.shared, own=growth * weights.own)
         shares = settings.informed, settings.calm
         with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
             return compute_stitcher_losses(self.network, self.posterior, truth, shares, weights, self.generator)
@@ -148,7 +153,10 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
 
     def make_untaught(self, parts: Split) -> StitcherTrainer:
         """The trainer, its weights drawn."""
-        return StitcherTrainer(self.config, self.settings, parts.train)
+        trainer = StitcherTrainer(self.config, self.settings, parts.train)
+        # Who begins with weights of a run has seen them grow.
+        trainer.grown = self.init is not None
+        return trainer
 
     def make_trainer(self, parts: Split) -> StitcherTrainer:
         """As it is before the first step."""

@@ -18,7 +18,7 @@ from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Sides, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Transition
 
-_FREE_NATS = 0.02  # a dimension, which cost nothing: the latent is not given up before it is of use
+_FREE_NATS = 0.05  # of each dimension that both sides share, which cost nothing: they are not given up early
 _EASE, _EASE_METRES = 0.4, 0.05
 
 
@@ -38,8 +38,10 @@ class LossWeights:
     """Steps of toes that are planted, metres a frame."""
     stitching: float = 5.0
     """Mean distance of the two sides' joints where they overlap, metres (Eq. 4)."""
-    latent: float = 0.02
-    """Divergence of the posterior from the prior, nats a transition; it grows over the first third."""
+    shared: float = 0.001
+    """Divergence of the posterior from the prior of what both sides share, nats; at first it costs nothing."""
+    own: float = 0.001
+    """Divergence of the frames' latents, nats a transition; likewise."""
     phase: float = 0.3
     """Absolute error of the phases."""
 
@@ -60,7 +62,7 @@ class TaughtLatents:
     slow: Float[Tensor, "2 batch made own"]
     """The same, of frames."""
     nats: list[Tensor] = field(default_factory=list)
-    """Divergences by row, the transition's first and then those of frames."""
+    """Divergences by row and dimension, the transition's first and then those of frames."""
     means: list[Tensor] = field(default_factory=list)
     """Means of the posterior: the transition's, and then those of frames."""
 
@@ -81,12 +83,12 @@ class TaughtLatents:
         noise = self.slow[:, :, step]
         return torch.where(self.informed[:, None], told.draw(noise), prior.draw(noise))
 
-    def count_nats(self) -> Float[Tensor, " batch"]:
-        """Sum divergences over the transition."""
-        return torch.stack(self.nats).sum(dim=0)
+    def count_nats(self) -> tuple[Float[Tensor, "batch shared"], Float[Tensor, "batch own"]]:
+        """Count those of what is shared, and sum those of all frames."""
+        return self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
 
     def _count(self, nats: Tensor, mean: Tensor) -> None:
-        self.nats.append(nats.clamp_min(_FREE_NATS).sum(dim=-1))
+        self.nats.append(nats)
         self.means.append(mean)
 
 
@@ -135,6 +137,7 @@ def compute_stitcher_losses(
     planted = stand[:, :, 1:] * stand[:, :, :-1]
     phases = torch.cat([sides.at_ends[:count, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
     apart = None if sides.alone else measure_apart(places, frames)
+    nats = [each[:informed].mean(dim=0) if informed else torch.zeros(1) for each in latents.count_nats()]
     parts = {
         "places": (ease * distance.mean(dim=(0, 2, 3))).mean(),
         "pace": (ease * slip.mean(dim=(0, 2, 3))).mean(),
@@ -142,7 +145,8 @@ def compute_stitcher_losses(
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
         "stitching": torch.zeros(()) if apart is None else apart.mean(),
-        "latent": latents.count_nats()[:informed].mean() if informed else torch.zeros(()),
+        "shared": nats[0].clamp_min(_FREE_NATS).sum(),
+        "own": nats[1].sum(),
         "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
     }
     loss = sum((getattr(weights, name) * value for name, value in parts.items()), start=torch.zeros(()))
@@ -155,7 +159,8 @@ def compute_stitcher_losses(
         "contacts": parts["contacts"],
         "feet_cm": 100 * parts["feet"],
         "apart_cm": 100 * parts["stitching"],
-        "nats": parts["latent"],
+        "shared_nats": nats[0].sum(),
+        "own_nats": nats[1].sum(),
         "phase": parts["phase"],
     }
 
