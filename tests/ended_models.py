@@ -8,6 +8,7 @@ from typing import Any
 import tiny_denoiser
 import tiny_infiller
 import tiny_path
+import tiny_stitcher
 import tiny_transformer
 import tiny_tweener
 
@@ -21,6 +22,7 @@ from priors.training.recipes import (
     path,
     pose_transformer,
     refiner,
+    stitcher,
     tweener,
     tweener_critic,
 )
@@ -107,6 +109,7 @@ MODELS = {
     "keyframe-timing": Model(keyframe_timing.KeyframeTimingTrainer, _timing),
     "path": Model(path.PathTrainer, _windowed(path.PathRecipe, tiny_path.CONFIG)),
     "tweener": Model(tweener.TweenerTrainer, _windowed(tweener.TweenerRecipe, tiny_tweener.CONFIG)),
+    "stitcher": Model(stitcher.StitcherTrainer, _windowed(stitcher.StitcherRecipe, tiny_stitcher.CONFIG)),
 }
 """By the names of their commands."""
 VARIANTS = {

@@ -5,6 +5,8 @@ analytic: contacts are smoothed, standardised among the frames around, and turne
 transform. Their five bones are the two toes here, of which alone features hold contacts.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -43,7 +45,8 @@ def compute_phases(planted: Bool[Tensor, "frames 2"] | Float[Tensor, "frames 2"]
     spread = np.sqrt(np.where(variance > _NO_SPREAD**2, variance, 0))
     standard = (smooth - mean) / np.maximum(spread, _LEAST_SPREAD)
     around = np.pad(standard, ((REACH, REACH), (0, 0)), mode="reflect")
-    analytic = hilbert(around, axis=0)[REACH:-REACH] * np.minimum(spread / _LEAST_SPREAD, 1)
+    whole: Any = hilbert(around, axis=0)
+    analytic = whole[REACH:-REACH] * np.minimum(spread / _LEAST_SPREAD, 1)
     return torch.from_numpy(np.stack([analytic.real, analytic.imag], axis=-1)).flatten(1)
 
 

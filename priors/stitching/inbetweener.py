@@ -156,14 +156,14 @@ def _encode(body: Motion, start: int, stop: int) -> Float[Tensor, "frames size"]
     part = body.slice(start, stop)
     if stop - start == 1:
         part = replace(
-            part,
-            root_position=part.root_position.expand(2, -1),
-            local_quat_xyzw=part.local_quat_xyzw.expand(2, -1, -1),
+            part, root_position=part.root_position.expand(2, -1), local_quat_xyzw=part.local_quat_xyzw.expand(2, -1, -1)
         )
     return encode(part)[0]
 
 
-def _place(joined: Joined, body: Motion, start: int) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
+def _place(
+    joined: Joined, body: Motion, start: int
+) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
     """Place an answer after the pose before a gap, double precision."""
     facing = rotations.split_heading(body.local_quat_xyzw[start - 1 : start, 0])[0]
     at = body.root_position[start - 1] * torch.tensor([1.0, 0.0, 1.0]).double()

@@ -56,7 +56,8 @@ def join_sides(sides: Sides, ends: Ends) -> Joined:
         offset = rotations.lift_ground(share[:, None] * miss[:, None])
         quats = torch.cat([hips[..., None, :], quats[..., 1:, :]], dim=-2)
         rows.append((root + offset, quats, sides.logits[side][:, order]))
-    return Joined(*(_blend(one, other, between, first, last) for one, other in zip(*rows, strict=True)), apart)
+    root, quats, logits = (_blend(one, other, between, first, last) for one, other in zip(*rows, strict=True))
+    return Joined(root, quats, logits, apart)
 
 
 def _follow_one(sides: Sides, body: BodyPose, apart: Tensor) -> Joined:

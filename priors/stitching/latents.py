@@ -35,9 +35,7 @@ class DrawnLatents:
         """What both sides share over the transition."""
         return prior.draw(self.shared)
 
-    def own(
-        self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int
-    ) -> Float[Tensor, "2 batch own"]:
+    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
         return prior.draw(self.slow[:, :, step])
 

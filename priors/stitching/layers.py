@@ -6,6 +6,7 @@ The sides share no weights; tensors have a leading axis of two, forward first.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -57,13 +58,18 @@ class SidedLayers(nn.Module):
 
     def __init__(self, *widths: int):
         super().__init__()
-        self.layers = nn.ModuleList(SidedLinear(one, other) for one, other in zip(widths, widths[1:], strict=False))
+        self.layers = nn.ModuleList(SidedLinear(one, other) for one, other in pairwise(widths))
 
     def forward(self, x: Float[Tensor, "2 batch inputs"]) -> Float[Tensor, "2 batch outputs"]:
         """Return the outputs of each side."""
         for number, layer in enumerate(self.layers):
             x = layer(elu(x) if number else x)
         return x
+
+    def shrink_last(self, share: float) -> None:
+        """Shrink what the last layer makes at first."""
+        with torch.no_grad():
+            list(self.layers.parameters())[-2].mul_(share)
 
 
 class SidedLstm(nn.Module):
@@ -92,9 +98,7 @@ class SidedExperts(nn.Module):
     def __init__(self, experts: int, widths: Sequence[int]):
         super().__init__()
         self.experts = experts
-        self.layers = nn.ModuleList(
-            SidedLinear(one, experts * other) for one, other in zip(widths, widths[1:], strict=False)
-        )
+        self.layers = nn.ModuleList(SidedLinear(one, experts * other) for one, other in pairwise(widths))
 
     def forward(
         self, x: Float[Tensor, "2 batch inputs"], share: Float[Tensor, "2 batch experts"]
@@ -104,3 +108,8 @@ class SidedExperts(nn.Module):
             each = layer(elu(x) if number else x).unflatten(-1, (self.experts, -1))
             x = (share[..., None] * each).sum(dim=-2)
         return x
+
+    def shrink_last(self, share: float) -> None:
+        """Shrink what the last layer makes at first."""
+        with torch.no_grad():
+            list(self.layers.parameters())[-2].mul_(share)

@@ -1,8 +1,8 @@
 """Networks of dual posture stitching (Ren et al. 2024, sections 3.3 and 4.1), both sides at once.
 
 Each side sees its current frame, how far the frame is to which it goes, that frame, and when it is to be there. An
-LSTM encodes them, heads tell the distribution of the latent now and on arrival, and a decoder LSTM with experts gated by
-the phase makes the next frame. Departures from the printed sizes and inputs, kept out by `StitcherConfig.printed`:
+LSTM encodes them, heads tell the distribution of the latent now and on arrival, and a decoder LSTM with experts gated
+by the phase makes the next frame. Departures from the printed sizes and inputs, kept out by `StitcherConfig.printed`:
 
 - The paper's encoder sees the two frames and never what comes between, so that its latent can tell nothing of it. Here
   a posterior, in training alone, sees the true in-between, and the paper's encoder is the prior that it is held to.
@@ -155,6 +155,7 @@ class StitcherNetwork(nn.Module):
     mean: Tensor
     std: Tensor
     change: Tensor
+    waves: Tensor
 
     def __init__(self, config: StitcherConfig):
         super().__init__()
@@ -164,7 +165,9 @@ class StitcherNetwork(nn.Module):
         self.offset = SidedLayers(_OFFSET, *config.embedding)
         self.target = SidedLayers(_STATE, *config.embedding)
         self.lstm = "lstm" not in config.without
-        self.encoder = SidedLstm(seen, config.encoder) if self.lstm else SidedLayers(seen, 2 * config.encoder, config.encoder)
+        self.encoder = (
+            SidedLstm(seen, config.encoder) if self.lstm else SidedLayers(seen, 2 * config.encoder, config.encoder)
+        )
         self.now = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.decoder = SidedLstm(seen + config.encoder + config.shared + config.own, config.decoder)
@@ -176,11 +179,11 @@ class StitcherNetwork(nn.Module):
         self.prior = nn.Sequential(
             nn.Linear(SIDES * seen, config.head), nn.ELU(), nn.Linear(config.head, 2 * config.shared)
         )
-        for layer in (self.experts.layers[-1], self.next_phase.layers[-1], self.now.layers[-1], self.arrived.layers[-1]):
-            with torch.no_grad():
-                layer.weight.mul_(0.1)
+        for layers in (self.experts, self.next_phase, self.now, self.arrived):
+            layers.shrink_last(0.1)
+        told = seen + config.encoder
         with torch.no_grad():  # few numbers among many: at the usual size they would be learnt to be ignored
-            self.decoder.gates.weight[:, seen + config.encoder : seen + config.encoder + config.shared + config.own] *= 4
+            self.decoder.gates.weight[:, told : told + config.shared + config.own].mul_(4)
         self.register_buffer("mean", torch.zeros(LAYOUT.size))
         self.register_buffer("std", torch.ones(LAYOUT.size))
         self.register_buffer("change", torch.ones(LAYOUT.size))
@@ -232,8 +235,13 @@ class StitcherNetwork(nn.Module):
         # As if it were there: the target in place of the current frame, from the memory before this frame.
         there = self.embed(
             Situation(
-                now.target, now.target_paced, now.target, now.target_paced,
-                torch.zeros_like(now.place), torch.zeros_like(now.turn), torch.zeros_like(now.left),
+                now.target,
+                now.target_paced,
+                now.target,
+                now.target_paced,
+                torch.zeros_like(now.place),
+                torch.zeros_like(now.turn),
+                torch.zeros_like(now.left),
             )
         )
         arrival = self.encoder(there, memory.encoder)[0] if self.lstm else self.encoder(there)
@@ -268,7 +276,9 @@ class StitcherNetwork(nn.Module):
         """Return features in units of their spread, what is unknown of a bare pose at zero, and whether it is."""
         known = paced[..., None]
         scaled = (features - self.mean) / self.std
-        return torch.cat([scaled[..., PACE] * known, scaled[..., POSE], scaled[..., POSE.stop :] * known, known], dim=-1)
+        return torch.cat(
+            [scaled[..., PACE] * known, scaled[..., POSE], scaled[..., POSE.stop :] * known, known], dim=-1
+        )
 
     def _wave(self, left: Float[Tensor, "2 batch"]) -> Float[Tensor, "2 batch embedding"]:
         """Return sinusoids of the frames to arrival, no more than the longest transition."""

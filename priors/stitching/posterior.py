@@ -29,9 +29,7 @@ class PosteriorNetwork(nn.Module):
         )
         self.next = SidedLayers(SEEN_FUTURE * LAYOUT.size + config.encoder, 2 * _WIDTH, 2 * config.own)
 
-    def tell_shared(
-        self, truth: Float[Tensor, "batch frames size"], seen: Float[Tensor, "2 batch seen"]
-    ) -> Gaussian:
+    def tell_shared(self, truth: Float[Tensor, "batch frames size"], seen: Float[Tensor, "2 batch seen"]) -> Gaussian:
         """Tell it from the whole way from pose to pose, normalised features forwards."""
         frames = self.frame(truth)
         at = torch.linspace(0, frames.shape[1] - 1, _MOMENTS).round().long()

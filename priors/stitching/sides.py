@@ -6,7 +6,7 @@ those of the motion run backwards (`mapctl.features.reversed_features`).
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -35,6 +35,7 @@ class Ends:
     """By how much its heading is another, radians."""
 
 
+@runtime_checkable
 class Latents(Protocol):
     """Where latents come from."""
 
@@ -42,9 +43,7 @@ class Latents(Protocol):
         """What both sides share over the transition."""
         ...
 
-    def own(
-        self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int
-    ) -> Float[Tensor, "2 batch own"]:
+    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
         ...
 
@@ -100,9 +99,7 @@ def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Laten
         aligned = left >= 1 and "ba" not in without
         target, target_at = (now, at) if aligned else (far, far_at)
         target_paced = paced if aligned else far_paced
-        situation = _look(
-            now, paced, at, target, target_paced, target_at, float(left if aligned else frames - step)
-        )
+        situation = _look(now, paced, at, target, target_paced, target_at, float(left if aligned else frames - step))
         seen = network.embed(situation)
         encoded, encoder, prior = network.encode(seen, situation, memory, torch.full_like(paced, float(step)))
         own = latents.own(prior, encoded, step)
@@ -111,7 +108,10 @@ def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Laten
         at = at.displace(*_pick_pace(now))
         paced = torch.ones_like(paced)
         rows.append((now, logits, at.position_xz, at.heading, memory.phase, share))
-    return Sides(frames, *(torch.stack(column, dim=2) for column in zip(*rows, strict=True)), at_ends, "bs" in without)
+    features, logits, places, headings, phases, shares = (
+        torch.stack(column, dim=2) for column in zip(*rows, strict=True)
+    )
+    return Sides(frames, features, logits, places, headings, phases, shares, at_ends, "bs" in without)
 
 
 def reverse_sense(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:

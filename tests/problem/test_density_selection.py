@@ -14,7 +14,7 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, encode
 from mapctl.problem import density_selection
 from mapctl.rotations import from_rotation_vector, multiply
-from priors.training.density_quality import compute_window_nats
+from priors.training.quality.density import compute_window_nats
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ from helpers import corpus, write_corpus
 
 import priors
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training import density_quality, run
+from priors.training import run
+from priors.training.quality import density as density_quality
 from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
 
 TINY = LstmGmmConfig(width=8, components=2)

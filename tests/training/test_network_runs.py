@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import tiny_denoiser
 import tiny_infiller
+import tiny_stitcher
 import tiny_transformer
 import tiny_tweener
 from helpers import killing, run
@@ -22,6 +23,7 @@ from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors.denoiser.network import DenoiserConfig
 from priors.infiller.network import InfillerConfig
 from priors.pose_transformer.network import PoseTransformerConfig
+from priors.stitching.network import StitcherConfig
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings, DenoiserTrainer
 from priors.training.recipes.infiller import InfillerRecipe, InfillerSettings, InfillerTrainer
 from priors.training.recipes.path import PathRecipe, PathSettings, PathTrainer
@@ -30,6 +32,7 @@ from priors.training.recipes.pose_transformer import (
     PoseTransformerSettings,
     PoseTransformerTrainer,
 )
+from priors.training.recipes.stitcher import StitcherRecipe, StitcherSettings, StitcherTrainer
 from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings, TweenerTrainer
 from priors.training.run import train
 from priors.tweening.generator import GeneratorConfig
@@ -120,6 +123,15 @@ MODELS = (
         TweenerSettings(),
         (("--plain",), GeneratorConfig(skips=False)),
     ),
+    Model(
+        StitcherRecipe,
+        StitcherTrainer,
+        priors.load_stitcher,
+        tiny_stitcher.CONFIG,
+        replace(tiny_stitcher.CONFIG, encoder=6),
+        StitcherSettings(),
+        (("--without", "ba,lstm"), StitcherConfig(without=("ba", "lstm"))),
+    ),
 )
 
 
@@ -181,7 +193,7 @@ def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_pa
         train(request_in(out))
     with pytest.raises(CheckpointError, match=r"other settings \(learning_rate: .* then, 0\.3 now\)"):
         train(request_in(out, resume=True, settings={"learning_rate": 0.3}))
-    with pytest.raises(CheckpointError, match=r"other network \((width|kernel|style): \d then, \d now\)"):
+    with pytest.raises(CheckpointError, match=r"other network \((width|kernel|style|encoder): \d then, \d now\)"):
         train(request_in(out, resume=True, config=model.other))
     with pytest.raises(CheckpointError, match="other data"):
         train(request_in(out, resume=True, match="walk-[0-3]"))

@@ -19,8 +19,8 @@ from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from priors import checkpoints
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus as corpora
+from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
 from priors.training.recipes.refiner import PAPER, AdversarialSettings, AdversarialTrainer, RefinerRecipe
-from priors.training.refiner_quality import RefinerEvaluator, compute_realism_gap, sample_corpus
 from priors.training.run import train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))

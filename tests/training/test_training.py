@@ -17,7 +17,8 @@ from mapctl.features import LAYOUT, encode, ground_speed, mirror_features
 from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import density_quality, initial_states
+from priors.training import initial_states
+from priors.training.quality import density as density_quality
 from priors.training.recipes.lstm_gmm import (
     PAPER,
     DensityRecipe,

@@ -15,9 +15,9 @@ import priors
 from mapctl import retarget
 from mapctl.errors import RequestError
 from priors.training import corpus as corpora
-from priors.training import density_quality
 from priors.training import run as training_run
 from priors.training.gathering import DataSource, gather
+from priors.training.quality import density as density_quality
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer
 
 BALL = (

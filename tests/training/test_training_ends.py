@@ -21,7 +21,8 @@ from mapctl.commands.train.options import TrainOptions
 from mapctl.runtime import interruption
 from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
-from priors.training import corpus, density_quality, run, run_files
+from priors.training import corpus, run, run_files
+from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
 
 

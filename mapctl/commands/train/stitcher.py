@@ -11,7 +11,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainStitcher(ParallelOptions):
-    """Train the stitcher, which makes many motions from one pose to another; --batch is in transitions."""
+    """Train the stitcher, which makes many motions from one pose to another; --batch is in transitions, --window the
+    frames of their longest."""
 
     model = "stitcher"
     used_by = "use it with --stitcher"
@@ -25,13 +26,14 @@ class TrainStitcher(ParallelOptions):
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.training.recipes.stitcher import StitcherConfig, StitcherRecipe, StitcherSettings
 
+        common = self.common()
         parts = tuple(part.strip() for part in self.without.split(",") if part.strip())
-        given = self.select_given("steps", "batch", "seed", "learning_rate")
+        given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
         settings = replace(StitcherSettings(), bfloat16=self.bfloat16, **given)
         if "sl" in parts:
             settings = replace(settings, weights=replace(settings.weights, stitching=0.0))
         return StitcherRecipe(
-            **self.common(),
+            **common,
             config=StitcherConfig(without=parts),
             settings=settings,
             skip_first=self.skip_first,

@@ -23,7 +23,7 @@ def draw_style_poses(
     at = torch.randint(frames, (batch, count), generator=generator)
     own = torch.take_along_dim(sequences.motion.quats, at[..., None, None], dim=1)
     one = torch.ones(batch, dtype=torch.long)
-    clip = windows.pick(one, generator)[0][:, None].expand(-1, count)
+    clip = windows.picker.pick(one, generator)[0][:, None].expand(-1, count)
     time = (torch.rand(batch, count, generator=generator) * windows.lengths[clip]).floor().double()
     other = torch.rand(batch, generator=generator) < foreign
     local = rotations.to_matrix(torch.where(other[:, None, None, None], windows.gather(clip, time).quats, own))

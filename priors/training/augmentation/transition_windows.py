@@ -103,6 +103,4 @@ class TransitionWindows:
         mirrored = (torch.rand(batch, generator=generator) < 0.5)[:, None, None]
         features, phases = self.features[index], self.phases[index]
         features = torch.where(mirrored, mirror_features(features), features)
-        return Transition(
-            features, torch.where(mirrored, mirror_phases(phases), phases), frames, lead, known
-        )
+        return Transition(features, torch.where(mirrored, mirror_phases(phases), phases), frames, lead, known)

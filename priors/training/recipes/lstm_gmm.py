@@ -18,11 +18,11 @@ from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
-from priors.training import density_quality
 from priors.training.corpus import Corpus, Split
 from priors.training.gathering import describe_skipped
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
+from priors.training.quality import density as density_quality
 from priors.training.recipe import Export, Gathered, Recipe, Row, average, find_split_seed
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import FeatureWindows

@@ -24,8 +24,8 @@ from priors.training.adversaries.history import HistoryBuffer
 from priors.training.corpus import Corpus, Split, find_window_starts
 from priors.training.gathering import DataSource, describe_skipped
 from priors.training.moment_matching import MatchingSettings, moment_loss
+from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
 from priors.training.recipe import Export, Gathered, Recipe, Row, average
-from priors.training.refiner_quality import RefinerEvaluator, compute_realism_gap, sample_corpus
 from priors.training.trainer import Trainer, draw_weights
 from priors.training.windows import FeatureWindows
 

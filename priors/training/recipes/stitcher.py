@@ -16,15 +16,17 @@ from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.training.augmentation.transition_windows import Known, TransitionWindows
 from priors.training.corpus import Corpus, Split
+from priors.training.quality.stitcher import measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.recipes.stitcher_losses import LossWeights, compute_stitcher_losses
-from priors.training.stitcher_quality import measure_transitions
 from priors.training.trainer import GradientTrainer
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
+_LEAST_WINDOW = 16  # frames of the longest transition
 _CONTEXT = 10  # frames told before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
-_NATS_FREE, _NATS_GROWTH = 0.1, 0.4  # shares of training in which latents cost nothing, and then more and more
+_NATS_FREE, _NATS_GROWTH = 0.1, 0.4  # shares of training in which latents cost little, and then more and more
+_LEAST_NATS = 0.05  # share of that cost at first: without any the posterior runs away from the prior
 _AVERAGE = 0.999
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 _MAX_NORM = 1.0
@@ -38,6 +40,8 @@ class StitcherSettings:
     """Updates."""
     batch: int = 64
     """Transitions an update, all of one length."""
+    window: int = 61
+    """Frames from one pose to the other in the longest."""
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
     informed: float = 0.4
@@ -57,6 +61,8 @@ class StitcherSettings:
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch")
+        if self.window < _LEAST_WINDOW:
+            raise RequestError(f"window must be at least {_LEAST_WINDOW} frames, got {self.window}")
         if not 0 < self.informed + self.calm <= 1:
             raise RequestError("shares of informed and calm transitions are 0 to 1 together, and more than nothing")
 
@@ -69,14 +75,11 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         self.grown = False
         """Whether transitions are as long as they get from the first step on."""
         self.windows = TransitionWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
-        self.longest = min(config.longest, max(corpus.lengths) - 2 * _CONTEXT - 1)
+        self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
         if self.longest < _SHORTEST:
             raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
         super().__init__(
-            lambda: self._make(config),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
+            lambda: self._make(config), steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
         )
         _set_moments(self.network, corpus)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
@@ -102,11 +105,11 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         settings, done = self.settings, 1.0 if self.grown else self.step / self.steps
-        longest = _FIRST_LONGEST + (self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
+        longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(settings.batch, frames, self._draw_known(), self.generator)
-        growth = min(1.0, max(0.0, done - _NATS_FREE) / _NATS_GROWTH)
+        growth = min(1.0, max(_LEAST_NATS, (done - _NATS_FREE) / _NATS_GROWTH))
         weights = settings.weights
         weights = replace(weights, shared=growth * weights.shared, own=growth * weights.own)
         shares = settings.informed, settings.calm

@@ -72,9 +72,7 @@ class TaughtLatents:
         self._count(told.diverge(prior), told.mean)
         return torch.where(self.informed[:, None], told.draw(self.shared), prior.draw(self.shared))
 
-    def own(
-        self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int
-    ) -> Float[Tensor, "2 batch own"]:
+    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
         last = self.truth.shape[2] - 1
         ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]

@@ -22,7 +22,7 @@ from priors.training.augmentation.key_parts import WHOLE
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.augmentation.style_poses import draw_style_poses
 from priors.training.corpus import Corpus, Split
-from priors.training.gap_quality import measure_kinds
+from priors.training.quality.gap import measure_kinds
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.recipes.tweener_losses import Judge, LossWeights, compute_tweener_losses
 from priors.training.trainer import GradientTrainer

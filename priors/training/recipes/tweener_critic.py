@@ -23,7 +23,7 @@ from priors.training.adversaries.history import HistoryBuffer
 from priors.training.augmentation.key_layouts import KeySettings, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus, Split
-from priors.training.gap_quality import measure_kinds
+from priors.training.quality.gap import measure_kinds
 from priors.training.recipe import Export, Gathered, Row
 from priors.training.recipes.tweener import TweenerRecipe, TweenerTrainer
 from priors.training.trainer import Trainer, draw_weights, make_divergence_error

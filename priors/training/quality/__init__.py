@@ -1,0 +1,1 @@
+"""What models in training are measured by."""

@@ -1,0 +1,52 @@
+"""A small stitcher, for tests."""
+
+import torch
+
+from mapctl.features import LAYOUT
+from priors import checkpoints
+from priors.stitching.inbetweener import Stitcher
+from priors.stitching.network import StitcherConfig, StitcherNetwork
+
+CONFIG = StitcherConfig(
+    embedding=(10, 8),
+    encoder=8,
+    head=6,
+    shared=2,
+    own=2,
+    decoder=12,
+    experts=2,
+    expert=(8,),
+    gate=(6,),
+    phase=6,
+    longest=24,
+)
+
+
+def network(config: StitcherConfig = CONFIG, *, drawn: float = 0.3, seed: int = 0) -> StitcherNetwork:
+    """Drawn with the seed; makes so much of its own beside the interpolation."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        made = StitcherNetwork(config)
+    made.experts.shrink_last(10 * drawn)
+    made.change[:], made.std[:] = 0.03, 0.3
+    made.std[LAYOUT.slices["root_displacement_heading"]] = made.std[LAYOUT.slices["heading_change"]] = 0.02
+    return made.eval().requires_grad_(False)
+
+
+def card(config: StitcherConfig = CONFIG) -> checkpoints.Card:
+    """Of such weights."""
+    return checkpoints.Card(
+        kind="stitcher",
+        config=config.as_card(),
+        licence="free",
+        data={},
+        training={},
+        quality={},
+        abilities={},
+        **checkpoints.Card.layout_fields(),
+    )
+
+
+def tiny_stitcher(config: StitcherConfig = CONFIG, *, drawn: float = 0.3) -> Stitcher:
+    """As controllers take it."""
+    return Stitcher("tiny", network(config, drawn=drawn), card(config))
