@@ -75,7 +75,6 @@ class Stitcher(Inbetweener):
         both = Ends(
             torch.cat([ends.features, mirror_features(ends.features)], dim=1),
             torch.cat([ends.present, ends.present], dim=1),
-            torch.cat([ends.paced, ends.paced], dim=1),
             torch.cat([ends.place, ends.place * ends.place.new_tensor([-1.0, 1.0])]),
             torch.cat([ends.turn, -ends.turn]),
         )
@@ -126,7 +125,7 @@ class Stitcher(Inbetweener):
 def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:
     """See the ends of a gap in a canonical motion of unit size, and whole frames beside it, of which `missing` has
     none."""
-    features, present, paced = [], [], []
+    features, present = [], []
     before, after = _count_known(missing, start - 1, -1), _count_known(missing, stop, 1)
     context = 1 + max(before, after)
     there = _encode(body, start - 1 - before, start)
@@ -135,12 +134,11 @@ def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:
         lead = context - 1 - count
         features.append(torch.cat([rows[:1].expand(lead, -1), rows])[None])
         present.append((torch.arange(context) >= lead).float()[None])
-        paced.append(torch.full((1,), float(count > 0)))
     heading = rotations.split_heading(body.local_quat_xyzw[[start - 1, stop], 0])[0]
     away = (body.root_position[stop] - body.root_position[start - 1])[[0, 2]]
     place = rotations.rotate_ground(away, -heading[0]).float()[None]
     turn = rotations.wrap_angle(heading[1] - heading[0]).float()[None]
-    return Ends(torch.stack(features).float(), torch.stack(present), torch.stack(paced), place, turn)
+    return Ends(torch.stack(features).float(), torch.stack(present), place, turn)
 
 
 def _count_known(missing: Tensor, at: int, step: int) -> int:
@@ -188,7 +186,6 @@ def _repeat(ends: Ends, count: int) -> Ends:
     return Ends(
         ends.features.expand(-1, count, -1, -1).contiguous(),
         ends.present.expand(-1, count, -1).contiguous(),
-        ends.paced.expand(-1, count).contiguous(),
         ends.place.expand(count, -1).contiguous(),
         ends.turn.expand(count).contiguous(),
     )

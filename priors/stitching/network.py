@@ -35,7 +35,8 @@ PACE = slice(0, POSE.start)
 """Columns of the step over the ground and of the turn."""
 SEEN_FUTURE = 5
 """True frames ahead that the posterior sees of a frame."""
-_POSE_SIZE, _STATE, _OFFSET = POSE.stop - POSE.start, LAYOUT.size + 1, POSE.stop - POSE.start + 3
+_POSE_SIZE = POSE.stop - POSE.start
+_STATE, _OFFSET = LAYOUT.size + _POSE_SIZE + 1, _POSE_SIZE + 3
 _CLAMP = 5.0  # spreads of a pose's change from frame to frame, beyond which no change goes
 _WAVE_BASE = 10_000.0  # of the sinusoids of time to arrival, as in the paper
 _LEAST_LOG_SIGMA, _MOST_LOG_SIGMA = -5.0, 1.0
@@ -84,10 +85,14 @@ class Situation:
 
     features: Float[Tensor, "2 batch size"]
     """Of the current frames."""
+    change: Float[Tensor, "2 batch pose"]
+    """By how much the pose became another in the step that led there."""
     paced: Float[Tensor, "2 batch"]
-    """1 where step, turn and contacts of the current frame are known."""
+    """1 where change, step, turn and contacts of the current frame are known."""
     target: Float[Tensor, "2 batch size"]
     """Features of the frames that they go to, whose step, turn and contacts tell how motion goes on from there."""
+    target_change: Float[Tensor, "2 batch pose"]
+    """By how much the pose becomes another in the step on from there."""
     target_paced: Float[Tensor, "2 batch"]
     """1 where these are known."""
     place: Float[Tensor, "2 batch 2"]
@@ -141,6 +146,10 @@ class Gaussian:
         share = share[..., None]
         sigma = torch.lerp(self.log_sigma.exp(), other.log_sigma.exp(), share)
         return Gaussian(torch.lerp(self.mean, other.mean, share), sigma.log())
+
+    def detach(self) -> "Gaussian":
+        """Return the same, through which nothing learns."""
+        return Gaussian(self.mean.detach(), self.log_sigma.detach())
 
     def diverge(self, prior: "Gaussian") -> Float[Tensor, "*batch latent"]:
         """Compute the Kullback-Leibler divergence from a prior, nats a dimension."""
@@ -197,9 +206,9 @@ class StitcherNetwork(nn.Module):
         offset = torch.cat([now.place, now.turn[..., None], pose], dim=-1)
         return torch.cat(
             [
-                self.state(self._normalise(now.features, now.paced)) + time,
+                self.state(self._normalise(now.features, now.change, now.paced)) + time,
                 self.offset(offset) + time,
-                self.target(self._normalise(now.target, now.target_paced)) + time,
+                self.target(self._normalise(now.target, now.target_change, now.target_paced)) + time,
             ],
             dim=-1,
         )
@@ -236,8 +245,10 @@ class StitcherNetwork(nn.Module):
         there = self.embed(
             Situation(
                 now.target,
+                now.target_change,
                 now.target_paced,
                 now.target,
+                now.target_change,
                 now.target_paced,
                 torch.zeros_like(now.place),
                 torch.zeros_like(now.turn),
@@ -271,13 +282,19 @@ class StitcherNetwork(nn.Module):
         return features, logits, Memory(encoder, (output, cell), memory.phase + step), share
 
     def _normalise(
-        self, features: Float[Tensor, "2 batch size"], paced: Float[Tensor, "2 batch"]
+        self,
+        features: Float[Tensor, "2 batch size"],
+        change: Float[Tensor, "2 batch pose"],
+        paced: Float[Tensor, "2 batch"],
     ) -> Float[Tensor, "2 batch state"]:
-        """Return features in units of their spread, what is unknown of a bare pose at zero, and whether it is."""
+        """Return features and change in units of their spread, what is unknown of a bare pose at zero, and whether it
+        is."""
         known = paced[..., None]
         scaled = (features - self.mean) / self.std
+        moved = (change / self.change[POSE]).clamp(-_CLAMP, _CLAMP)
         return torch.cat(
-            [scaled[..., PACE] * known, scaled[..., POSE], scaled[..., POSE.stop :] * known, known], dim=-1
+            [scaled[..., PACE] * known, scaled[..., POSE], scaled[..., POSE.stop :] * known, moved * known, known],
+            dim=-1,
         )
 
     def _wave(self, left: Float[Tensor, "2 batch"]) -> Float[Tensor, "2 batch embedding"]:

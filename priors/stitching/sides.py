@@ -14,8 +14,10 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose
-from priors.stitching.network import Gaussian, Memory, Situation, StitcherNetwork
+from priors.stitching.network import POSE, Gaussian, Memory, Situation, StitcherNetwork
 
+Frame = tuple[Float[Tensor, "2 batch size"], Float[Tensor, "2 batch pose"], Float[Tensor, "2 batch"]]
+"""Features, the change of pose that led to them, and 1 where change, step, turn and contacts are known."""
 _OVERLAP_SHARE, _MOST_OVERLAP = 8, 6  # K is so much of the frames, and no more
 
 
@@ -27,12 +29,15 @@ class Ends:
     """Frames up to each side's end, which is the last, in the side's own sense of time."""
     present: Float[Tensor, "2 batch context"]
     """1 where there is such a frame; the last always is, and those before it without a gap."""
-    paced: Float[Tensor, "2 batch"]
-    """1 where step, turn and contacts of the end are known; of a bare pose they are not."""
     place: Float[Tensor, "batch 2"]
     """Where the second end is over the ground, seen from the first in its heading frame, metres."""
     turn: Float[Tensor, "batch"]
     """By how much its heading is another, radians."""
+
+    @property
+    def paced(self) -> Float[Tensor, "2 batch"]:
+        """1 where step, turn and contacts of the end are known: not of a bare pose, without a frame before it."""
+        return self.present[:, :, -2] if self.present.shape[2] > 1 else torch.zeros_like(self.present[:, :, 0])
 
 
 @runtime_checkable
@@ -91,20 +96,21 @@ def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Laten
     """Walk both sides of a transition of so many frames from pose to pose until they overlap."""
     without = network.config.without
     made = count_made(network, frames)
-    now, memory, shared, at = _enter(network, ends, frames, latents)
-    at_ends, far, far_at, far_paced = memory.phase, now, at, ends.paced
-    paced, rows = ends.paced, []
+    memory, shared, at = _enter(network, ends, frames, latents)
+    now, change, paced = far, far_change, far_paced = _pick_end(ends)
+    at_ends, far_at, rows = memory.phase, at, []
     for step in range(made):
         left = frames - 2 * step
         aligned = left >= 1 and "ba" not in without
-        target, target_at = (now, at) if aligned else (far, far_at)
-        target_paced = paced if aligned else far_paced
-        situation = _look(now, paced, at, target, target_paced, target_at, float(left if aligned else frames - step))
+        target, target_at = ((now, change, paced), at) if aligned else ((far, far_change, far_paced), far_at)
+        situation = _look((now, change, paced), at, target, target_at, float(left if aligned else frames - step))
         seen = network.embed(situation)
         encoded, encoder, prior = network.encode(seen, situation, memory, torch.full_like(paced, float(step)))
         own = latents.own(prior, encoded, step)
         latent = torch.cat([shared.expand(2, -1, -1), own], dim=-1)
+        before = now
         now, logits, memory, share = network.decode(seen, encoded, latent, situation, memory, encoder)
+        change = (now - before)[..., POSE]
         at = at.displace(*_pick_pace(now))
         paced = torch.ones_like(paced)
         rows.append((now, logits, at.position_xz, at.heading, memory.phase, share))
@@ -124,27 +130,26 @@ def reverse_sense(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*bat
 
 def _enter(
     network: StitcherNetwork, ends: Ends, frames: int, latents: Latents
-) -> tuple[Float[Tensor, "2 batch size"], Memory, Float[Tensor, "batch shared"], GroundPose]:
-    """Walk through the frames before each end; returns the end itself, the memory there, what is shared and where the
-    ends are."""
+) -> tuple[Memory, Float[Tensor, "batch shared"], GroundPose]:
+    """Walk through the frames before each end; returns the memory there, what is shared and where the ends are."""
     context = ends.features.shape[2]
     zero = torch.zeros_like(ends.place)
     at = GroundPose(torch.stack([zero, ends.place]), torch.stack([zero[:, 0], ends.turn]))
     grounds = [at]
     for number in range(context - 1, 0, -1):
         grounds.insert(0, grounds[0].before(*_pick_pace(ends.features[:, :, number])))
-    end = ends.features[:, :, -1]
+    end = _pick_end(ends)
 
-    def look(number: int, paced: Tensor) -> Situation:
+    def look(number: int) -> Situation:
         left = float(frames + context - 1 - number)
-        return _look(ends.features[:, :, number], paced, grounds[number], end, ends.paced, at, left)
+        return _look(_pick_frame(ends, number), grounds[number], end, at, left)
 
-    first = network.embed(look(context - 1, ends.paced))
+    first = network.embed(look(context - 1))
     shared = latents.share(network.tell_shared(first), first)
-    memory, before = network.begin(first), torch.zeros_like(ends.paced)
+    memory, before = network.begin(first), torch.zeros_like(ends.present[:, :, 0])
     for number in range(context - 1):
         there = ends.present[:, :, number]
-        situation = look(number, before)
+        situation = look(number)
         seen = network.embed(situation)
         memory = network.begin(seen).keep(memory, 1 - before)
         encoded, encoder, prior = network.encode(seen, situation, memory, torch.zeros_like(there))
@@ -153,19 +158,33 @@ def _enter(
         memory, before = after.keep(memory, there), there
     if context > 1:
         memory = network.begin(first).keep(memory, 1 - before)
-    return end, memory, shared, at
+    return memory, shared, at
 
 
-def _look(
-    now: Tensor, paced: Tensor, at: GroundPose, target: Tensor, target_paced: Tensor, target_at: GroundPose, left: float
-) -> Situation:
+def _pick_end(ends: Ends) -> Frame:
+    return _pick_frame(ends, ends.features.shape[2] - 1)
+
+
+def _pick_frame(ends: Ends, number: int) -> Frame:
+    """Pick a frame, its change of pose since the frame before, and whether that one is known."""
+    now = ends.features[:, :, number]
+    if number == 0:
+        return now, torch.zeros_like(now[..., POSE]), torch.zeros_like(ends.present[:, :, 0])
+    return now, (now - ends.features[:, :, number - 1])[..., POSE], ends.present[:, :, number - 1]
+
+
+def _look(now: Frame, at: GroundPose, target: Frame, target_at: GroundPose, left: float) -> Situation:
     """Tell each side what it knows: of the other it sees the frame given for it."""
     away = target_at.position_xz.flip(0) - at.position_xz
+    features, change, paced = now
+    aim, aim_change, aim_paced = target
     return Situation(
-        features=now,
+        features=features,
+        change=change,
         paced=paced,
-        target=reverse_sense(target.flip(0)),
-        target_paced=target_paced.flip(0),
+        target=reverse_sense(aim.flip(0)),
+        target_change=-aim_change.flip(0),
+        target_paced=aim_paced.flip(0),
         place=rotations.rotate_ground(away, -at.heading),
         turn=rotations.wrap_angle(target_at.heading.flip(0) - at.heading),
         left=torch.full_like(paced, left),

@@ -101,6 +101,6 @@ def test_kinds_are_drawn_evenly():
     uneven = PoseWindows(corpus(), kinds=("walk", "run"), evenness=0.0)
     shares = []
     for windows in (WINDOWS, uneven):
-        room = (windows.lengths - 39).float() * windows.weights
+        room = (windows.picker.lengths - 39).float() * windows.picker.weights
         shares.append(float(room[0] / room.sum()))
     assert abs(shares[0] - 0.5) < abs(shares[1] - 0.5)

@@ -22,8 +22,6 @@ class Known(NamedTuple):
     """Frames before the first pose."""
     after: int = 0
     """Frames after the second."""
-    paced: bool = False
-    """Whether step, turn and contacts are told of a pose without such frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +55,10 @@ class Transition:
             sides.append(torch.cat([rows[:, :1].expand(-1, context - 1 - count, -1), rows], dim=1))
             present.append((torch.arange(context) >= context - 1 - count).float())
         place, turn = self.integrate()
-        paced = torch.tensor([float(known.paced or count > 0) for count in (known.before, known.after)])
         batch = len(self.features)
         return Ends(
             torch.stack(sides),
             torch.stack(present)[:, None].expand(-1, batch, -1),
-            paced[:, None].expand(-1, batch),
             place[:, -1],
             turn[:, -1],
         )

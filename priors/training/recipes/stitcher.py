@@ -25,8 +25,6 @@ _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
 _LEAST_WINDOW = 16  # frames of the longest transition
 _CONTEXT = 10  # frames told before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
-_NATS_FREE, _NATS_GROWTH = 0.1, 0.4  # shares of training in which latents cost little, and then more and more
-_LEAST_NATS = 0.05  # share of that cost at first: without any the posterior runs away from the prior
 _AVERAGE = 0.999
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 _MAX_NORM = 1.0
@@ -109,10 +107,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(settings.batch, frames, self._draw_known(), self.generator)
-        growth = min(1.0, max(_LEAST_NATS, (done - _NATS_FREE) / _NATS_GROWTH))
-        weights = settings.weights
-        weights = replace(weights, shared=growth * weights.shared, own=growth * weights.own)
-        shares = settings.informed, settings.calm
+        weights, shares = settings.weights, (settings.informed, settings.calm)
         with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
             return compute_stitcher_losses(self.network, self.posterior, truth, shares, weights, self.generator)
 
@@ -135,13 +130,14 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         return [*self.network.parameters(), *self.posterior.parameters()]
 
     def _draw_known(self) -> Known:
-        """Two bare poses in half of the cases; their pace in a quarter; up to 10 frames before, and after or not, in
-        the rest."""
+        """Two bare poses in two fifths of the cases; in the rest up to 10 frames before, and after or not."""
         share = float(torch.rand((), generator=self.generator))
-        if share < 0.75:
-            return Known(paced=share >= 0.5)
         before, after = torch.randint(0, _CONTEXT + 1, (2,), generator=self.generator).tolist()
-        return Known(max(1, before) if share < 0.85 else _CONTEXT, after if share < 0.875 else 0)
+        if share < 0.4:
+            return Known()
+        if share < 0.55:
+            return Known(1, min(1, after))
+        return Known(max(1, before) if share < 0.75 else _CONTEXT, after if share < 0.8 else 0)
 
 
 @dataclass(frozen=True)
