@@ -52,16 +52,18 @@ def load_infiller(name: str) -> ConvInfiller:
     return infiller_network.load(name)
 
 
-def load_inbetweener(name: str = "transformer", path: str = "path") -> ConvInfiller | PoseTransformer | Tweener:
-    """The bundled pose transformer or tweener, or a trained transformer, infiller or tweener by its file or run folder;
-    CheckpointError for anything else. A tweener goes by the path predictor `path`."""
+def load_inbetweener(
+    name: str = "transformer", path: str = "path"
+) -> ConvInfiller | PoseTransformer | Tweener | Stitcher:
+    """The bundled pose transformer, tweener or stitcher, or a trained one, or a trained infiller, by its file or run
+    folder; CheckpointError for anything else. A tweener goes by the path predictor `path`."""
     kind = find_inbetweener_kind(name)
     return load_tweener(name, path) if kind == "tweener" else _INBETWEENERS[kind](name)
 
 
 def find_inbetweener_kind(name: str) -> str:
-    """The kind of a bundled or trained in-betweener, from its card: `pose-transformer`, `infiller` or `tweener`;
-    CheckpointError for anything else."""
+    """The kind of a bundled or trained in-betweener, from its card: `pose-transformer`, `infiller`, `tweener` or
+    `stitcher`; CheckpointError for anything else."""
     found = checkpoints.locate(name)
     kind = checkpoints.read_card(found.with_suffix(".json")).kind
     if kind not in (*_INBETWEENERS, "tweener"):
@@ -103,4 +105,4 @@ def refiner_of(prior: str, name: str = "auto") -> LstmRefiner | None:
     return load_refiner(own) if own in checkpoints.list_bundled() else None
 
 
-_INBETWEENERS = {"infiller": load_infiller, "pose-transformer": load_transformer}
+_INBETWEENERS = {"infiller": load_infiller, "pose-transformer": load_transformer, "stitcher": load_stitcher}

@@ -1,5 +1,7 @@
 """A small stitcher, for tests."""
 
+from pathlib import Path
+
 import torch
 
 from mapctl.features import LAYOUT
@@ -45,6 +47,13 @@ def card(config: StitcherConfig = CONFIG) -> checkpoints.Card:
         abilities={},
         **checkpoints.Card.layout_fields(),
     )
+
+
+def save_tiny_stitcher(path: Path, *, drawn: float = 0.3) -> Path:
+    """Write the weights and the card; returns the path for --stitcher."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
+    return path
 
 
 def tiny_stitcher(config: StitcherConfig = CONFIG, *, drawn: float = 0.3) -> Stitcher:

@@ -81,6 +81,7 @@ def fill(
     asked, query = query, show_drawn_poses(query, inbetweener, generator)
     answer, reached = propose_through_keys(query, inbetweener, generator)
     answer = meet_places(answer, query)
+    proposed = time.perf_counter()
     made, ledger, windows = answer.motion, Ledger(), ()
     if settings.finish:
         firm = replace(query, missing=hold_loose_keys(query))
@@ -97,6 +98,7 @@ def fill(
         ledger,
         windows,
         seconds=time.perf_counter() - began,
+        proposal_seconds=proposed - began,
         missing=missing,
         rig=as_rig(clip.rigmap),
         contacts=contacts.debounced(answer.contact_logits > 0),

@@ -1,5 +1,6 @@
 """Solution of in-betweening: a complete motion, what of it was missing, and who proposed it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +15,16 @@ from mapctl.problem.solution import Solution
 from mapctl.retarget.rigs import Rig
 
 
+@dataclass(frozen=True)
+class Pick:
+    """Which of several answers this is."""
+
+    name: str
+    """Its own."""
+    energies: Mapping[str, float]
+    """Mean energies of a frame by the names of all answers, nats."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InbetweenSolution(Solution):
     """A complete motion on the given rig, at its rate, with all of its frames."""
@@ -26,6 +37,10 @@ class InbetweenSolution(Solution):
     """Contacts of the left and the right toe, at PRIOR_FPS."""
     sources: tuple[GapSource, ...] = ()
     """Proposer of the motion in each gap in which nothing was known."""
+    proposal_seconds: float = 0.0
+    """Of `seconds`, those in which the in-betweener proposed."""
+    pick: Pick | None = None
+    """Which of several answers this is; None where one alone was made."""
     gap_notes: tuple[str, ...] = ()
     """A note on each of these gaps: proposer, error estimate, remarks."""
 
@@ -48,10 +63,26 @@ class InbetweenSolution(Solution):
         ]
 
     def details(self) -> dict[str, Any]:
-        """Return gaps, who filled them, contacts at PRIOR_FPS, and compute of each filled frame."""
+        """Return gaps, who filled them, contacts at PRIOR_FPS, and compute of each filled frame.
+
+        `sides_apart_cm` is the farthest at which two sides met, if any did; `fallback` lists gaps, in frames at
+        PRIOR_FPS, that were not the in-betweener's that was asked for.
+        """
+        apart = [100 * source.apart for source in self.sources if source.apart is not None]
         return {
             "gaps": self.list_gaps(),
             "gap_notes": list(self.gap_notes),
+            "fallback": [
+                {"start": source.start, "stop": source.stop, "by": source.by, "reason": source.reason}
+                for source in self.sources
+                if source.reason
+            ],
+            **({"sides_apart_cm": max(apart)} if apart else {}),
+            **({"picked": self.pick.name, "draws": dict(self.pick.energies)} if self.pick else {}),
+            "timing": {
+                "draw_ms": 1000 * self.proposal_seconds,
+                "finish_ms": 1000 * (self.seconds - self.proposal_seconds),
+            },
             "contacts": self.contacts.tolist(),
             "frame_ms": self.frame_ms,
         }

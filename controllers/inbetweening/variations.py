@@ -1,6 +1,6 @@
 """Variations: different motions through the same keys, each with its energy."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,7 +12,7 @@ from controllers.inbetweening.proposers.rolling import select_likeliest_density
 from controllers.inbetweening.proposers.rollouts import RolloutInbetweener
 from controllers.inbetweening.proposers.slerp import SlerpInbetweener
 from controllers.inbetweening.refine import INFILL_REFINEMENT
-from controllers.inbetweening.solution import InbetweenSolution
+from controllers.inbetweening.solution import InbetweenSolution, Pick
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics.realism import Diversity, measure_diversity
@@ -26,8 +26,20 @@ _MIN_FRAMES = 8  # frames at PRIOR_FPS of the shortest motion whose energy is me
 
 Tweening = Callable[[Inbetweener, torch.Generator], InbetweenSolution]
 """Function that makes one variation: `tween` with its motion, keys and settings bound."""
-StyleDraw = Callable[[int, torch.Generator], Inbetweener]
-"""Function that returns the in-betweener, in a style of its own, of the variation of a number among those drawn."""
+Drawing = Callable[[int, torch.Generator], Inbetweener]
+"""Function that returns the in-betweener of the variation of a number among those drawn."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Who makes the variations after the first."""
+
+    draw: Drawing
+    """Draws an in-betweener for each."""
+    name: str
+    """What one of them is called, as in `rollout`."""
+    room: str
+    """What two keys need for a choice between them, as in `room for a style`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +74,13 @@ def sample_variations(
     count: int,
     *,
     generator: torch.Generator,
-    styles: StyleDraw | None = None,
+    source: Source | None = None,
     refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> Variations:
     """Make so many motions through the same keys. The first ones do not depend on the count.
 
-    The first is by one in-betweener. The others are by those that `styles` draws; without, the likeliest density of
+    The first is by one in-betweener. The others are by those that `source` draws; without, the likeliest density of
     `rollouts` is sampled and steered from key to key. Energies are by that density. RequestError for fewer than two,
     and for keys that are too close in time to leave a choice.
     """
@@ -76,11 +88,10 @@ def sample_variations(
         raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
     found = [_make_first(make, first, generator)]
     density = _select_density(rollouts, found[0])
-    rolled = replace(rollouts, densities=[density])
-    found += _sample(make, styles or (lambda number, draws: rolled), count - 1, generator, progress)
+    source = source or _roll_out(rollouts, density)
+    found += _sample(make, source.draw, count - 1, generator, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
-        room = "room for a style" if styles else f"{rollouts.settings.span} between them"
-        raise RequestError(f"no two keys have {room}, which leaves nothing to vary")
+        raise RequestError(f"no two keys have {source.room}, which leaves nothing to vary")
     each = tuple(_score_variation(one, density, refinement) for one in found)
     return Variations(each, measure_diversity([one.motion for one in found]))
 
@@ -91,24 +102,38 @@ def lowest_energy(
     count: int,
     *,
     generator: torch.Generator,
+    first: Mapping[str, Inbetweener] | None = None,
+    source: Source | None = None,
     refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> InbetweenSolution:
-    """Make so many motions and keep the one with the lowest energy: by the rollouts' fallback, by slerp, and sampled;
-    its status lists all energies. RequestError for fewer than two.
+    """Make so many motions and keep the one with the lowest energy: by the `first` in-betweeners under their names, or
+    by the rollouts' fallback and slerp, and sampled by `source`, or from the likeliest density. Its status lists all
+    energies. RequestError for fewer than two.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"the best is of 2 to {MAX_VARIATIONS}, got {count}")
-    found = [_make_first(make, AutoInbetweener(rollouts.fallback), generator), make(SlerpInbetweener(), generator)]
+    first = first or {"network": AutoInbetweener(rollouts.fallback), "slerp": SlerpInbetweener()}
+    found = [make(each, generator) for each in list(first.values())[1:count]]
+    found.insert(0, _make_first(make, next(iter(first.values())), generator))
     density = _select_density(rollouts, found[0])
-    rolled = replace(rollouts, densities=[density])
-    found += _sample(make, lambda number, draws: rolled, count - 2, generator, progress)
+    source = source or _roll_out(rollouts, density)
+    drawn = count - len(found)
+    found += _sample(make, source.draw, drawn, generator, progress)
     nats = [_score_variation(one, density, refinement).energy for one in found]
-    names = ["infiller", "slerp", *(f"rollout {number + 1}" for number in range(count - 2))]
+    names = [*first, *(f"{source.name} {number + 1}" for number in range(drawn))]
     best = found[index := min(range(count), key=nats.__getitem__)]
-    energies = ", ".join(f"{name} {one:.1f}" for name, one in zip(names, nats, strict=True))
+    energies = ", ".join(f"{name} {one:.1f}" for name, one in zip(names, nats, strict=False))
     note = f"the best of {count} is from the {names[index]}; nats a frame: {energies}"
-    return replace(best, seconds=sum(one.seconds for one in found), status=best.status.with_notes([note]))
+    pick = Pick(names[index], dict(zip(names, nats, strict=False)))
+    seconds = sum(one.seconds for one in found)
+    return replace(best, seconds=seconds, pick=pick, status=best.status.with_notes([note]))
+
+
+def _roll_out(rollouts: RolloutInbetweener, density: Density) -> Source:
+    """Steer rollouts of a density from key to key."""
+    rolled = replace(rollouts, densities=[density])
+    return Source(lambda number, draws: rolled, "rollout", f"{rollouts.settings.span} between them")
 
 
 def _make_first(make: Tweening, first: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
@@ -128,7 +153,7 @@ def _score_variation(made: InbetweenSolution, density: Density, refinement: Refi
 
 
 def _sample(
-    make: Tweening, draw: StyleDraw, count: int, generator: torch.Generator, progress: Callable[[int, int], None] | None
+    make: Tweening, draw: Drawing, count: int, generator: torch.Generator, progress: Callable[[int, int], None] | None
 ) -> Sequence[InbetweenSolution]:
     """Sample variations, each with a seed of its own: the first ones do not depend on the count."""
     found = []

@@ -15,6 +15,9 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
+INTERPOLATION = "interpolation"
+"""Name of the source of a gap that stays as it was interpolated."""
+
 
 @dataclass(frozen=True, eq=False)
 class GapQuery:
@@ -86,6 +89,8 @@ class GapSource:
     """Name of the in-betweener, as in `infiller` or `rollout of locomotion`."""
     reason: str = ""
     """Why another in-betweener that was tried first did not propose; empty where none was."""
+    apart: float | None = None
+    """Mean distance of joints, metres, at which two sides met that were then joined; None of what has no sides."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
-from mapctl.inbetweening.query import GapSource
+from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.numerics.intervals import true_intervals
 from mapctl.protocols import Inbetweener
@@ -70,7 +70,7 @@ class PoseTransformer(Inbetweener):
         )
         reason = f"longer than the {MAX_GAP_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} fills"
         others = tuple(
-            GapSource(start, stop, "interpolation", reason) for _, start, stop in true_intervals(too_long[:, None])
+            GapSource(start, stop, INTERPOLATION, reason) for _, start, stop in true_intervals(too_long[:, None])
         )
         spread = poses.log_spread[0].exp() * query.scale
         return Proposal(replace(shown, root_position=root, local_quat_xyzw=quats), logits, SOURCE, others, spread)

@@ -9,11 +9,13 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS, encode, mirror_features, reversed_features
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.query import GapSource
+from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
+from priors.stitching.draws import CHUNK, Draws
 from priors.stitching.joining import Joined, join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import StitcherConfig, StitcherNetwork
@@ -23,7 +25,7 @@ SOURCE = "stitcher"
 """Name of the in-betweener in notes."""
 MAX_CONTEXT = 10
 """Frames before a gap, and after it, that are looked at."""
-_CHUNK = 8  # draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count
+_NOT_FINITE = "nothing finite came of it"
 _PARTNERS = CANONICAL.mirror_partners()
 
 
@@ -37,19 +39,23 @@ class Stitcher(Inbetweener):
     """Network in evaluation mode."""
     card: checkpoints.Card
     """Card of the weights."""
-    drawn: bool = False
-    """Whether `propose` draws one of many answers; the calm answer otherwise, with the latent at its mean."""
-    temperature: float = 1.0
-    """Standard deviation of the noise that is drawn."""
+    draws: Draws | None = None
+    """What it draws its answers from; without it gives the calm one, with the latent at its mean."""
+    number: int = 0
+    """Number of the draw that it proposes."""
 
     @property
     def longest(self) -> int:
         """Frames of the longest gap that it fills."""
         return self.network.config.longest - 1
 
-    def drawing(self, temperature: float = 1.0) -> "Stitcher":
-        """Return the in-betweener that draws its answers."""
-        return replace(self, drawn=True, temperature=temperature)
+    def drawing(self, seed: int = 0, temperature: float = 1.0) -> "Stitcher":
+        """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others."""
+        return replace(self, draws=Draws(seed, temperature), number=0)
+
+    def numbered(self, number: int) -> "Stitcher":
+        """Return the in-betweener that proposes the draw of a number, from 0 on."""
+        return replace(self, number=number)
 
     @torch.no_grad()
     def draw(
@@ -57,16 +63,17 @@ class Stitcher(Inbetweener):
     ) -> Joined:
         """Draw so many answers to one pair of poses, `frames` from the one to the other; the first ones do not depend
         on the count."""
-        network, config = self.network, self.network.config
-        ends = _repeat(ends, _CHUNK)
-        made, rows = count_made(network, frames), []
-        for _ in range(-(-count // _CHUNK)):
-            latents = DrawnLatents.sample(_CHUNK, made, config.shared, config.own, generator)
-            latents = DrawnLatents(temperature * latents.shared, temperature * latents.slow)
-            rows.append(join_sides(walk_sides(network, ends, frames, latents), ends))
+        rows = [self._draw_chunk(ends, frames, generator, temperature) for _ in range(-(-count // CHUNK))]
         return Joined(
             *(torch.cat([getattr(row, name) for row in rows])[:count] for name in Joined.__dataclass_fields__)
         )
+
+    def _draw_chunk(self, ends: Ends, frames: int, generator: torch.Generator, temperature: float) -> Joined:
+        config, made = self.network.config, count_made(self.network, frames)
+        latents = DrawnLatents.sample(CHUNK, made, config.shared, config.own, generator)
+        latents = DrawnLatents(temperature * latents.shared, temperature * latents.slow)
+        ends = _repeat(ends, CHUNK)
+        return join_sides(walk_sides(self.network, ends, frames, latents), ends)
 
     @torch.no_grad()
     def answer(self, ends: Ends, frames: int) -> Joined:
@@ -85,30 +92,36 @@ class Stitcher(Inbetweener):
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose motion for gaps between whole poses of up to `longest` frames; all else stays interpolated, and the
-        proposal says so. Frames beside a gap that are wholly known, up to MAX_CONTEXT of them, are looked at."""
+        proposal says so. Frames beside a gap that are wholly known, up to MAX_CONTEXT of them, are looked at. Draws
+        have a seed of their own."""
         body = query.to_unit_size(query.motion)
         toes = body.joint_positions()[:, list(TOE_JOINTS)]
         root, quats = body.root_position.clone(), body.local_quat_xyzw.clone()
         logits = contacts.to_logits(contacts.detect_contacts(toes, PRIOR_FPS)).float()
-        generator = generator or torch.Generator().manual_seed(0)
-        others = []
+        sources = []
         for start, stop in query.enclosed_gaps:
             reason = self._refuse(query, start, stop)
-            if reason:
-                others.append(GapSource(start, stop, "interpolation", reason))
+            found = None if reason else self._find(see_ends(body, query.missing.frames, start, stop), start, stop)
+            if found is None:
+                sources.append(GapSource(start, stop, INTERPOLATION, reason or _NOT_FINITE))
                 continue
-            ends, frames = see_ends(body, query.missing.frames, start, stop), stop - start + 1
-            if self.drawn:
-                found = self.draw(ends, frames, count=1, generator=generator, temperature=self.temperature)
-            else:
-                found = self.answer(ends, frames)
             part = slice(start, stop)
             root[part], quats[part] = _place(found, body, start)
             logits[part] = found.contacts[0]
-        if (partly := _find_partly_known(query)) is not None:
-            others.append(partly)
+            sources.append(GapSource(start, stop, SOURCE, apart=query.scale * float(found.apart[0])))
+        sources += _list_partly_known(query)
         moved = replace(body, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
-        return Proposal(query.to_character(moved), logits, SOURCE, tuple(others))
+        return Proposal(query.to_character(moved), logits, SOURCE, tuple(sources))
+
+    def _find(self, ends: Ends, start: int, stop: int) -> Joined | None:
+        """Find the answer to the ends of a gap; None where it is not finite."""
+        frames = stop - start + 1
+        if self.draws is not None:
+            return self.draws.pick(
+                ends, start, frames, self.number, lambda noise, heat: self._draw_chunk(ends, frames, noise, heat)
+            )
+        calm = self.answer(ends, frames)
+        return calm if bool(calm.finite.all()) else None
 
     def _refuse(self, query: GapQuery, start: int, stop: int) -> str:
         """Return why a gap is not stitched; empty where it is."""
@@ -191,16 +204,13 @@ def _repeat(ends: Ends, count: int) -> Ends:
     )
 
 
-def _find_partly_known(query: GapQuery) -> GapSource | None:
-    """Find frames that are known in part, or have nothing known on one side."""
-    enclosed = torch.zeros(query.motion.num_frames, dtype=torch.bool)
+def _list_partly_known(query: GapQuery) -> list[GapSource]:
+    """List runs of frames that are known in part, or have nothing known on one side."""
+    rest = query.missing.frames.clone()
     for start, stop in query.enclosed_gaps:
-        enclosed[start:stop] = True
-    rest = (query.missing.frames & ~enclosed).nonzero()[:, 0]
-    if not len(rest):
-        return None
+        rest[start:stop] = False
     reason = f"known in part or on one side alone, where the {SOURCE} takes whole poses"
-    return GapSource(int(rest[0]), int(rest[-1]) + 1, "interpolation", reason)
+    return [GapSource(start, stop, INTERPOLATION, reason) for _, start, stop in true_intervals(rest[:, None])]
 
 
 def load(name: str = "stitcher") -> Stitcher:

@@ -7,7 +7,7 @@ slide both feet; spread over the whole way they are a slightly longer or shorter
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
@@ -28,6 +28,16 @@ class Joined:
     """Logits of planted toes."""
     apart: Float[Tensor, " batch"]
     """Mean distance of the two sides' joints in the middle of their overlap before they are joined, metres (MMPE)."""
+
+    @property
+    def finite(self) -> Bool[Tensor, " batch"]:
+        """Whether all numbers of a motion are finite."""
+        return self.root_position.isfinite().flatten(1).all(dim=1) & self.quats.isfinite().flatten(1).all(dim=1)
+
+    def row(self, number: int) -> "Joined":
+        """Return one motion, as a batch of one."""
+        part = slice(number, number + 1)
+        return Joined(self.root_position[part], self.quats[part], self.contacts[part], self.apart[part])
 
 
 def join_sides(sides: Sides, ends: Ends) -> Joined:

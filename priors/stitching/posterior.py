@@ -23,9 +23,7 @@ class PosteriorNetwork(nn.Module):
         super().__init__()
         self.frame = nn.Sequential(nn.Linear(LAYOUT.size, _WIDTH), nn.ELU(), nn.Linear(_WIDTH, _WIDTH), nn.ELU())
         self.whole = nn.Sequential(
-            nn.Linear((_MOMENTS + 1) * _WIDTH, 2 * _WIDTH),
-            nn.ELU(),
-            nn.Linear(2 * _WIDTH, 2 * config.shared),
+            nn.Linear((_MOMENTS + 1) * _WIDTH, 2 * _WIDTH), nn.ELU(), nn.Linear(2 * _WIDTH, 2 * config.shared)
         )
         self.next = SidedLayers(SEEN_FUTURE * LAYOUT.size + config.encoder, 2 * _WIDTH, 2 * config.own)
 

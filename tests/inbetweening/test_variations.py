@@ -196,13 +196,13 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
     make = making(motion, Keys(keys))
     made = lowest_energy(make, rollouts, 4, generator=generator(0), refinement=FEW.refinement)
     assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
-    told = dict(re.findall(r"(infiller|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
-    assert list(told) == ["infiller", "slerp", "rollout 1", "rollout 2"]
+    told = dict(re.findall(r"(network|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
+    assert list(told) == ["network", "slerp", "rollout 1", "rollout 2"]
     winner = min(told, key=lambda name: float(told[name]))
     assert made.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
     # Its own energy, found anew, is that told; the answers that variations have as well have the same.
     others = asked(motion, prior, keys=keys).each
-    for name, one in zip(("infiller", "rollout 1", "rollout 2"), others, strict=True):
+    for name, one in zip(("network", "rollout 1", "rollout 2"), others, strict=True):
         assert float(told[name]) == pytest.approx(one.energy, abs=0.06)
         if name == winner:
             assert torch.equal(made.motion.local_quat_xyzw, one.solution.motion.local_quat_xyzw)

@@ -14,6 +14,7 @@ from mapctl.features import encode, mirror_features, reversed_features
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
+from priors.stitching.draws import Draws
 from priors.stitching.inbetweener import see_ends
 from priors.stitching.joining import join_sides
 from priors.stitching.latents import DrawnLatents
@@ -155,11 +156,42 @@ def test_gaps_are_filled_between_poses_that_stay_and_too_long_ones_are_named():
     assert float(step) < 2 * float(motion.joint_positions().diff(dim=0).norm(dim=-1).max())
 
 
-def test_one_that_draws_gives_the_same_for_the_same_seed_and_another_for_another():
-    query, drawing = query_of(walk(60), (20, 40)), tiny_stitcher().drawing()
+def test_one_that_draws_gives_the_same_for_the_same_seed_and_number_and_others_for_others():
+    query = query_of(walk(60), (20, 40))
 
-    def places(seed):
-        return drawing.propose(query, generator=torch.Generator().manual_seed(seed)).motion.root_position
+    def places(seed, number):
+        return tiny_stitcher().drawing(seed).numbered(number).propose(query).motion.root_position
 
-    assert torch.equal(places(1), places(1))
-    assert float((places(1) - places(2)).abs().max()) > 1e-5
+    assert torch.equal(places(1, 9), places(1, 9))
+    for other in ((1, 0), (1, 8), (2, 9)):
+        assert float((places(1, 9) - places(*other)).abs().max()) > 1e-5
+
+
+def test_draws_for_one_gap_are_not_taken_for_another():
+    drawing, gap = tiny_stitcher().drawing(1), (20, 40)
+    one, two = (drawing.propose(query_of(each, gap)) for each in (walk(60), walk(60, turn_rate=0.5)))
+    fresh = tiny_stitcher().drawing(1).propose(query_of(walk(60, turn_rate=0.5), gap))
+    assert torch.equal(two.motion.root_position, fresh.motion.root_position)
+    assert not torch.equal(one.motion.root_position, two.motion.root_position)
+
+
+def test_draws_that_are_not_finite_are_dropped_and_counted():
+    made = tiny_stitcher().draw(bare(walk(60), 11, 30), 20, count=8, generator=torch.Generator().manual_seed(3))
+    made.root_position[[2, 3]] = torch.nan
+    draws = Draws(0)
+
+    def pick(number):
+        return draws.pick(bare(walk(60), 11, 30), 11, 20, number, lambda noise, heat: made)
+
+    assert torch.equal(pick(2).quats, made.quats[4:5])
+    assert torch.equal(pick(1).quats, made.quats[1:2])
+    assert draws.dropped == 2
+    made.root_position[:] = torch.nan
+    assert Draws(0).pick(bare(walk(60), 11, 30), 11, 20, 0, lambda noise, heat: made) is None
+
+
+def test_an_answer_that_is_not_finite_is_left_to_another():
+    broken = tiny_stitcher()
+    broken.network.experts.shrink_last(float("nan"))
+    source = broken.propose(query_of(walk(60), (20, 40))).others[0]
+    assert (source.by, source.reason) == ("interpolation", "nothing finite came of it")

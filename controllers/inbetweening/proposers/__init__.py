@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from controllers.inbetweening.proposers.auto import AutoInbetweener
 from controllers.inbetweening.proposers.rollouts import RolloutInbetweener
 from controllers.inbetweening.proposers.slerp import SlerpInbetweener
+from controllers.inbetweening.proposers.stitched import StitchedInbetweener
 from mapctl.errors import RequestError
 from mapctl.protocols import Density, Inbetweener
 
@@ -15,6 +16,7 @@ __all__ = [
     "ModelLoaders",
     "RolloutInbetweener",
     "SlerpInbetweener",
+    "StitchedInbetweener",
     "build_inbetweener",
     "check_method",
 ]
@@ -31,6 +33,8 @@ class ModelLoaders:
     """Loader of the densities for rollouts."""
     tweener: Callable[[], Inbetweener]
     """Loader of the network for long gaps that `auto` takes beside the other."""
+    stitcher: Callable[[], Inbetweener]
+    """Loader of the network that fills gaps from both sides."""
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
@@ -38,6 +42,7 @@ METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
     "transformer": lambda models: models.network("transformer"),
     "infiller": lambda models: models.network("infiller"),
     "tweener": lambda models: models.network("tweener"),
+    "stitcher": lambda models: StitchedInbetweener(models.stitcher(), lambda: models.network("stitcher")),
     "rollouts": lambda models: RolloutInbetweener(models.densities(), models.network("rollouts")),
     "slerp": lambda models: SlerpInbetweener(),
 }

@@ -18,7 +18,9 @@ from scenes.film import film
 def run(command: Chain) -> int:
     """Check everything, chain, write, report."""
     options.check_seed(command.seed)
-    results.check_method(command.method, finish=not command.no_finish, inbetweener=command.inbetweener)
+    results.check_method(
+        command.method, finish=not command.no_finish, inbetweener=command.inbetweener, stitcher=command.stitcher
+    )
     results.check_destinations(command.out, command.video, given=command.clips)
     if command.path is not None and not results.takes_path(command.method, command.inbetweener):
         raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
@@ -26,7 +28,9 @@ def run(command: Chain) -> int:
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
     done = chain(
         [inputs.read_motion(path, None) for path in command.clips],
-        build_inbetweener(command.method, results.load_models(command.inbetweener, None, command.path, dna)),
+        build_inbetweener(
+            command.method, results.load_models(command.inbetweener, None, command.path, dna, command.stitcher)
+        ),
         settings=settings,
         filling=InfillSettings(finish=not command.no_finish),
         generator=torch.Generator().manual_seed(command.seed),

@@ -29,8 +29,9 @@ class Infill(Command):
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: options.Method = "auto"
     """Method that proposes. auto: the transformer, the tweener through gaps of more than 6 s, or a held pose where the
-    body stands still; a note on each gap names it. transformer, infiller, tweener: that network alone. rollouts: a
-    density's rollouts, wherever nothing is known. slerp: interpolation."""
+    body stands still; a note on each gap names it. transformer, infiller, tweener: that network alone. stitcher:
+    gaps of up to 2 s between whole poses from both sides. rollouts: a density's rollouts, wherever nothing is known.
+    slerp: interpolation."""
     dna: options.MaybeDna = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
     gaps with --method tweener, in those of 2 s and more without parts with auto."""
@@ -44,6 +45,9 @@ class Infill(Command):
     inbetweener: options.MaybeName = None
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""
+    stitcher: options.MaybeName = None
+    """The file or run folder of a trained stitcher for --method stitcher; the bundled one if not given. --inbetweener
+    then fills what it leaves."""
     path: options.MaybeName = None
     """For --way and the tweener: the file or run folder of a trained path predictor; the bundled one if not given."""
     prior: options.MaybeName = None

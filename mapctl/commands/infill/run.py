@@ -48,7 +48,9 @@ def _check(command: Infill) -> None:
     if command.curve is not None and command.dna is not None:
         raise RequestError("--dna says how to move and --curve where; only one of them can be had, leave the other out")
     finish, prior = not command.no_finish, command.prior
-    results.check_method(command.method, finish=finish, prior=prior, inbetweener=command.inbetweener)
+    results.check_method(
+        command.method, finish=finish, prior=prior, inbetweener=command.inbetweener, stitcher=command.stitcher
+    )
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
 
 
@@ -98,7 +100,9 @@ def _run_infilling(
 
 def _build_inbetweener(command: Infill) -> Inbetweener:
     dna = read_dna(command.dna, command.method)
-    return build_inbetweener(command.method, results.load_models(command.inbetweener, command.prior, command.path, dna))
+    return build_inbetweener(
+        command.method, results.load_models(command.inbetweener, command.prior, command.path, dna, command.stitcher)
+    )
 
 
 def _tell(command: Infill, done: InbetweenSolution) -> None:

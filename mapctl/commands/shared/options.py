@@ -32,7 +32,7 @@ MaybeSize = Annotated[str | None, arg(metavar="WxH")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
-Method = Annotated[str, arg(metavar="auto|transformer|infiller|tweener|rollouts|slerp")]
+Method = Annotated[str, arg(metavar="auto|transformer|infiller|tweener|stitcher|rollouts|slerp")]
 OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
 
 

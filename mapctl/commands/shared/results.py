@@ -19,6 +19,7 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
+from priors.stitching.inbetweener import Stitcher
 from scenes.plots.denoising import film_side_by_side
 
 _SIZE = (1280, 720)
@@ -34,9 +35,13 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
         outputs.check_film(video, _SIZE)
 
 
-def check_method(method: str, *, finish: bool, prior: str | None = None, inbetweener: str | None) -> None:
+def check_method(
+    method: str, *, finish: bool, prior: str | None = None, inbetweener: str | None, stitcher: str | None
+) -> None:
     """Raise RequestError for an unknown method, and for a density or a network that the method does not use."""
     proposers.check_method(method)
+    if stitcher is not None and method != "stitcher":
+        raise RequestError(f"--method {method} stitches nothing; leave --stitcher out or take --method stitcher")
     if prior is not None and not finish and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
     if inbetweener is not None and method == "slerp":
@@ -53,7 +58,11 @@ def _is_tweener(inbetweener: str | None) -> bool:
 
 
 def load_models(
-    inbetweener: str | None, prior: str | None, path: str | None = None, dna: Sequence[Example] = ()
+    inbetweener: str | None,
+    prior: str | None,
+    path: str | None = None,
+    dna: Sequence[Example] = (),
+    stitcher: str | None = None,
 ) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones, tweeners in a style if there is one; RequestError
     for a network that is not of the kind that the method asks for, and for classes that are not known. A named tweener
@@ -71,6 +80,8 @@ def load_models(
         # Of a named tweener `auto` makes its own for long gaps.
         named = None if method == "auto" and is_tweener else inbetweener
         network = priors.load_inbetweener(named or usual, path or "path")
+        if isinstance(network, Stitcher):
+            raise RequestError(f"{inbetweener} is a stitcher; name it by --stitcher, with --method stitcher")
         kinds = {"infiller": "infiller", "transformer": "pose-transformer", "tweener": "tweener"}
         wanted = kinds.get(method, network.card.kind)
         if network.card.kind != wanted:
@@ -80,7 +91,10 @@ def load_models(
     def load_tweener() -> Inbetweener:
         return tell_style(priors.load_tweener((is_tweener and inbetweener) or "tweener", path or "path"), dna)
 
-    return ModelLoaders(load_network, partial(priors.load_choice, prior or "auto"), load_tweener)
+    load_densities = partial(priors.load_choice, prior or "auto")
+    return ModelLoaders(
+        load_network, load_densities, load_tweener, partial(priors.load_stitcher, stitcher or "stitcher")
+    )
 
 
 def conclude(status: Status, *, strict: bool) -> int:

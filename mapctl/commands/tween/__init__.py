@@ -35,8 +35,9 @@ class Tween(Command):
     """The file or run folder of a trained keyframe timing for --suggest-timing; the bundled one if not given."""
     method: options.Method = "auto"
     """Method that proposes. auto: the transformer, the tweener through gaps of more than 6 s, or a held pose where the
-    body stands still; a note on each gap names it. transformer, infiller, tweener: that network alone. rollouts: a
-    density's rollouts, wherever nothing is known. slerp: interpolation."""
+    body stands still; a note on each gap names it. transformer, infiller, tweener: that network alone. stitcher:
+    gaps of up to 2 s between whole poses from both sides. rollouts: a density's rollouts, wherever nothing is known.
+    slerp: interpolation."""
     dna: options.MaybeDna = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
     gaps with --method tweener, in those of 2 s and more between whole poses with auto. Several are mixed."""
@@ -47,6 +48,9 @@ class Tween(Command):
     inbetweener: options.MaybeName = None
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""
+    stitcher: options.MaybeName = None
+    """The file or run folder of a trained stitcher for --method stitcher; the bundled one if not given. --inbetweener
+    then fills what it leaves."""
     path: options.MaybeName = None
     """The file or run folder of the path predictor that the tweener was trained with; the bundled one if not given."""
     prior: options.MaybeName = None
@@ -55,11 +59,12 @@ class Tween(Command):
     variations: options.Count = 1
     """Number of different motions, as OUT_000.bvh, OUT_001.bvh, ...: the first is what a single one would be. With
     --dna the others are in one of its styles each, and when all were had by some of the poses of one; with --method
-    tweener alone each is of a class. Else they are rollouts of densities (--prior, or auto), steered from key to
-    key."""
+    tweener alone each is of a class; with --method stitcher they are its draws. Else they are rollouts of densities
+    (--prior, or auto), steered from key to key."""
     best_of: options.Count = 1
     """Number of motions of which the one with the lowest energy is kept: from the network's proposal, slerp's, and
-    rollouts of densities (--prior, or auto) that are steered from key to key."""
+    rollouts of densities (--prior, or auto) that are steered from key to key; with --method stitcher from its calm
+    answer and its draws."""
     seed: options.Count = 0
     """Seed of everything that is sampled; the first variations do not depend on their number."""
     report: options.MaybeFile = None

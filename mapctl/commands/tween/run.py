@@ -34,7 +34,7 @@ def run(command: Tween) -> int:
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     clip = _read_keyframe_clip(command, request)
     dna = read_dna(command.dna, command.method)
-    models = results.load_models(command.inbetweener, command.prior, command.path, dna)
+    models = results.load_models(command.inbetweener, command.prior, command.path, dna, command.stitcher)
     make = _prepare_tweening(command, clip)
     if command.variations > 1:
         ok = variations.run_variations(command, clip, make, models, dna)
@@ -96,7 +96,13 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
     variations.check_answers(command, given)
     # Variations are rollouts of a density with every method.
     prior = command.prior if command.variations == command.best_of == 1 else None
-    results.check_method(command.method, finish=not command.no_finish, prior=prior, inbetweener=command.inbetweener)
+    results.check_method(
+        command.method,
+        finish=not command.no_finish,
+        prior=prior,
+        inbetweener=command.inbetweener,
+        stitcher=command.stitcher,
+    )
 
 
 def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:

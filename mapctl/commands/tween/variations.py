@@ -3,15 +3,16 @@
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from controllers.inbetweening.keyframe_poses import KeyframeClip
-from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, build_inbetweener
+from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, StitchedInbetweener, build_inbetweener
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors
-from controllers.inbetweening.variations import StyleDraw, Tweening, Variations, lowest_energy, sample_variations
+from controllers.inbetweening.variations import Source, Tweening, Variations, lowest_energy, sample_variations
 from mapctl import formats, report
 from mapctl.commands.shared import options, results
 from mapctl.commands.shared.progress_bar import show_progress
@@ -20,6 +21,7 @@ from mapctl.commands.tween import Tween
 from mapctl.errors import RequestError
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
+from priors.stitching.inbetweener import Stitcher
 from priors.tweening.styles import draw_style
 from scenes.film import draw_strips_to
 
@@ -64,8 +66,13 @@ def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) ->
     """Make several motions and keep the one with the lowest energy."""
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("answers", quiet=command.quiet) as progress:
-        rollouts = RolloutInbetweener(models.densities(), models.network("rollouts"))
-        return lowest_energy(make, rollouts, command.best_of, generator=generator, progress=progress)
+        stitched = build_inbetweener("stitcher", models) if command.method == "stitcher" else None
+        source = _draw_stitches(command, stitched)
+        first = {"calm": stitched} if stitched else None
+        rollouts = RolloutInbetweener(models.densities(), stitched or models.network("rollouts"))
+        return lowest_energy(
+            make, rollouts, command.best_of, generator=generator, first=first, source=source, progress=progress
+        )
 
 
 def run_variations(
@@ -75,11 +82,11 @@ def run_variations(
     generator = torch.Generator().manual_seed(command.seed)
     with show_progress("variations", quiet=command.quiet) as progress:
         first = build_inbetweener(command.method, models)
-        # Where there are styles the density only tells energies.
-        styles = _prepare_styles(command, first, dna)
-        rollouts = RolloutInbetweener(models.densities(), first if styles else models.network("rollouts"))
+        # Where others are drawn from the density only tells energies.
+        source = _draw_stitches(command, first) or _prepare_styles(command, first, dna)
+        rollouts = RolloutInbetweener(models.densities(), first if source else models.network("rollouts"))
         found = sample_variations(
-            make, first, rollouts, command.variations, generator=generator, styles=styles, progress=progress
+            make, first, rollouts, command.variations, generator=generator, source=source, progress=progress
         )
     files = number_paths(command.out, command.variations)
     rows = list(zip(found.each, files, strict=True))
@@ -97,7 +104,19 @@ def run_variations(
     return all(one.solution.status.ok for one in found.each)
 
 
-def _prepare_styles(command: Tween, first: Inbetweener, dna: Sequence[Example]) -> StyleDraw | None:
+def _draw_stitches(command: Tween, first: Inbetweener | None) -> Source | None:
+    """Draw from the stitcher, if it is one that was asked for."""
+    if not isinstance(first, StitchedInbetweener) or not isinstance(first.stitcher, Stitcher):
+        return None
+    drawing, longest = first.stitcher.drawing(command.seed), first.stitcher.longest
+    return Source(
+        lambda number, draws: replace(first, stitcher=drawing.numbered(number)),
+        "draw",
+        f"whole poses with 1 to {longest} frames between them",
+    )
+
+
+def _prepare_styles(command: Tween, first: Inbetweener, dna: Sequence[Example]) -> Source | None:
     """Prepare the draw of styles, of those that --dna names or of the classes that the tweener knows; None for methods
     whose variations are rollouts. RequestError where there is nothing to draw from."""
     tweener = find_tweener(first)
@@ -111,7 +130,7 @@ def _prepare_styles(command: Tween, first: Inbetweener, dna: Sequence[Example]) 
     def draw(number: int, draws: torch.Generator) -> Inbetweener:
         return restyle(first, draw_style(styles, number, tweener.encode_style, order=order, generator=draws))
 
-    return draw
+    return Source(draw, "style", "room for a style")
 
 
 def _tell(found: Variations, files: Sequence[Path], keys: int) -> None:

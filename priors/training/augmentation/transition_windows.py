@@ -56,12 +56,7 @@ class Transition:
             present.append((torch.arange(context) >= context - 1 - count).float())
         place, turn = self.integrate()
         batch = len(self.features)
-        return Ends(
-            torch.stack(sides),
-            torch.stack(present)[:, None].expand(-1, batch, -1),
-            place[:, -1],
-            turn[:, -1],
-        )
+        return Ends(torch.stack(sides), torch.stack(present)[:, None].expand(-1, batch, -1), place[:, -1], turn[:, -1])
 
     def integrate(self) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
         """Places over the ground and headings of the frames between and of the second pose, seen from the first."""

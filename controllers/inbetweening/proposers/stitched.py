@@ -1,0 +1,67 @@
+"""Stitched gaps, and another in-betweener for what cannot be stitched."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from controllers.inbetweening.proposers.partial_keys import hide_partial_keys
+from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.query import INTERPOLATION, GapSource
+from mapctl.protocols import Inbetweener
+
+
+@dataclass(frozen=True, eq=False)
+class StitchedInbetweener(Inbetweener):
+    """In-betweener that fills gaps between two whole poses from both sides (Ren et al. 2024), and leaves all others to
+    another one."""
+
+    stitcher: Inbetweener
+    """In-betweener that leaves interpolated what it cannot fill, and says why."""
+    load_fallback: Callable[[], Inbetweener]
+    """Loader of the in-betweener for the rest, called where there is some."""
+
+    @property
+    def takes_partial_keys(self) -> bool:
+        """Whether they reach `propose`; they are hidden there from who does not take them."""
+        return True
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose for each gap the stitcher's motion; what it left is the other's, and the proposal says why."""
+        stitched = self.stitcher.propose(query, generator=generator)
+        left = [source for source in stitched.attribute(query) if source.by == INTERPOLATION]
+        if not left:
+            return stitched
+        fallback = self.load_fallback()
+        asked = query if fallback.takes_partial_keys else hide_partial_keys(query)
+        made = fallback.propose(asked, generator=generator)
+        if len(left) == len(stitched.attribute(query)):
+            return replace(made, others=_pass_on(left, made))
+        return _put_in(stitched, replace(made, others=_pass_on(left, made)), query)
+
+
+def _pass_on(left: list[GapSource], made: Proposal) -> tuple[GapSource, ...]:
+    """Name who made what was left, and both reasons if that one had another to leave it on."""
+    named = {source.start: source for source in made.others}
+    passed = []
+    for source in left:
+        own = named.pop(source.start, GapSource(source.start, source.stop, made.source))
+        reason = "; ".join(filter(None, (source.reason, own.reason)))
+        passed.append(replace(own, reason=reason))
+    return (*passed, *named.values())
+
+
+def _put_in(stitched: Proposal, made: Proposal, query: GapQuery) -> Proposal:
+    """Put the gaps that were stitched into another proposal."""
+    root, quats = made.motion.root_position.clone(), made.motion.local_quat_xyzw.clone()
+    logits = made.contact_logits.clone()
+    sources = [source for source in stitched.attribute(query) if source.by != INTERPOLATION]
+    for source in sources:
+        part = slice(source.start, source.stop)
+        root[part] = stitched.motion.root_position[part]
+        quats[part] = stitched.motion.local_quat_xyzw[part]
+        logits[part] = stitched.contact_logits[part].to(logits)
+    starts = {source.start for source in sources}
+    others = (*(other for other in made.others if other.start not in starts), *sources)
+    motion = replace(made.motion, root_position=root, local_quat_xyzw=quats)
+    return replace(made, motion=motion, contact_logits=logits, others=others)
