@@ -8,8 +8,10 @@ by the phase makes the next frame. Departures from the printed sizes and inputs,
   a posterior, in training alone, sees the true in-between, and the paper's encoder is the prior that it is held to.
 - Half of the latent belongs to the whole transition and is the same for both sides, so that they agree on which foot
   goes first by construction; the other half, a frame's, changes slowly.
-- What the network makes is added to the step that would lead to the target at an even pace. Untrained, it interpolates.
-- The decoder is given the offset and the encoder's output too, not the embeddings and the latent alone.
+- What the network makes is added to a step between the one that led to the frame, where that is known, and the one that
+  would lead to the target at an even pace. Untrained, it interpolates bare poses.
+- The decoder is given the offset and the encoder's output too, not the embeddings and the latent alone; the experts
+  are given what both sides share of the latent.
 - Features of `mapctl.features` (68) replace root positions and quaternions; the head has 68 numbers, not 88.
 """
 
@@ -50,7 +52,7 @@ class StitcherConfig(NetworkConfig):
     """Layers of the encoders of state, offset and target; the last is even."""
     encoder: int = 192
     """Width of the encoder LSTM."""
-    head: int = 192
+    head: int = 176
     """Width of the layer before the distributions."""
     shared: int = 8
     """Numbers of the latent that both sides share over a transition."""
@@ -181,7 +183,8 @@ class StitcherNetwork(nn.Module):
         self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.decoder = SidedLstm(seen + config.encoder + config.shared + config.own, config.decoder)
         experts = 1 if "pm" in config.without else config.experts
-        self.experts = SidedExperts(experts, (config.decoder, *config.expert, LAYOUT.size))
+        self.experts = SidedExperts(experts, (config.decoder + config.shared, *config.expert, LAYOUT.size))
+        self.carry = nn.Parameter(torch.zeros(2, SIDES, 1, POSE.stop))
         self.gate = SidedLayers(PHASES, *config.gate, experts)
         self.first_phase = SidedLayers(seen, config.phase, PHASES)
         self.next_phase = SidedLayers(LAYOUT.size + PHASES, config.phase, config.phase, PHASES)
@@ -271,15 +274,26 @@ class StitcherNetwork(nn.Module):
         after it, and the experts' shares."""
         output, cell = self.decoder(torch.cat([seen, encoded, latent], dim=-1), memory.decoder)
         share = torch.softmax(self.gate(memory.phase.detach()), dim=-1)
-        made = self.experts(output, share)
+        made = self.experts(torch.cat([output, latent[..., : self.config.shared]], dim=-1), share)
+        kept = self._keep_pace(now)
         even = 1 / now.left.clamp_min(1)[..., None]
-        pace = torch.cat([now.place, now.turn[..., None]], dim=-1) * even + made[..., PACE] * self.std[PACE]
-        change = made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
-        pose = now.features[..., POSE] + (now.target - now.features)[..., POSE] * even + change
+        pace = torch.lerp(
+            torch.cat([now.place, now.turn[..., None]], dim=-1) * even, now.features[..., PACE], kept[..., PACE]
+        )
+        pace = pace + made[..., PACE] * self.std[PACE]
+        change = torch.lerp((now.target - now.features)[..., POSE] * even, now.change, kept[..., POSE])
+        pose = now.features[..., POSE] + change + made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
         logits = made[..., POSE.stop :]
         features = torch.cat([pace, pose, torch.sigmoid(logits)], dim=-1)
         step = self.next_phase(torch.cat([(features.detach() - self.mean) / self.std, memory.phase], dim=-1))
         return features, logits, Memory(encoder, (output, cell), memory.phase + step), share
+
+    def _keep_pace(self, now: Situation) -> Float[Tensor, "2 batch continuous"]:
+        """Return the share of the step that led to a frame in the one on from there: none of a bare pose's, and none
+        in the last step to the target."""
+        left = now.left.clamp_min(1)[..., None]
+        share = torch.sigmoid(4 * (self.carry[0] + self.carry[1] * left / self.config.longest))
+        return now.paced[..., None] * share * (1 - 1 / left)
 
     def _normalise(
         self,

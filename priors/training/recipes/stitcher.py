@@ -34,7 +34,7 @@ _MAX_NORM = 1.0
 class StitcherSettings:
     """How a stitcher is trained."""
 
-    steps: int = 20_000
+    steps: int = 12_000
     """Updates."""
     batch: int = 64
     """Transitions an update, all of one length."""
@@ -42,9 +42,9 @@ class StitcherSettings:
     """Frames from one pose to the other in the longest."""
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
-    informed: float = 0.4
+    informed: float = 0.5
     """Share of transitions whose latents come from the posterior, which has seen the truth."""
-    calm: float = 0.4
+    calm: float = 0.35
     """Share whose latents are the prior's mean; the rest is drawn."""
     weights: LossWeights = field(default_factory=LossWeights)
     """Of what is learnt."""
