@@ -32,9 +32,12 @@ class MotionCollection:
         facing = torch.cat([heading(motion.local_quat_xyzw[:, 0]).float() for motion in motions])
         return MotionCollection(tuple(motions), positions, facing)
 
-    def find_nearest(self, first: Motion, last: Motion, steps: int) -> Motion:
-        """Return the window of so many steps whose first and last poses, seen from its first hips, are nearest to these
-        two poses (motions of one frame) in the mean square over joints. ValueError if no clip is long enough.
+    def find_nearest(
+        self, first: Motion, last: Motion, steps: int, count: int = 1, *, within: float = torch.inf
+    ) -> list[Motion]:
+        """Return windows of so many steps whose first and last poses, seen from its first hips, are nearest to these
+        two poses (motions of one frame) in the mean square over joints: the nearest of each of `count` clips, those
+        not farther than `within`, metres, root mean square. ValueError if no clip is long enough.
         """
         starts, ends = _see_ends(self, steps)
         if not len(starts):
@@ -43,13 +46,26 @@ class MotionCollection:
         facing = heading(first.local_quat_xyzw[:, 0]).float()
         target = _see_from(wanted[None], wanted[:1, 0], facing).flatten()
         # A part at a time, as differences of all windows at once would not fit into the processor's cache.
-        distance = torch.cat([(part - target).square().sum(dim=1) for part in ends.split(5000)])
-        nearest = int(starts[distance.argmin()])
-        for motion in self.motions:
-            if nearest < motion.num_frames:
-                return motion.slice(nearest, nearest + steps + 1)
-            nearest -= motion.num_frames
-        raise AssertionError("a start lies in a clip")
+        square = torch.cat([(part - target).square().sum(dim=1) for part in ends.split(5000)])
+        clip = self.find_clips(starts)
+        least = torch.full((len(self.motions),), torch.inf).scatter_reduce(0, clip, square, "amin")
+        joints, windows = wanted.shape[0] * wanted.shape[1], []
+        for number in least.argsort(stable=True)[:count].tolist():
+            if not (bool(least[number].isfinite()) and float(least[number]) <= joints * within**2):
+                break
+            nearest = int(starts[torch.where(clip == number, square, torch.inf).argmin()]) - int(self.firsts[number])
+            windows.append(self.motions[number].slice(nearest, nearest + steps + 1))
+        return windows
+
+    @property
+    def firsts(self) -> Int[Tensor, " clips"]:
+        """First frame of each clip."""
+        lengths = torch.tensor([motion.num_frames for motion in self.motions])
+        return lengths.cumsum(0) - lengths
+
+    def find_clips(self, frames: Int[Tensor, " windows"]) -> Int[Tensor, " windows"]:
+        """Return the number of the clip that each frame is of."""
+        return torch.searchsorted(self.firsts, frames, right=True) - 1
 
     def find_starts(self, steps: int) -> Int[Tensor, " windows"]:
         """Return the first frames of all windows of so many steps."""

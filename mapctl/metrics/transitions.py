@@ -1,5 +1,5 @@
 """Measures of transitions as the LaFAN1 benchmark defines them (Harvey et al. 2020, section 5): L2P, L2Q, NPSS; and the
-errors in centimetres of Ren et al. 2024, section 4: ADE, and that at the last frame.
+errors of Ren et al. 2024, section 4: ADE, that at the last frame, and the APD of several answers.
 
 All take batches of windows of one length, at the frames that were made, in the world on canonical joints.
 """
@@ -55,6 +55,17 @@ def compute_displacement_errors(
     """Return the mean distance of joints from their true places over all frames (ADE), and in the last one; metres."""
     distance = (made - truth).norm(dim=-1)
     return float(distance.mean()), float(distance[:, -1].mean())
+
+
+def compute_pairwise_distances(draws: Float[Tensor, "draws frames joints 3"]) -> tuple[float, float]:
+    """Return the mean distance of joints between two of several answers to one question, and the mean distance between
+    two of them as vectors of all frames' coordinates; the unit of the positions. The second is the APD of Ren et al.
+    2024, section 4.1, whose figures are compatible with centimetres.
+    """
+    count = len(draws)
+    rows, columns = torch.triu_indices(count, count, offset=1)
+    apart = draws[rows] - draws[columns]
+    return float(apart.norm(dim=-1).mean()), float(apart.flatten(1).norm(dim=1).mean())
 
 
 def align_signs(made: Float[Tensor, "*batch 4"], truth: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:

@@ -8,6 +8,7 @@ from helpers import walk
 from tiny_transformer import tiny_transformer
 
 from controllers.benchmarks import transitions
+from controllers.benchmarks.transitions import twins
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl.inbetweening.retrieval import MotionCollection
 
@@ -16,7 +17,16 @@ KINDS = {"walks": [walk(80, cadence=1.2)], "turns": [walk(120, turn_rate=0.5)], 
 
 
 def oracle(part, start, stop):
-    return part
+    return transitions.Filled(part)
+
+
+def shaken(part, start, stop, count):
+    """Answers that are the truth, moved by 0, 1, 2, ... cm."""
+    shift = torch.tensor([0.01, 0.0, 0.0]).double()
+    return [
+        transitions.Filled(replace(part, root_position=part.root_position + (count - 1 - number) * shift), 0.02)
+        for number in range(count)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +38,8 @@ def rows():
         "retrieval": transitions.of_retrieval(MotionCollection.of(KINDS["walks"])),
         "oracle": oracle,
     }
-    return transitions.benchmark_transitions(KINDS, methods, past=10, std=STD, baseline="slerp")
+    samplers = {"shaken": shaken}
+    return transitions.benchmark_transitions(KINDS, methods, past=10, std=STD, baseline="slerp", samplers=samplers)
 
 
 def row_of(rows, **wanted):
@@ -73,7 +84,7 @@ def test_methods_get_what_is_known_and_no_frame_more(past):
 
     def method(part, start, stop):
         given.append((part.num_frames, start, stop))
-        return part
+        return transitions.Filled(part)
 
     transitions.benchmark_transitions({"walks": KINDS["walks"]}, {"one": method}, past=past, std=STD, baseline="one")
     wanted = [(80, 10, 10 + n) if past is None else (past + n + 1, past, past + n) for n in transitions.LENGTHS]
@@ -90,5 +101,31 @@ def test_what_stands_in_a_gap_does_not_matter():
         transitions.hold_last_pose,
         transitions.of_retrieval(MotionCollection.of(KINDS["walks"])),
     ):
-        one, other = (method(each, 15, 30).joint_positions() for each in (clip, replace(clip, root_position=root)))
+        one, other = (
+            method(each, 15, 30).motion.joint_positions() for each in (clip, replace(clip, root_position=root))
+        )
         torch.testing.assert_close(one[15:30], other[15:30], atol=1e-5, rtol=0)
+
+
+def test_draws_have_the_first_the_nearest_and_their_distance(rows):
+    for length in transitions.LENGTHS:
+        one = row_of(rows, frames=length, kind="walks", method="shaken, one draw")
+        best = row_of(rows, frames=length, kind="walks", method="shaken, best of 8 by truth")
+        assert one["ade_cm"] == pytest.approx(7)
+        assert best["ade_cm"] == pytest.approx(0)
+        assert one["spread_cm"] == pytest.approx(3)  # mean of |a - b| of 0 to 7
+        assert one["apd_cm"] == pytest.approx(3 * (21 * length) ** 0.5)
+        assert one["apart_cm"] == one["apart_most_cm"] == pytest.approx(2)
+
+
+def test_twins_are_windows_of_other_clips_between_the_same_poses():
+    clip = walk(60)
+    raised = replace(
+        clip, root_position=clip.root_position + 0.02 * torch.sin(torch.arange(60) / 9.0)[:, None].double()
+    )
+    far = walk(60, cadence=2.5, turn_rate=1.5)
+    windows = [clip.slice(10, 42)]
+    assert twins.measure_twins([clip, far], windows) == {}
+    found = twins.measure_twins([clip, far, raised], windows)
+    assert found["twins"] == 1
+    assert 0 < found["spread_cm"] < 4

@@ -4,12 +4,15 @@ import json
 from dataclasses import replace
 
 import pytest
+import tiny_stitcher
 import tiny_transformer
 from helpers import run, walk
 from tiny_infiller import save_tiny_infiller
 
 from mapctl import retarget
 from priors import checkpoints
+
+LONG = replace(tiny_stitcher.CONFIG, longest=61)
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +54,30 @@ def test_finished_rows_and_auto_if_asked(folder, capsys):
     rows = measure(folder, capsys, "--auto")
     methods = {row["method"] for row in rows}
     assert {"auto", f"{folder / 'ours.safetensors'}, finished"} <= methods
+
+
+def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
+    held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
+    network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": held})
+    checkpoints.save(network.state_dict(), card, folder / "stitch.safetensors")
+    name = str(folder / "stitch.safetensors")
+    rows = measure(folder, capsys, "--past", "1", "--raw", "--stitcher", name)
+    methods = {f"{name}, calm, raw"} | {
+        f"{each}, {which}" for each in (name, "retrieval") for which in ("one draw", "best of 8 by truth")
+    }
+    assert methods < {row["method"] for row in rows}
+    for length in (5, 15, 30, 45):
+        by = {row["method"]: row for row in rows if row["frames"] == length and row["kind"] == "mean of kinds"}
+        assert by[f"{name}, best of 8 by truth"]["l2p"] <= by[f"{name}, one draw"]["l2p"]
+        assert by[f"{name}, one draw"]["spread_cm"] > 0
+        assert by[f"{name}, calm, raw"]["apart_cm"] > 0
+
+
+def test_a_stitcher_that_saw_the_clips_is_refused(folder, capsys):
+    tiny_stitcher.save_tiny_stitcher(folder / "seen.safetensors")
+    words = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors"]
+    assert run("bench", "transitions", *words, "--stitcher", folder / "seen.safetensors") == 2
+    assert "was trained on bandai/a_walk_0.bvh" in capsys.readouterr().err
 
 
 def test_clips_that_are_no_longer_there_are_said(folder, tmp_path, capsys):

@@ -101,3 +101,12 @@ def test_displacement_errors_of_a_shift():
     made[:, -1, :, 0] = 0.1
     mean, last = transitions.compute_displacement_errors(made, truth)
     assert (mean, last) == pytest.approx((0.02, 0.1))
+
+
+def test_pairwise_distances_against_their_definition():
+    draws = torch.randn(4, 6, 3, 3, generator=torch.Generator().manual_seed(2))
+    pairs = [(a, b) for a in range(4) for b in range(a)]
+    each = draws.numpy()
+    mean = np.mean([np.linalg.norm(each[a] - each[b], axis=-1).mean() for a, b in pairs])
+    flat = np.mean([np.sqrt(((each[a] - each[b]) ** 2).sum()) for a, b in pairs])
+    assert transitions.compute_pairwise_distances(draws) == pytest.approx((mean, flat), rel=1e-5)

@@ -224,6 +224,9 @@ class Transitions(Table):
     """The bundled transformer, or the file or run folder of a trained transformer or infiller."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """Other in-betweeners to compare, bundled or trained."""
+    stitcher: str = ""
+    """A stitcher, by file or run folder: its calm answer, one draw and the best of 8 by the truth, beside 8 of
+    retrieval's, and how far they are from each other, beside mocap's twins."""
     raw: bool = False
     """Leave out the rows that a MAP stage finishes."""
     auto: bool = False

@@ -1,5 +1,6 @@
 """`mapctl bench transitions`: gaps by LaFAN1's protocol."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,8 +11,11 @@ from controllers.benchmarks.infilling import scale_to_canonical_bones
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.transitions import (
     Method,
+    Sampler,
     benchmark_transitions,
+    draw_retrieved,
     hold_last_pose,
+    of_draws,
     of_inbetweener,
     of_retrieval,
 )
@@ -19,9 +23,12 @@ from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from mapctl.commands.bench import Transitions
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.retrieval import MotionCollection
 from mapctl.pose import decode
+from mapctl.protocols import Inbetweener
+from priors.stitching.inbetweener import Stitcher
 from priors.training.corpus import read_corpus
 from priors.training.transition_statistics import compute_position_std
 
@@ -46,14 +53,39 @@ def run(table: Transitions) -> int:
     }
     compared = {name: priors.load_inbetweener(name) for name in filter(None, table.baselines.split(","))}
     for name, each in (compared | {table.inbetweener: network}).items():
-        methods[f"{name}, raw"] = of_inbetweener(each, finish=False)
-        if not table.raw:
-            methods[f"{name}, finished"] = of_inbetweener(each)
+        methods |= _name_methods(name, each, raw=table.raw)
     if table.auto:
         methods["auto"] = of_inbetweener(AutoInbetweener(network, priors.load_choice("auto")))
+    samplers: dict[str, Sampler] = {}
+    if table.stitcher:
+        stitcher = _load_unseeing(table.stitcher, held_out)
+        methods |= _name_methods(f"{table.stitcher}, calm", stitcher, raw=table.raw)
+        samplers = {table.stitcher: of_draws(stitcher.drawing().numbered), "retrieval": draw_retrieved(collection)}
     past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:
         rows = benchmark_transitions(
-            kinds, methods, past=past, std=compute_position_std(train), baseline="slerp", progress=progress
+            kinds,
+            methods,
+            past=past,
+            std=compute_position_std(train),
+            baseline="slerp",
+            samplers=samplers,
+            progress=progress,
         )
     return print_rows(table, rows)
+
+
+def _name_methods(name: str, inbetweener: Inbetweener, *, raw: bool) -> dict[str, Method]:
+    """Name the rows of an in-betweener: as it proposes, and finished unless they are to be raw."""
+    methods = {f"{name}, raw": of_inbetweener(inbetweener, finish=False)}
+    return methods if raw else methods | {f"{name}, finished": of_inbetweener(inbetweener)}
+
+
+def _load_unseeing(name: str, held_out: Mapping[str, Sequence[str]]) -> Stitcher:
+    """Load a stitcher; RequestError where its training saw clips that the other's did not."""
+    stitcher = priors.load_stitcher(name)
+    own = {clip for clips in stitcher.card.data.get("held_out", {}).values() for clip in clips}
+    seen = [clip for clips in held_out.values() for clip in clips if clip not in own]
+    if seen:
+        raise RequestError(f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed")
+    return stitcher

@@ -5,16 +5,16 @@ bare pose, or with the whole clip around, by kind of clip, length and method.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
-from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.benchmarks.transitions.methods import Filled, Method, Sampler
+from controllers.benchmarks.transitions.twins import measure_twins
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.missing import MissingMask
-from mapctl.inbetweening.retrieval import MotionCollection, bend_to_ends
 from mapctl.metrics import body, feet, transitions, worst_frame
 from mapctl.metrics.realism import (
     RealismSettings,
@@ -24,23 +24,23 @@ from mapctl.metrics.realism import (
     measure_window_realism,
 )
 from mapctl.motion import Motion
-from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, TOES
 
 LENGTHS = (5, 15, 30, 45)
 """Frames of the gaps, as in the tables of LaFAN1."""
 WINDOW, STRIDE = 65, 40
 """Frames of a test window, and from one to the next."""
+DRAWS = 8
+"""Answers drawn of each gap."""
 ALL_KINDS = "mean of kinds"
 """Kind of the rows that average those of all kinds."""
 _PAST = 10  # frames before the gap
 _TOES = CANONICAL.indices(TOES)
 _EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
+_TOLD = ("kind", "frames", "windows", "method")
+_WORST = ("step_cm", "acceleration_m_s2", "apart_most_cm")
 _REALISM_LENGTH = 30
 _REALISM = RealismSettings(windows=WindowSettings(frames=30))
-
-Method = Callable[[Motion, int, int], Motion]
-"""Fills frames start to stop of a canonical motion, whose values there are the truth and must not be looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,16 @@ class _Gap:
     """Frames of the gap in it."""
     around: Motion
     """The gap with up to ten true frames on either side."""
-    lead: int
-    """Frames of `around` before the gap."""
+
+    @property
+    def filled(self) -> slice:
+        """Frames of the gap in `around`."""
+        return slice(_PAST, _PAST + self.stop - self.start)
+
+    @property
+    def inner(self) -> Motion:
+        """The gap with the two poses beside it."""
+        return self.part.slice(self.start - 1, self.stop + 1)
 
 
 def benchmark_transitions(
@@ -65,72 +73,111 @@ def benchmark_transitions(
     past: int | None,
     std: Float[Tensor, "joints 3"],
     baseline: str,
+    samplers: Mapping[str, Sampler] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Measure every method by kind of clip and length of gap; clips are canonical, of canonical bones, at PRIOR_FPS.
 
     `past` frames are known before a gap, and one after; None shows the whole clip. L2P divides by `std`. Shares are of
     the method `baseline`. Also: planted toes, jitter and the worst frames of gaps with ten true frames on either side,
-    beside mocap's; how often a small network tells gaps of 30 frames from mocap; milliseconds for each filled frame.
+    beside mocap's; how far the two sides of a stitched gap were apart; how often a small network tells gaps of 30
+    frames from mocap; milliseconds for each filled frame.
+
+    Of `samplers` there are two rows: the first of DRAWS answers, with the distance of all of them from each other
+    (beside mocap's, that of its twins: `measure_twins`), and the one of them that is nearest to the truth.
     """
-    rows, total = [], len(LENGTHS) * len(kinds) * len(methods)
+    samplers, rows = samplers or {}, []
+    names = [*methods, *(name for sampler in samplers for name in _name_draws(sampler))]
+    total = len(LENGTHS) * len(kinds) * (len(methods) + len(samplers))
+    done = 0
     for length in LENGTHS:
-        made: dict[str, list[Tensor]] = {name: [] for name in ("mocap", *methods)}
+        cut: dict[str, list[Tensor]] = {name: [] for name in ("mocap", *names)}
         found = []
         for kind, clips in kinds.items():
             gaps = [gap for clip in clips for gap in _find_gaps(clip, length, past)]
             if not gaps:
                 continue
+            shared = {"kind": kind, "frames": length, "windows": len(gaps)}
             truth = [gap.around for gap in gaps]
-            made["mocap"] += [_cut(motion) for motion in truth] if length == _REALISM_LENGTH else []
-            here = [{"method": "mocap", **_measure_motion(truth)}]
-            for name, method in methods.items():
-                began = time.process_time()
-                filled = [_fill(method, gap) for gap in gaps]
-                cost = 1000 * (time.process_time() - began) / (length * len(gaps))
-                here.append(
-                    {"method": name, **_compare(filled, gaps, std), **_measure_motion(filled), "frame_ms": cost}
-                )
-                made[name] += [_cut(motion) for motion in filled] if length == _REALISM_LENGTH else []
+            twins = measure_twins(clips, [gap.inner for gap in gaps]) if samplers else {}
+            made = [_Made("mocap", truth, {**_measure_motion(truth), **twins})]
+            for task in (
+                *(partial(_run_method, name, method) for name, method in methods.items()),
+                *(partial(_run_sampler, name, sampler) for name, sampler in samplers.items()),
+            ):
+                made += task(gaps, std)
+                done += 1
                 if progress is not None:
-                    progress(min(total, len(rows) + len(found) + len(here)), total)
-            found += [{"kind": kind, "frames": length, "windows": len(gaps), **row} for row in here]
-        rows += found + _average_kinds(found, ["mocap", *methods], baseline, length)
+                    progress(done, total)
+            for each in made:
+                found.append({**shared, "method": each.name, **each.row})
+                cut[each.name] += [_cut(motion) for motion in each.motions] if length == _REALISM_LENGTH else []
+        rows += found + _average_kinds(found, ["mocap", *names], baseline, length)
         if length == _REALISM_LENGTH:
-            _add_realism(rows, made)
+            _add_realism(rows, cut)
     return rows
 
 
-def of_inbetweener(inbetweener: Inbetweener, densities: Sequence[Density] = (), *, finish: bool = True) -> Method:
-    """Return the method of an in-betweener, raw or finished by MAP, as `mapctl infill` runs it."""
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What a method made of all gaps of a kind and length, and its row."""
 
-    def method(part: Motion, start: int, stop: int) -> Motion:
-        free = torch.zeros(part.num_frames, dtype=torch.bool)
-        free[start:stop] = True
-        missing = MissingMask.of_frames(free, part.num_joints)
-        return fill(part, missing, inbetweener, settings=InfillSettings(finish=finish), densities=densities).motion
-
-    return method
+    name: str
+    motions: Sequence[Motion]
+    row: Row
 
 
-def hold_last_pose(part: Motion, start: int, stop: int) -> Motion:
-    """Hold the pose before the gap: zero velocity."""
-    source = torch.arange(part.num_frames)
-    source[start:stop] = start - 1
-    return replace(part, root_position=part.root_position[source], local_quat_xyzw=part.local_quat_xyzw[source])
+def _run_method(name: str, method: Method, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
+    began = time.process_time()
+    filled = [method(gap.part, gap.start, gap.stop) for gap in gaps]
+    cost = _count_ms(began, gaps)
+    motions = [_put_in(each, gap) for each, gap in zip(filled, gaps, strict=True)]
+    return [_Made(name, motions, {**_compare(motions, gaps, std), **_measure_motion(motions), **cost, **_tell(filled)})]
 
 
-def of_retrieval(collection: MotionCollection) -> Method:
-    """Return the method that takes the nearest window of other clips, its ends bent."""
+def _run_sampler(name: str, sampler: Sampler, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
+    began = time.process_time()
+    draws = [sampler(gap.part, gap.start, gap.stop, DRAWS) for gap in gaps]
+    cost = _count_ms(began, gaps)
+    firsts = [each[0] for each in draws]
+    motions = [[_put_in(one, gap) for one in each] for each, gap in zip(draws, gaps, strict=True)]
+    spreads = [_measure_spread(each, gap) for each, gap in zip(motions, gaps, strict=True)]
+    spread = {key: sum(each[key] for each in spreads) / len(spreads) for key in spreads[0]}
+    one = [each[0] for each in motions]
+    best = [_pick_nearest(each, gap, std) for each, gap in zip(motions, gaps, strict=True)]
+    first, nearest = _name_draws(name)
+    return [
+        _Made(first, one, {**_compare(one, gaps, std), **_measure_motion(one), **cost, **_tell(firsts), **spread}),
+        _Made(nearest, best, {**_compare(best, gaps, std), **_measure_motion(best)}),
+    ]
 
-    def method(part: Motion, start: int, stop: int) -> Motion:
-        first, last = part.slice(start - 1, start), part.slice(stop, stop + 1)
-        found = bend_to_ends(collection.find_nearest(first, last, stop - start + 1), first, last)
-        root, quats = part.root_position.clone(), part.local_quat_xyzw.clone()
-        root[start:stop], quats[start:stop] = found.root_position[1:-1], found.local_quat_xyzw[1:-1]
-        return replace(part, root_position=root, local_quat_xyzw=quats)
 
-    return method
+def _name_draws(sampler: str) -> tuple[str, str]:
+    return f"{sampler}, one draw", f"{sampler}, best of {DRAWS} by truth"
+
+
+def _count_ms(began: float, gaps: Sequence[_Gap]) -> Row:
+    return {"frame_ms": 1000 * (time.process_time() - began) / sum(gap.stop - gap.start for gap in gaps)}
+
+
+def _tell(filled: Sequence[Filled]) -> Row:
+    """Tell how far sides were apart, where something was stitched."""
+    apart = [100 * each.apart for each in filled if each.apart is not None]
+    return {"apart_cm": sum(apart) / len(apart), "apart_most_cm": max(apart)} if apart else {}
+
+
+def _measure_spread(draws: Sequence[Motion], gap: _Gap) -> Row:
+    """Measure how far draws are from each other: mean distance of joints, and Ren et al.'s APD."""
+    positions = torch.stack([each.joint_positions()[gap.filled] for each in draws])
+    mean, flat = transitions.compute_pairwise_distances(positions)
+    return {"spread_cm": 100 * mean, "apd_cm": 100 * flat}
+
+
+def _pick_nearest(draws: Sequence[Motion], gap: _Gap, std: Tensor) -> Motion:
+    """Pick the draw with the least L2P: with the truth at hand, which nobody has."""
+    truth = gap.around.joint_positions()[None, gap.filled]
+    errors = [transitions.compute_l2p(each.joint_positions()[None, gap.filled], truth, std) for each in draws]
+    return draws[min(range(len(draws)), key=errors.__getitem__)]
 
 
 def _find_gaps(clip: Motion, length: int, past: int | None) -> list[_Gap]:
@@ -140,25 +187,23 @@ def _find_gaps(clip: Motion, length: int, past: int | None) -> list[_Gap]:
         begin, end = (0, clip.num_frames) if past is None else (start - past, stop + 1)
         after = min(clip.num_frames, stop + 10)
         part = clip.slice(begin, end)
-        gaps.append(_Gap(part, start - begin, stop - begin, clip.slice(start - 10, after), 10))
+        gaps.append(_Gap(part, start - begin, stop - begin, clip.slice(start - _PAST, after)))
     return gaps
 
 
-def _fill(method: Method, gap: _Gap) -> Motion:
+def _put_in(filled: Filled, gap: _Gap) -> Motion:
     """Return the gap as filled, with its true frames around."""
-    done = method(gap.part, gap.start, gap.stop)
     root, quats = gap.around.root_position.clone(), gap.around.local_quat_xyzw.clone()
-    into = slice(gap.lead, gap.lead + gap.stop - gap.start)
-    root[into], quats[into] = done.root_position[gap.start : gap.stop], done.local_quat_xyzw[gap.start : gap.stop]
+    made, here = filled.motion, slice(gap.start, gap.stop)
+    root[gap.filled], quats[gap.filled] = made.root_position[here], made.local_quat_xyzw[here]
     return replace(gap.around, root_position=root, local_quat_xyzw=quats)
 
 
 def _compare(made: Sequence[Motion], gaps: Sequence[_Gap], std: Tensor) -> Row:
     """Measure errors of one length."""
-    length = gaps[0].stop - gaps[0].start
-    sides = []
+    part, sides = gaps[0].filled, []
     for motions in (made, [gap.around for gap in gaps]):
-        parts = [motion.slice(10, 10 + length) for motion in motions]
+        parts = [motion.slice(part.start, part.stop) for motion in motions]
         sides.append(
             (
                 torch.stack([part.joint_positions() for part in parts]),
@@ -204,13 +249,13 @@ def _average_kinds(found: Sequence[Row], methods: Sequence[str], baseline: str, 
         own = [row for row in found if row["method"] == method]
         if not own:
             continue
-        columns = [name for name in own[0] if name not in ("kind", "frames", "windows", "method")]
+        # Kinds without twins, or without a gap that was stitched, have fewer columns.
+        columns = [name for name in dict.fromkeys(name for row in own for name in row) if name not in _TOLD]
         mean: Row = {"kind": ALL_KINDS, "frames": length, "windows": sum(row["windows"] for row in own)}
         mean |= {"method": method}
-        worst = ("step_cm", "acceleration_m_s2")
         for name in columns:
-            values = [row[name] for row in own]
-            mean[name] = max(values) if name in worst else sum(values) / len(values)
+            values = [row[name] for row in own if name in row]
+            mean[name] = max(values) if name in _WORST else sum(values) / len(values)
         rows.append(mean)
     by_kind |= {(row["kind"], row["method"]): row for row in rows}
     for row in by_kind.values():
@@ -222,7 +267,7 @@ def _average_kinds(found: Sequence[Row], methods: Sequence[str], baseline: str, 
 
 def _cut(motion: Motion) -> Tensor:
     """Cut a gap out, with the frame before it, for the network that tells it from mocap."""
-    part = motion.slice(9, 10 + _REALISM_LENGTH)
+    part = motion.slice(_PAST - 1, _PAST + _REALISM_LENGTH)
     return cut_windows(canonical_positions(part), _REALISM.windows)
 
 
