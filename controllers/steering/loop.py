@@ -18,7 +18,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from controllers.steering.steer import SteerFrames, SteerState, step
+from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, SteeringTarget
@@ -33,6 +33,17 @@ class Source(Protocol):
 
     def at(self, seconds: float) -> Command:
         """Return the command that holds now, at so many seconds of the stream."""
+        ...
+
+
+@runtime_checkable
+class Stepper(Protocol):
+    """Maker of the next frames."""
+
+    def __call__(
+        self, state: SteerState, command: Command, *, seconds: float | None = None
+    ) -> tuple[SteerState, SteerFrames]:
+        """Make them, as `controllers.steering.steer.step` does."""
         ...
 
 
@@ -164,6 +175,11 @@ class Recorder:
         return Motion(first.skeleton, first.fps, roots, make_sign_continuous(quats))
 
     @property
+    def refusals(self) -> list[Refusal]:
+        """Return the orders that were not obeyed."""
+        return [piece.refusal for piece in self.pieces if piece.refusal is not None]
+
+    @property
     def steering_targets(self) -> list[SteeringTarget]:
         """Steering targets of all frames."""
         return [target for piece in self.pieces for target in piece.steering_targets]
@@ -184,6 +200,7 @@ def iterate_steps(
     *,
     clock: Clock,
     settings: LoopSettings | None = None,
+    stepper: Stepper = step,
 ) -> Iterator[tuple[SteerState, StepRecord]]:
     """Yield one step after the other without end; the first pose counts as delivered.
 
@@ -197,7 +214,7 @@ def iterate_steps(
         clock.wait_until(begun + due - lead)
         asked = clock.now() - begun
         left = due - asked - settings.margin if clock.real else None
-        state, new = step(state, source.at(asked), seconds=None if left is None else max(0.0, left))
+        state, new = stepper(state, source.at(asked), seconds=None if left is None else max(0.0, left))
         delivered = clock.now() - begun
         held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
         if held:
@@ -217,10 +234,11 @@ def drive(
     clock: Clock | None = None,
     settings: LoopSettings | None = None,
     stop: Callable[[], bool] = lambda: False,
+    stepper: Stepper = step,
 ) -> tuple[SteerState, list[StepRecord]]:
     """Steer until `frames` have been delivered, `stop()` is true, or Ctrl-C."""
     records: list[StepRecord] = []
-    stream = iterate_steps(state, source, displays, clock=clock or StreamClock(), settings=settings)
+    stream = iterate_steps(state, source, displays, clock=clock or StreamClock(), settings=settings, stepper=stepper)
     try:
         while state.frames < frames and not stop():
             state, record = next(stream)

@@ -20,7 +20,7 @@ from controllers.steering.overlay import Overlay
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.avoidance import lead_around
-from mapctl.intent.steering import Command, SteeringTarget
+from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.pose import decode
 from mapctl.problem.context import WindowRequest
@@ -36,6 +36,7 @@ from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
+_KEPT_FRAMES = 11  # whose features are kept: who goes to a place begins as it came here
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _KNOTS, _KNOT_SIGMA = 7, 0.8  # samples for a stuck character: noise of every feature, slow enough for a step
@@ -108,6 +109,18 @@ class SteerState:
     """The caller's own terms, for the prior's size."""
     overlay: Overlay = field(default_factory=Overlay)
     """What hands and head are doing beside the walk."""
+    approach: object | None = None
+    """How far an order to be somewhere is carried out (`controllers.steering.arrival`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """An order that is not obeyed."""
+
+    order: Arrival
+    """The order."""
+    reason: str
+    """Why, with numbers."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -122,6 +135,8 @@ class SteerFrames(Solution):
     """World joint positions of the frames that would come next, metres; the next command changes them."""
     evaluations: int = 0
     """Energy-and-gradient evaluations of the step."""
+    refusal: Refusal | None = None
+    """An order to be somewhere that is not obeyed; said once."""
 
 
 def begin(
@@ -178,8 +193,8 @@ def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
 
 
 def step(state: SteerState, command: Command, *, seconds: float | None = None) -> tuple[SteerState, SteerFrames]:
-    """Solve the next frames under a command. After `seconds` the best solution so far is returned, with a note, but not
-    before `least_evaluations`.
+    """Solve the next frames under a command, but for its arrival (see `controllers.steering.arrival`). After `seconds`
+    the best solution so far is returned, with a note, but not before `least_evaluations`.
 
     RequestError for labels that the prior does not know. The first step under new labels takes longer.
     """
@@ -222,7 +237,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     velocities = torch.tensor([target.velocity for target in committed_targets])
     next_state = replace(
         state,
-        committed=done.discard_history(len(new)),
+        committed=done.discard_history(max(len(new), _KEPT_FRAMES)),
         target=committed_targets[-1],
         past_targets=torch.cat([state.past_targets, velocities])[-_PAST_TARGET_FRAMES:],
         frames=state.frames + len(new),

@@ -9,12 +9,31 @@ from itertools import pairwise
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.motion import Motion
 
 REACHING_HANDS = ("leftHand", "rightHand")
 """Joints that live targets may be given for."""
 STEP_LENGTHS = (0.3, 1.2)
 """Shortest and longest step that can be asked for, metres. Beyond them feet slide to meet the target and speed is lost:
 at 1.2 m/s, planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 99 m the whole body slides at 9 m/s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """An order to be somewhere at a time."""
+
+    place: tuple[float, float]
+    """Where the hips are to be over the ground, x and z, metres."""
+    by: float
+    """When, seconds of the stream."""
+    facing: float | None = None
+    """Facing of the hips there, radians; None faces where it came from another place, or as it did."""
+    pose: Motion | None = None
+    """Pose there, a canonical motion of one frame; None walks on, or stands where the command's speed is 0."""
+
+    def __post_init__(self):
+        if not all(map(math.isfinite, (*self.place, self.by, self.facing or 0.0))):
+            raise RequestError("the place, the time and the facing of an arrival are finite numbers")
 
 
 @dataclass(frozen=True)
@@ -41,6 +60,8 @@ class Command:
     """Place in the world that is to be looked at, metres."""
     obstacles: tuple[Obstacle, ...] = ()
     """Discs and boxes on the ground to walk round."""
+    arrival: Arrival | None = None
+    """Where to be first, and when; the rest of the command holds from then on."""
 
     def __post_init__(self):
         if not (math.isfinite(self.speed) and self.speed >= 0):

@@ -1,17 +1,19 @@
 """The stitcher as an in-betweener: short gaps between whole poses, in as many ways as are drawn."""
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import contacts, rotations
-from mapctl.features import PRIOR_FPS, encode, mirror_features, reversed_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, mirror_features, reversed_features
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
+from mapctl.pose import BodyPose
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
@@ -88,6 +90,40 @@ class Stitcher(Inbetweener):
         calm = DrawnLatents.calm(2 * batch, count_made(self.network, frames), config.shared, config.own)
         joined = join_sides(walk_sides(self.network, both, frames, calm), both)
         return _average_mirrored(joined, batch)
+
+    @torch.no_grad()
+    def connect(
+        self,
+        before: Float[Tensor, "before size"],
+        after: Float[Tensor, "batch after size"],
+        place: Float[Tensor, "batch 2"],
+        turn: Float[Tensor, " batch"],
+        frames: int,
+    ) -> Float[Tensor, "batch frames size"]:
+        """Make the calm ways from the last frame of `before` to the last of `after`, which are run backwards, as
+        features from the next frame on to that one, `frames` later. Seen from the first, it is at `place`, metres, and
+        its heading another by `turn`, radians. All others of these frames say how motion came here and goes on."""
+        before = before[-1 - MAX_CONTEXT :].expand(len(after), -1, -1)
+        after = after[:, -1 - MAX_CONTEXT :]
+        context = max(before.shape[1], after.shape[1])
+        sides, present = [], []
+        for known in (before, after):
+            lead = context - known.shape[1]
+            sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
+            present.append((torch.arange(context) >= lead).float().expand(len(after), -1))
+        joined = self.answer(Ends(torch.stack(sides), torch.stack(present), place, turn), frames)
+        origin = GroundPose(torch.zeros_like(place), torch.zeros_like(turn))
+        first, last = _stand_at(before[:, -1], origin), _stand_at(after[:, -1], GroundPose(place, turn))
+        root = torch.cat([first.root_position, joined.root_position, last.root_position], dim=1)
+        quats = torch.cat([first.local_quat_xyzw, joined.quats, last.local_quat_xyzw], dim=1)
+        planted = torch.cat([(joined.contacts > 0).float(), after[:, -1:, LAYOUT.slices["contacts"]]], dim=1)
+        ways = [
+            encode(Motion(CANONICAL, Fraction(PRIOR_FPS), one.double(), rotations.make_sign_continuous(two.double())))[
+                0
+            ][1:]
+            for one, two in zip(root, quats, strict=True)
+        ]
+        return torch.cat([torch.stack(ways).float()[..., : LAYOUT.continuous], planted], dim=-1)
 
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
@@ -170,6 +206,13 @@ def _encode(body: Motion, start: int, stop: int) -> Float[Tensor, "frames size"]
             part, root_position=part.root_position.expand(2, -1), local_quat_xyzw=part.local_quat_xyzw.expand(2, -1, -1)
         )
     return encode(part)[0]
+
+
+def _stand_at(features: Float[Tensor, "batch size"], at: GroundPose) -> BodyPose:
+    """Return single poses at ground poses."""
+    root = rotations.lift_ground(at.position_xz) + torch.nn.functional.pad(LAYOUT.pick(features, "root_height"), (1, 1))
+    joints = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))
+    return BodyPose(root[:, None], at.heading[:, None], LAYOUT.pick(features, "root_tilt")[:, None], joints[:, None])
 
 
 def _place(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import walk
+from tiny_stitcher import save_tiny_stitcher
 
 import mapctl
 from mapctl import cli
@@ -166,3 +167,54 @@ def test_who_begins_within_an_obstacle_is_refused(steer, tmp_path, capsys):
     assert steer(SCRIPT, "--avoid", "0.1,0,0.5") == 2
     assert "40 cm within an obstacle" in capsys.readouterr().err
     assert not (tmp_path / "a.bvh").exists()
+
+
+GOTO = "time_s,speed_mps,heading_deg,goto_x_m,goto_z_m,within_s,goto_facing_deg,pose\n0,1.2,0,,,,,\n"
+
+
+def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
+    stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
+    walk(10).save(tmp_path / "pose.bvh")
+    script = GOTO + "0.2,1.0,40,0.3,0.4,0.7,20,pose.bvh:7\n"
+    assert steer(script, "--report", tmp_path / "r.json", "--stitcher", stitcher) == 0
+    (row,) = json.loads((tmp_path / "r.json").read_text())["arrivals"]
+    assert row["frame"] == 27
+    assert row["place_error_cm"] < 0.1
+    assert row["facing_error_deg"] < 0.1
+    assert row["pose_error_cm"] < 0.1
+    assert mapctl.load(tmp_path / "a.bvh").num_frames >= 27 + 30
+    assert "0.9 s  at 0.3, 0.4 m: 0.00 cm off, 0.00 degrees off, joints 0.0 cm off the pose" in capsys.readouterr().out
+
+
+def test_a_place_that_nobody_reaches_is_said_and_strict_fails(steer, tmp_path, capsys):
+    stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
+    script = GOTO + "0.2,1.0,40,30,0,0.7,,\n"
+    assert steer(script, "--strict", "--stitcher", stitcher, "--report", tmp_path / "r.json") == 3
+    assert "30.0 m away, in 0.7 s is not obeyed: it needs 4" in capsys.readouterr().out
+    assert "arrivals" not in json.loads((tmp_path / "r.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0.2,1,0,1,,0.7,,", "c.csv:3: goto_x_m needs goto_z_m too"),
+        ("0.2,1,0,1,1,,,", "c.csv:3: goto_x_m needs within_s too"),
+        ("0.2,1,0,,,,30,", "c.csv:3: goto_facing_deg needs goto_x_m and goto_z_m and within_s too"),
+        ("0.2,1,0,1,1,0,,", "c.csv:3: within_s must be more than 0"),
+        ("0.2,1,0,1,1,3601,,", "c.csv:3: within_s must lie between 0 and 3600, got 3601"),
+        ("0.2,1,0,1001,1,1,,", "c.csv:3: goto_x_m must lie between -1000 and 1000, got 1001"),
+        ("0.2,1,0,1,1,1,,gone.bvh:3", "c.csv:3: pose: "),
+        ("0.2,1,0,1,1,1,,pose.bvh", "c.csv:3: pose is FILE:FRAME, a motion file and a frame of it; got pose.bvh"),
+        ("0.2,1,0,1,1,1,,pose.bvh:10", "c.csv:3: pose: pose.bvh has the frames 0:10, and no 10"),
+    ],
+)
+def test_orders_that_are_none_are_refused(steer, tmp_path, capsys, line, message):
+    walk(10).save(tmp_path / "pose.bvh")
+    assert steer(GOTO + line + "\n") == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.bvh").exists()
+
+
+def test_a_stitcher_without_orders_is_refused(steer, capsys):
+    assert steer(SCRIPT, "--stitcher", "stitcher") == 2
+    assert "--stitcher makes ways to a place, and the script has no goto_x_m" in capsys.readouterr().err

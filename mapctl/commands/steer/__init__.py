@@ -22,7 +22,9 @@ class Steer(Command):
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
     strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style as the prior knows them,
     left_hand_x, left_hand_y, left_hand_z (and right_hand_, look_) for a place in metres that a hand reaches or that is
-    looked at. The last line's time is the end."""
+    looked at. goto_x_m, goto_z_m, within_s, and where wanted goto_facing_deg and pose (FILE:FRAME), say where the hips
+    are to be first, and within how many seconds: the rest of the line holds from then on. The last line's time is the
+    end, or a second after the last place is reached."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
@@ -30,6 +32,9 @@ class Steer(Command):
     cannot keep up the script's time runs slower than the clock's, and the summary says so."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
+    stitcher: options.MaybeName = None
+    """For goto_x_m: the file or run folder of a trained stitcher, which makes the end of the way; the bundled one if
+    not given."""
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""

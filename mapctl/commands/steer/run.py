@@ -11,7 +11,16 @@ import torch
 import priors
 from controllers.common.character import Character
 from controllers.steering import steer
-from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
+from controllers.steering.arrival import Arriver
+from controllers.steering.loop import (
+    Recorder,
+    Stepper,
+    StepRecord,
+    StreamClock,
+    WallClock,
+    drive,
+    summarise_step_timing,
+)
 from mapctl import formats, metrics, report
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.character import read_character
@@ -20,9 +29,10 @@ from mapctl.commands.steer import Steer
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import CommandTrack
+from mapctl.intent.steering import Arrival, CommandTrack
 from mapctl.intent.steering_csv import read_commands
 from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.metrics.arrivals import measure_arrivals
 from mapctl.metrics.travel import measure_commands
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution, Status
@@ -31,6 +41,7 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.plots.steering import plot
 
 _PLACE_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
+_AFTER_SECONDS = 1.0  # for which a motion goes on after the last place was reached
 _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
 
 
@@ -42,13 +53,15 @@ def run(command: Steer) -> int:
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
     for labels in {wanted.told for wanted in track.commands if wanted.told}:
         prior.conditioned_on(labels)  # unknown labels are refused now
-    recorder, records, frames = _run_steering(command, prior, track, character)
+    stepper = _choose_stepper(command, track)
+    recorder, records, frames = _run_steering(command, prior, track, character, stepper)
     motion = recorder.motion(frames)
     character.on_rig(motion).save(command.out)
     arrivals = [time for time in track.times[1:] if time < motion.seconds]
     timing = summarise_step_timing(records, arrivals) | {"peak_memory_mb": report.peak_memory_mb()}
     done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
-    found = _build_report(command, done, track, prior, timing)
+    refused = [refusal.order for refusal in recorder.refusals]
+    found = _build_report(command, done, track, prior, timing, refused)
     if command.report is not None:
         report.write_report(found, command.report)
     if command.plot is not None:
@@ -78,11 +91,20 @@ def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> Comman
     return CommandTrack(track.times, tuple(replace(one, obstacles=tuple(obstacles)) for one in track.commands))
 
 
+def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
+    """Choose who makes the next frames: with a stitcher where the script has orders to be somewhere."""
+    if any(wanted.arrival is not None for wanted in track.commands):
+        return Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
+    if command.stitcher is not None:
+        raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
+    return steer.step
+
+
 def _run_steering(
-    command: Steer, prior: LstmGmmDensity, track: CommandTrack, character: Character
+    command: Steer, prior: LstmGmmDensity, track: CommandTrack, character: Character, stepper: Stepper
 ) -> tuple[Recorder, list[StepRecord], int]:
     first, recorder = track.commands[0], Recorder()
-    frames = inputs.count_frames(track.times[-1] + (_LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0))
+    frames = inputs.count_frames(_find_end(track))
     footing = FootContact(rest_height=character.toe_rest_height)
     settings = steer.SteerSettings(limits=_limits(command), footing=footing)
     generator = torch.Generator().manual_seed(command.seed)
@@ -93,8 +115,16 @@ def _run_steering(
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
         displays = [recorder] if progress is None else [recorder, _ProgressDisplay(progress, frames)]
-        _, records = drive(state, track, displays, frames=frames, clock=clock)
+        _, records = drive(state, track, displays, frames=frames, clock=clock, stepper=stepper)
     return recorder, records, frames
+
+
+def _find_end(track: CommandTrack) -> float:
+    """Find the second at which a script ends: when its last command comes, which says no more than that if it is not
+    the only one; an order to be somewhere is carried out, and what comes after it shown for a while."""
+    by = max((command.arrival.by for command in track.commands if command.arrival is not None), default=0.0)
+    alone = track.times[0] + _LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0
+    return max(track.times[-1], alone, by + _AFTER_SECONDS if by >= track.times[-1] else 0.0)
 
 
 def _conclude_steering(
@@ -102,13 +132,22 @@ def _conclude_steering(
 ) -> Solution:
     """Sum up all steps; lowered commands and late frames make the status infeasible."""
     late = timing["late_frames"]
-    notes = [*lowered, *([f"{late} frames came after they were due"] if late else [])]
+    notes = [
+        *lowered,
+        *(refusal.reason for refusal in recorder.refusals),
+        *([f"{late} frames came after they were due"] if late else []),
+    ]
     status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
     return Solution(motion, status, recorder.ledger, seconds=sum(piece.seconds for piece in recorder.pieces))
 
 
 def _build_report(
-    command: Steer, done: Solution, track: CommandTrack, prior: LstmGmmDensity, timing: Mapping[str, Any]
+    command: Steer,
+    done: Solution,
+    track: CommandTrack,
+    prior: LstmGmmDensity,
+    timing: Mapping[str, Any],
+    refused: Sequence[Arrival],
 ) -> dict[str, Any]:
     card = prior.card
     found = report.build_report(
@@ -119,7 +158,8 @@ def _build_report(
         prior={"name": prior.name, "licence": card.licence, "quality": card.quality},
         timing=timing,
     )
-    return found | {"commands": measure_commands(done.motion, track)}
+    arrivals = measure_arrivals(done.motion, track, refused)
+    return found | {"commands": measure_commands(done.motion, track)} | ({"arrivals": arrivals} if arrivals else {})
 
 
 @dataclass(frozen=True)
@@ -142,6 +182,15 @@ def _format_place(row: Mapping[str, Any], name: str, words: str) -> str:
     return f", {words} there for {held:.1f} s" if held else f", {words} {nearest:.0f} cm short"
 
 
+def _format_arrival(row: Mapping[str, Any]) -> str:
+    """Say how near a place was reached, and its facing and pose where they were wanted."""
+    facing, pose = row["facing_error_deg"], row["pose_error_cm"]
+    turned = "" if facing is None else f", {facing:.2f} degrees off"
+    posed = "" if pose is None else f", joints {pose:.1f} cm off the pose"
+    where = f"{row['goto_x_m']:g}, {row['goto_z_m']:g} m"
+    return f"{row['by_s']:6.1f} s  at {where}: {row['place_error_cm']:.2f} cm off{turned}{posed}"
+
+
 def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
     lines = []
     for row in found["commands"][:-1]:
@@ -159,6 +208,7 @@ def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str
         lines.append(
             f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}{places}"
         )
+    lines += [_format_arrival(row) for row in found.get("arrivals", ())]
     cost, latency = found["timing"], found["timing"]["command_latency_s"]
     waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
     slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""

@@ -1,0 +1,244 @@
+"""Be there, face so, at a time: a walk is steered toward a place that is far, and its end is stitched to it.
+
+Ren et al. 2024 make what lies between two poses; here the first is the last that was delivered, with those before it,
+and the second is where the character is to be: in a pose that is given, or in that of one of the moments from which the
+prior begins, walking on or standing. The density's state is then advanced over what was shown, and steering goes on.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
+from mapctl import rotations
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, reversed_features
+from mapctl.intent.steering import Arrival, Command, SteeringTarget
+from mapctl.motion import Motion
+from mapctl.pose import decode
+from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import Outcome, Status
+
+_STITCHED_FRAMES = 45  # of the end of a way that is walked first
+_LEAST_FRAMES = 4
+_LEAST_SPEED = 0.3  # m/s below which nobody sets out: there is time to stand first
+_FAR = 0.3  # metres from which on the way to a place says where to face there
+_CANDIDATES = 4  # moments of the prior that are tried at the place
+_AFTER = 10  # frames of the prior's own continuation that say how motion goes on from there
+_PAST_FRAMES = 60  # that are kept for terms that look back
+
+
+@runtime_checkable
+class TransitionMaker(Protocol):
+    """Who makes the frames between two poses."""
+
+    @property
+    def longest(self) -> int:
+        """Most frames between two poses."""
+        ...
+
+    def connect(
+        self,
+        before: Float[Tensor, "before size"],
+        after: Float[Tensor, "batch after size"],
+        place: Float[Tensor, "batch 2"],
+        turn: Float[Tensor, " batch"],
+        frames: int,
+    ) -> Float[Tensor, "batch frames size"]:
+        """Make features from the frame after the last of `before` to the last of `after`, which is run backwards and
+        `frames` later: there, seen from the last of `before`, is `place`, metres, and the heading another by `turn`.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """How far an order is carried out."""
+
+    order: Arrival
+    """The order."""
+    planned: Float[Tensor, "frames size"] | None = None
+    """Features of the frames to the place that are not delivered yet, none of them once it is there; None while it is
+    walked to."""
+    refused: str = ""
+    """Why it is not obeyed, with numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arriver:
+    """A step of steering that obeys orders to be somewhere."""
+
+    transitions: TransitionMaker
+    """Who makes the way."""
+
+    def __call__(
+        self, state: SteerState, command: Command, *, seconds: float | None = None
+    ) -> tuple[SteerState, SteerFrames]:
+        """Solve or deliver the next frames, as `controllers.steering.steer.step`. Orders that cannot be met are said in
+        the frames' `refusal` and not obeyed; the rest of their command holds at once."""
+        order, plain = command.arrival, replace(command, arrival=None)
+        if order is None:
+            return step(replace(state, approach=None), plain, seconds=seconds)
+        approach, left = state.approach, _arrival_frame(order) - state.frames + 1
+        begun = isinstance(approach, Approach) and approach.order is order
+        if not begun:
+            approach = Approach(order, refused=_refuse(state, order))
+        assert isinstance(approach, Approach)
+        if approach.refused:
+            state, frames = step(replace(state, approach=approach), plain, seconds=seconds)
+            return state, frames if begun else replace(frames, refusal=Refusal(order, approach.refused))
+        if approach.planned is not None and not len(approach.planned):
+            return step(state, plain, seconds=seconds)
+        # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
+        most = _STITCHED_FRAMES if begun else self.transitions.longest + 1
+        if approach.planned is None and left <= most:
+            approach = replace(approach, planned=self._plan(state, command, order, left))
+        if approach.planned is not None:
+            return _deliver(state, approach, plain)
+        return step(replace(state, approach=approach), _lead_to(state, plain, order, left), seconds=seconds)
+
+    def _plan(self, state: SteerState, command: Command, order: Arrival, frames: int) -> Tensor:
+        """Plan the frames to a place, in the pose there to which the way is smoothest."""
+        character = state.character
+        after = _pose_candidates(state, command, order)
+        here = state.committed.place
+        place = torch.tensor(order.place) / character.scale
+        facing = order.facing
+        if facing is None:
+            away = place - here.position_xz
+            facing = float(here.heading) if float(away.norm()) < _FAR else math.atan2(*away.tolist())
+        seen = rotations.rotate_ground(place - here.position_xz, -here.heading)
+        turn = rotations.wrap_angle(torch.tensor(facing) - here.heading)
+        count = len(after)
+        ways = self.transitions.connect(
+            state.committed.features, after, seen.expand(count, -1), turn.expand(count), frames
+        )
+        return ways[int(_measure_roughness(state, ways).argmin())]
+
+
+def _arrival_frame(order: Arrival) -> int:
+    return round(order.by * PRIOR_FPS)
+
+
+def _refuse(state: SteerState, order: Arrival) -> str:
+    """Say why an order cannot be met; empty where it can."""
+    left = _arrival_frame(order) - state.frames + 1
+    if left < _LEAST_FRAMES:
+        return f"an arrival in {left / PRIOR_FPS:.2f} s is not obeyed: nobody comes anywhere in less than 0.13 s"
+    scale, fastest = state.character.scale, state.prior.limits.max_steering_speed * state.character.scale
+    away = math.dist(order.place, (state.committed.place.position_xz * scale).tolist())
+    if away * PRIOR_FPS / left > fastest:
+        return (
+            f"an arrival at {order.place[0]:g}, {order.place[1]:g} m, {away:.1f} m away, in {left / PRIOR_FPS:.1f} s is"
+            f" not obeyed: it needs {away * PRIOR_FPS / left:.1f} m/s, and {fastest:.1f} m/s is the fastest"
+        )
+    return ""
+
+
+def _lead_to(state: SteerState, command: Command, order: Arrival, left: int) -> Command:
+    """Lead to a place that is far, at the pace that comes there in time; who would come too early stands."""
+    scale = state.character.scale
+    here = (state.committed.place.position_xz * scale).tolist()
+    away = (order.place[0] - here[0], order.place[1] - here[1])
+    speed = math.hypot(*away) * PRIOR_FPS / left
+    if speed < _LEAST_SPEED * scale:
+        return replace(command, speed=0.0, heading=state.target.facing, facing=None, turning=None, step_length=None)
+    return replace(command, speed=speed, heading=math.atan2(*away), facing=None, turning=None, step_length=None)
+
+
+def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Float[Tensor, "batch after size"]:
+    """Frames at the place run backwards, the pose there last: the given pose alone, or moments of the prior and how
+    motion goes on from them."""
+    if order.pose is not None:
+        pose = order.pose
+        still = Motion(
+            pose.skeleton, pose.fps, pose.root_position.expand(2, -1), pose.local_quat_xyzw.expand(2, -1, -1)
+        )
+        return encode(still)[0][:1].float()[None]
+    prior = state.prior.conditioned_on(command.told) if command.told else state.prior
+    starts = prior.initial_states
+    speed = command.speed / state.character.scale
+    near = (starts.speed - speed).abs().argsort()[:_CANDIDATES]
+    begun = starts.state.pick(near)
+    noise = torch.zeros(len(near), _AFTER, LAYOUT.continuous)
+    with torch.no_grad():
+        on, _ = prior.rollout(begun, noise, prior.plan(begun, noise))
+    return reversed_features(torch.cat([begun.last_frame[:, None], on], dim=1))
+
+
+def _measure_roughness(state: SteerState, ways: Float[Tensor, "batch frames size"]) -> Float[Tensor, " batch"]:
+    """Measure the root mean square acceleration of the joints on ways from where the character is."""
+    rough = []
+    for way in ways:
+        joints = decode(way, state.committed.place, skeleton=state.character.unit_skeleton).joint_positions()
+        whole = torch.cat([state.committed.joints_world[-2:].to(joints), joints])
+        rough.append(torch.diff(whole, n=2, dim=0).square().sum(dim=-1).mean().sqrt())
+    return torch.stack(rough)
+
+
+def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[SteerState, SteerFrames]:
+    """Deliver the next planned frames, and advance the density over them."""
+    planned, character, committed = approach.planned, state.character, state.committed
+    assert planned is not None
+    new, rest = planned[: state.settings.commit], planned[state.settings.commit :]
+    unit = decode(new, committed.place, skeleton=character.unit_skeleton)
+    at = _end_place(new, committed.place)
+    ahead = decode(rest, at, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
+    forecast = unit.joint_positions()[:0] if ahead is None else ahead
+    motion = character.motion(unit)
+    overlay, motion = state.overlay.pose(motion, command, forecast * character.scale)
+    targets = _read_targets(new, committed.place, state.target)
+    density_state = state.prior.advance(committed.state, new[None])  # pyright: ignore[reportArgumentType]
+    joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
+    after = replace(
+        committed,
+        state=density_state,
+        place=at,
+        features=torch.cat([committed.features, new]),
+        joints_world=joints[-_PAST_FRAMES:],
+        warm_start=committed.warm_start[:0],
+        forecast=None,
+    ).discard_history(len(committed.features))
+    velocities = torch.tensor([target.velocity for target in targets])
+    frames = SteerFrames(
+        motion,
+        Status(Outcome.DONE),
+        Ledger(),
+        features=new,
+        contacts=LAYOUT.pick(new, "contacts"),
+        steering_targets=tuple(replace(target, speed=target.speed * character.scale) for target in targets),
+        forecast=forecast * character.scale,
+    )
+    next_state = replace(
+        state,
+        committed=after,
+        target=targets[-1],
+        past_targets=torch.cat([state.past_targets, velocities])[-_PAST_FRAMES:],
+        frames=state.frames + len(new),
+        overlay=overlay,
+        approach=replace(approach, planned=rest),
+    )
+    return next_state, frames
+
+
+def _end_place(features: Tensor, start: GroundPose) -> GroundPose:
+    """Ground pose after some frames, summed in double precision."""
+    at = GroundPose(start.position_xz.double(), start.heading.double())
+    for row in features.double():
+        at = at.displace(LAYOUT.pick(row, "root_displacement_heading"), LAYOUT.pick(row, "heading_change")[0])
+    return GroundPose(at.position_xz.float(), at.heading.float())
+
+
+def _read_targets(features: Tensor, start: GroundPose, before: SteeringTarget) -> list[SteeringTarget]:
+    """Read the targets that frames meet, so that steering goes on from their pace."""
+    targets, heading, travel = [], float(start.heading), before.heading
+    for row in features:
+        step_xz = rotations.rotate_ground(LAYOUT.pick(row, "root_displacement_heading"), torch.tensor(heading))
+        speed = float(step_xz.norm()) * PRIOR_FPS
+        heading += float(LAYOUT.pick(row, "heading_change")[0])
+        travel = math.atan2(*step_xz.tolist()) if speed > _LEAST_SPEED else heading
+        targets.append(SteeringTarget(speed, travel, heading))
+    return targets

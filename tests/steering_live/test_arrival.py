@@ -1,0 +1,130 @@
+"""Orders to be somewhere at a time, with an untrained density and stitcher: exact, and steered on from there."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import walk
+from tiny_steering import AHEAD, DENSITY, begun
+from tiny_stitcher import tiny_stitcher
+
+from controllers.steering import steer
+from controllers.steering.arrival import Approach, Arriver
+from controllers.steering.loop import Recorder, StreamClock, drive
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.steering import Arrival, Command, CommandTrack
+from mapctl.metrics.arrivals import measure_arrivals
+from mapctl.retarget import to_canonical
+from mapctl.skeleton import CANONICAL, Skeleton
+
+ARRIVER = Arriver(tiny_stitcher())  # 23 frames between two poses at most
+
+
+def play(*orders, frames=70, state=None):
+    """Play orders at their times, after a start ahead; returns the recorder and the track."""
+    track = CommandTrack(
+        (0.0, *(time for time, _ in orders)), (AHEAD, *(replace(AHEAD, arrival=order) for _, order in orders))
+    )
+    recorder = Recorder()
+    begin, first = begun() if state is None else state
+    recorder.show(first, 0.0)
+    drive(begin, track, [recorder], frames=frames, clock=StreamClock(), stepper=ARRIVER)
+    return recorder, track
+
+
+def errors(recorder, track):
+    (row,) = measure_arrivals(recorder.motion(), track, [refusal.order for refusal in recorder.refusals])
+    return row
+
+
+@pytest.mark.parametrize("facing", [None, -2.0])
+def test_a_near_place_is_reached_on_the_frame(facing):
+    recorder, track = play((0.2, Arrival((0.5, 0.4), 0.9, facing)))
+    row = errors(recorder, track)
+    assert row["frame"] == 27
+    assert row["place_error_cm"] < 0.1
+    assert facing is None or row["facing_error_deg"] < 0.1
+
+
+def test_a_far_place_is_walked_to_first_and_steered_from_there():
+    recorder, track = play((0.2, Arrival((0.3, 1.5), 2.0, 0.5)), frames=80)
+    assert errors(recorder, track)["place_error_cm"] < 0.1
+    searched = [piece.evaluations > 0 for piece in recorder.pieces[1:]]
+    assert searched[:3] == [True, True, True]  # walked
+    assert not all(searched[3:20])  # stitched
+    assert all(searched[-4:])  # steered on
+    steps = recorder.motion().joint_positions().diff(dim=0).norm(dim=-1)
+    assert bool(steps.isfinite().all())
+
+
+def test_a_pose_is_taken():
+    pose = to_canonical(walk(40))[0].slice(17, 18)
+    recorder, track = play((0.2, Arrival((0.2, 0.3), 0.9, 0.3, pose)))
+    row = errors(recorder, track)
+    assert row["pose_error_cm"] < 0.1
+    assert row["place_error_cm"] < 0.1
+
+
+def test_frames_meet_those_before_and_after_the_way():
+    """The way begins where the walk was, and the walk goes on where the way ended."""
+    recorder, _ = play((0.2, Arrival((0.2, 0.5), 0.9)))
+    joints = recorder.motion().joint_positions()
+    step = joints.diff(dim=0).norm(dim=-1).amax(dim=-1)
+    assert float(step[[5, 6, 7]].max()) < 3 * float(step[8:26].max())
+
+
+def test_a_new_command_on_the_way_leaves_it_at_once():
+    track = CommandTrack((0.0, 0.2, 0.5), (AHEAD, replace(AHEAD, arrival=Arrival((0.5, 0.4), 0.9)), AHEAD))
+    recorder = Recorder()
+    state, first = begun()
+    recorder.show(first, 0.0)
+    state, _ = drive(state, track, [recorder], frames=40, clock=StreamClock(), stepper=ARRIVER)
+    assert state.approach is None
+    assert recorder.pieces[-1].evaluations > 0
+
+
+def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
+    recorder, track = play((0.2, Arrival((50.0, 0.0), 0.9)), (0.5, Arrival((0.0, 0.0), 0.5)))
+    told = [refusal.reason for refusal in recorder.refusals]
+    assert len(told) == 2
+    assert "50.0 m away, in 0.6 s is not obeyed: it needs 8" in told[0]
+    assert "nobody comes anywhere in less" in told[1]
+    assert measure_arrivals(recorder.motion(), track, [refusal.order for refusal in recorder.refusals]) == []
+    plain, _ = play()
+    assert torch.equal(recorder.motion().root_position, plain.motion().root_position)
+
+
+def test_another_body_comes_to_the_same_place():
+    tall = Skeleton(CANONICAL.names, CANONICAL.parents, 1.3 * CANONICAL.offsets, CANONICAL.end_offsets)
+    settings = begun()[0].settings
+    state = steer.begin(
+        DENSITY, AHEAD, generator=torch.Generator().manual_seed(0), settings=settings, skeleton=tall
+    )
+    recorder, track = play((0.2, Arrival((0.5, 0.4), 0.9, 1.0)), state=state)
+    assert errors(recorder, track)["place_error_cm"] < 0.1
+
+
+def test_steps_are_pure():
+    state, _ = begun()
+    command = replace(AHEAD, arrival=Arrival((0.3, 0.4), 0.6))
+    one, two = (ARRIVER(state, command) for _ in range(2))
+    assert torch.equal(one[1].motion.root_position, two[1].motion.root_position)
+    assert isinstance(one[0].approach, Approach)
+    assert one[0].frames == 1 + state.settings.commit
+    assert round(PRIOR_FPS) == 30
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_an_order_has_finite_numbers(wrong):
+    for order in (((wrong, 0.0), 1.0, None), ((0.0, 0.0), wrong, None), ((0.0, 0.0), 1.0, wrong)):
+        with pytest.raises(RequestError, match="finite"):
+            Arrival(*order)
+
+
+def test_a_command_without_an_order_is_steered_as_ever():
+    state, _ = begun()
+    one, two = steer.step(state, AHEAD), ARRIVER(state, AHEAD)
+    assert torch.equal(one[1].motion.root_position, two[1].motion.root_position)
+    assert Command(1.0, 0.0).arrival is None
