@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mapctl.features import LAYOUT
-from priors.stitching.layers import SidedLayers
+from priors.stitching.layers import SIDES, SidedLayers
 from priors.stitching.network import SEEN_FUTURE, Gaussian, StitcherConfig
 
 _WIDTH = 128
@@ -25,19 +25,29 @@ class PosteriorNetwork(nn.Module):
         self.whole = nn.Sequential(
             nn.Linear((_MOMENTS + 1) * _WIDTH, 2 * _WIDTH), nn.ELU(), nn.Linear(2 * _WIDTH, 2 * config.shared)
         )
+        self.expect = nn.Sequential(
+            nn.Linear(SIDES * 3 * config.embedding[-1], 2 * _WIDTH), nn.ELU(), nn.Linear(2 * _WIDTH, config.shared)
+        )
         self.next = SidedLayers(SEEN_FUTURE * LAYOUT.size + config.encoder, 2 * _WIDTH, 2 * config.own)
 
-    def tell_shared(self, truth: Float[Tensor, "batch frames size"]) -> Gaussian:
-        """Tell it from the whole way from pose to pose, normalised features forwards.
+    def tell_shared(
+        self, truth: Float[Tensor, "batch frames size"], seen: Float[Tensor, "2 batch seen"]
+    ) -> tuple[Gaussian, Float[Tensor, "batch shared"]]:
+        """Tell it from the whole way from pose to pose, normalised features forwards; also return the errors of what
+        the ends alone let expect, which are to become small.
 
-        Over the batch each number's mean has unit variance, so that what is told cannot fade away (Zhu et al. 2020, "A
-        batch normalized inference network keeps the KL vanishing away").
+        What is told is what the ends do not tell: the rest of it has been taken off. Over the batch each number's mean
+        has unit variance, so that what is told cannot fade away (Zhu et al. 2020, "A batch normalized inference network
+        keeps the KL vanishing away").
         """
         frames = self.frame(truth)
         at = torch.linspace(0, frames.shape[1] - 1, _MOMENTS).round().long()
-        mean, raw = self.whole(torch.cat([frames.mean(dim=1), frames[:, at].flatten(1)], dim=-1)).chunk(2, dim=-1)
+        told, raw = self.whole(torch.cat([frames.mean(dim=1), frames[:, at].flatten(1)], dim=-1)).chunk(2, dim=-1)
+        expected = self.expect(seen.detach().transpose(0, 1).flatten(1))
+        mean = told - expected.detach()
         mean = (mean - mean.mean(dim=0)) / (mean.var(dim=0, correction=0) + 1e-5).sqrt()
-        return Gaussian(mean, (_LEAST_SIGMA + (1 - _LEAST_SIGMA) * torch.sigmoid(raw)).log())
+        sigma = _LEAST_SIGMA + (1 - _LEAST_SIGMA) * torch.sigmoid(raw)
+        return Gaussian(mean, sigma.log()), expected - told.detach()
 
     def tell_own(
         self, ahead: Float[Tensor, "2 batch frames size"], encoded: Float[Tensor, "2 batch width"]

@@ -99,9 +99,7 @@ def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
 def test_another_body_comes_to_the_same_place():
     tall = Skeleton(CANONICAL.names, CANONICAL.parents, 1.3 * CANONICAL.offsets, CANONICAL.end_offsets)
     settings = begun()[0].settings
-    state = steer.begin(
-        DENSITY, AHEAD, generator=torch.Generator().manual_seed(0), settings=settings, skeleton=tall
-    )
+    state = steer.begin(DENSITY, AHEAD, generator=torch.Generator().manual_seed(0), settings=settings, skeleton=tall)
     recorder, track = play((0.2, Arrival((0.5, 0.4), 0.9, 1.0)), state=state)
     assert errors(recorder, track)["place_error_cm"] < 0.1
 

@@ -43,6 +43,8 @@ class LossWeights:
     """Divergence of that posterior, as it is, from its prior, which is to learn it, nats."""
     own: float = 0.02
     """Divergence of the frames' latents from their prior, nats a transition."""
+    expected: float = 1.0
+    """Mean square error of what the ends let expect of the posterior, which learns nothing by it."""
     phase: float = 0.3
     """Absolute error of the phases."""
 
@@ -66,12 +68,15 @@ class TaughtLatents:
     """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
     cost: Tensor = field(default_factory=lambda: torch.zeros(()))
     """The transition's divergence from a standard normal distribution, by row and dimension."""
+    unexpected: Tensor = field(default_factory=lambda: torch.zeros(()))
+    """Mean square of what the posterior tells and its ends did not let expect."""
     means: list[Tensor] = field(default_factory=list)
     """Means of the posterior: the transition's, and then those of frames."""
 
     def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
         """What both sides share over the transition."""
-        told = self.posterior.tell_shared(self.truth[0])
+        told, off = self.posterior.tell_shared(self.truth[0], seen)
+        self.unexpected = off.square().mean()
         self.cost = told.diverge(Gaussian(torch.zeros_like(told.mean), torch.zeros_like(told.mean)))
         # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
         self._count(told.detach().diverge(prior), told.mean)
@@ -151,6 +156,7 @@ def compute_stitcher_losses(
         "shared": latents.cost.mean(dim=0).sum(),
         "prior": nats[0].sum(),
         "own": nats[1].sum(),
+        "expected": latents.unexpected,
         "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
     }
     loss = sum((getattr(weights, name) * value for name, value in parts.items()), start=torch.zeros(()))
