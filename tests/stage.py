@@ -45,6 +45,9 @@ class Actor:
     def command(self, command):
         self.heard.append(("command", command))
 
+    def go(self, command, place, within, facing=None):
+        self.heard.append(("go", command, place, within, facing))
+
     def aim(self, command):
         self.heard.append(("aim", command))
 

@@ -105,13 +105,13 @@ class Arriver:
         character = state.character
         after = _pose_candidates(state, command, order)
         here = state.committed.place
-        place = torch.tensor(order.place) / character.scale
+        place = torch.tensor(order.place, dtype=torch.float32) / character.scale
         facing = order.facing
         if facing is None:
             away = place - here.position_xz
             facing = float(here.heading) if float(away.norm()) < _FAR else math.atan2(*away.tolist())
         seen = rotations.rotate_ground(place - here.position_xz, -here.heading)
-        turn = rotations.wrap_angle(torch.tensor(facing) - here.heading)
+        turn = rotations.wrap_angle(torch.tensor(facing, dtype=torch.float32) - here.heading)
         count = len(after)
         ways = self.transitions.connect(
             state.committed.features, after, seen.expand(count, -1), turn.expand(count), frames

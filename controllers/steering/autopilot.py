@@ -6,7 +6,7 @@ from dataclasses import replace
 from controllers.steering.pure_pursuit import PurePursuit
 from controllers.steering.steer import SteerFrames
 from mapctl.curves.curve import Curve
-from mapctl.intent.steering import Command
+from mapctl.intent.steering import Arrival, Command
 from mapctl.intent.steering_limits import SteeringLimits
 
 _ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops
@@ -19,11 +19,22 @@ class Autopilot:
         """Begin with a command; `limits` determine how soon to brake before the end of a path."""
         self._command, self._limits = command, limits
         self._pursuit: PurePursuit | None = None
+        self._goal: Arrival | None = None  # its time counted from when it is asked for
         self._last: SteerFrames | None = None
 
     def command(self, command: Command) -> None:
         """Hold this command from now on."""
-        self._command, self._pursuit = command, None
+        self._command, self._pursuit, self._goal = command, None, None
+
+    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None) -> None:
+        """Be at a place, x and z in metres, in so many seconds from the next step on, facing so, and hold the command
+        from then on."""
+        self.command(command)
+        self._goal = Arrival(place, within, facing)
+
+    def stay(self) -> None:
+        """Go to no place any more."""
+        self._command, self._goal = replace(self._command, arrival=None), None
 
     def aim(self, command: Command) -> None:
         """Reach, look and walk round obstacles as this command says; nothing else of it counts."""
@@ -33,7 +44,8 @@ class Autopilot:
 
     def walk(self, curve: Curve, speed: float) -> None:
         """Walk along a curve with the step length and labels of the last command; stop at the end of an open one."""
-        self._pursuit = PurePursuit(curve, speed=speed)
+        self._pursuit, self._goal = PurePursuit(curve, speed=speed), None
+        self._command = replace(self._command, arrival=None)
         if self._last is not None:
             self._pursuit.show(self._last, 0.0)
 
@@ -45,6 +57,9 @@ class Autopilot:
 
     def at(self, seconds: float) -> Command:
         """See Source."""
+        if self._goal is not None:
+            self._command = replace(self._command, arrival=replace(self._goal, by=seconds + self._goal.by))
+            self._goal = None
         if self._pursuit is None:
             return self._command
         pursued, left = self._pursuit.at(seconds), self._pursuit.left

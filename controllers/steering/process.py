@@ -21,7 +21,7 @@ import numpy as np
 from controllers.steering.process_worker import CharacterRequest, run_worker
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
-from mapctl.intent.steering import Command
+from mapctl.intent.steering import Arrival, Command
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import spawn
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -64,6 +64,13 @@ class CharacterProcess:
     def aim(self, command: Command) -> None:
         """See LiveCharacter."""
         self._send("aim", command)
+
+    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
+        """See LiveCharacter. RequestError where the request has no `transitions`, and for numbers that are none."""
+        if self._request.transitions is None:
+            raise RequestError("this character was made without transitions, which take it to a place")
+        Arrival(place, within, facing)  # so that errors are raised here, not in the process
+        self._send("go", command, place, within, facing)
 
     def pause(self, paused: bool) -> None:
         """See LiveCharacter."""

@@ -5,20 +5,21 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from typing import Any
 
 import torch
 
 from controllers.steering import steer
+from controllers.steering.arrival import Arriver
 from controllers.steering.autopilot import Autopilot
 from controllers.steering.loop import iterate_steps
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Command
+from mapctl.intent.steering import Arrival, Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
 
@@ -39,6 +40,8 @@ class CharacterRequest:
     """Position of the first pose, x and z in metres."""
     settings: SteerSettings = field(default_factory=SteerSettings)
     """Sigmas, window lengths and budget."""
+    transitions: Callable[[], Any] | None = None
+    """Loader of who makes the way to a place, called there too; without one the character can be sent nowhere."""
 
 
 class ParentClosed(Exception):
@@ -80,6 +83,8 @@ class ProcessClock:
     def show(self, frames: SteerFrames, due: float) -> None:
         """See Display."""
         self._pilot.show(frames, due)
+        if frames.refusal is not None:
+            self._notes.append(frames.refusal.reason)
         at = self._began + due + self._shift
         spare = at - time.perf_counter() - self._held
         self._connection.send(("frames", _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes))))
@@ -112,6 +117,11 @@ class ProcessClock:
             self._pause(*content)
         elif word == "aim":
             self._pilot.aim(*content)
+        elif word == "go":
+            command, *where = content
+            command, notes = steer.accept(self._prior, command)
+            self._notes += notes
+            self._pilot.go(command, *where)
         elif word == "walk":
             points, speed = content
             self._pilot.walk(curves.through(points), min(speed, self._prior.limits.max_steering_speed))
@@ -149,16 +159,20 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
     first, _ = steer.accept(prior, request.first)
     pilot = Autopilot(first, request.settings.limits)
     clock = ProcessClock(connection, pilot, prior)
+    stepper = steer.step if request.transitions is None else Arriver(request.transitions())
     for number in itertools.count():
         state, pose = steer.begin(prior, first, generator=generator, at=request.at, settings=request.settings)
         if number == 0:
             for _ in range(_WARM_UP_STEPS):
                 steer.step(state, first)
+            if isinstance(stepper, Arriver):  # likewise
+                stepper(state, replace(first, arrival=Arrival(request.at, 1.0)))
             connection.send(("ready", None))
         clock.begin(state, pose)
-        for _ in iterate_steps(state, pilot, [clock], clock=clock):
+        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=stepper):
             if clock.again:
                 break
+        pilot.stay()
         first = pilot.at(clock.now())
 
 

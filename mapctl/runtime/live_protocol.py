@@ -74,6 +74,11 @@ class LiveCharacter(Protocol):
         """Reach, look and walk round obstacles as this command says; nothing else of it counts, and a path is kept."""
         ...
 
+    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
+        """Be at a place (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that is
+        possible, and obey the command from then on; a note says why not."""
+        ...
+
     def pause(self, paused: bool) -> None:
         """Stop the clock, or let it go on."""
         ...

@@ -78,9 +78,13 @@ class Stitcher(Inbetweener):
         return join_sides(walk_sides(self.network, ends, frames, latents), ends)
 
     @torch.no_grad()
-    def answer(self, ends: Ends, frames: int) -> Joined:
-        """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image."""
+    def answer(self, ends: Ends, frames: int, *, mirrored: bool = True) -> Joined:
+        """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image, or the
+        first alone, which takes half of the time."""
         config, batch = self.network.config, len(ends.place)
+        if not mirrored:
+            calm = DrawnLatents.calm(batch, count_made(self.network, frames), config.shared, config.own)
+            return join_sides(walk_sides(self.network, ends, frames, calm), ends)
         both = Ends(
             torch.cat([ends.features, mirror_features(ends.features)], dim=1),
             torch.cat([ends.present, ends.present], dim=1),
@@ -111,7 +115,7 @@ class Stitcher(Inbetweener):
             lead = context - known.shape[1]
             sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
             present.append((torch.arange(context) >= lead).float().expand(len(after), -1))
-        joined = self.answer(Ends(torch.stack(sides), torch.stack(present), place, turn), frames)
+        joined = self.answer(Ends(torch.stack(sides), torch.stack(present), place, turn), frames, mirrored=False)
         origin = GroundPose(torch.zeros_like(place), torch.zeros_like(turn))
         first, last = _stand_at(before[:, -1], origin), _stand_at(after[:, -1], GroundPose(place, turn))
         root = torch.cat([first.root_position, joined.root_position, last.root_position], dim=1)

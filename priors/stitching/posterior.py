@@ -43,9 +43,9 @@ class PosteriorNetwork(nn.Module):
         frames = self.frame(truth)
         at = torch.linspace(0, frames.shape[1] - 1, _MOMENTS).round().long()
         told, raw = self.whole(torch.cat([frames.mean(dim=1), frames[:, at].flatten(1)], dim=-1)).chunk(2, dim=-1)
+        told = _standardise(told)
         expected = self.expect(seen.detach().transpose(0, 1).flatten(1))
-        mean = told - expected.detach()
-        mean = (mean - mean.mean(dim=0)) / (mean.var(dim=0, correction=0) + 1e-5).sqrt()
+        mean = _standardise(told - expected.detach())
         sigma = _LEAST_SIGMA + (1 - _LEAST_SIGMA) * torch.sigmoid(raw)
         return Gaussian(mean, sigma.log()), expected - told.detach()
 
@@ -54,3 +54,8 @@ class PosteriorNetwork(nn.Module):
     ) -> Gaussian:
         """Tell a frame's from the true frames ahead, normalised, in each side's sense of time."""
         return Gaussian.of(self.next(torch.cat([ahead.flatten(-2), encoded], dim=-1)))
+
+
+def _standardise(values: Float[Tensor, "batch shared"]) -> Float[Tensor, "batch shared"]:
+    """Shift and scale each number to zero mean and unit variance over the batch."""
+    return (values - values.mean(dim=0)) / (values.var(dim=0, correction=0) + 1e-5).sqrt()

@@ -45,6 +45,21 @@ class LiveActor:
         """Send the character what it reaches for, looks at and walks round; it keeps its path."""
         self.character.aim(replace(self.orders.command, obstacles=tuple(obstacles)))
 
+    def go(
+        self,
+        place: tuple[float, float],
+        within: float,
+        facing: float | None,
+        obstacles: Sequence[Obstacle] = (),
+        *,
+        stand: bool,
+    ) -> None:
+        """Send the character to a place, x and z in metres, in so many seconds, facing so, radians; there it obeys its
+        orders, or stands. It leaves its path."""
+        if stand:
+            self.orders = replace(self.orders, speed=0.0)
+        self.character.go(replace(self.orders.command, obstacles=tuple(obstacles)), place, within, facing)
+
     def reset(self, obstacles: Sequence[Obstacle] = ()) -> None:
         """Restart with the first orders; a recording goes on."""
         self._waiting.clear()

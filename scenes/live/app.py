@@ -21,6 +21,7 @@ from scenes.live import ground
 from scenes.live.access import ServerErrorReporter, format_error, restrict_to_own_pages
 from scenes.live.actor import LiveActor
 from scenes.live.controls import ControlPanel
+from scenes.live.going import GoThere
 from scenes.live.inputs import InputLimits, SteeringInputs
 from scenes.live.notifications import Notifications
 from scenes.live.readouts import Readouts
@@ -71,6 +72,7 @@ class LiveApp:
             gui, self, self.targets, characters=len(characters), bounds=self._bounds, below=self._notices.below
         )
         self._panel.show(self._members[0].orders)
+        self._going = GoThere(gui, scene, _WORLD)
         self._gauges = Readouts(gui)
         scene.on_click()(lambda event: self._draw_at(event.ray_origin, event.ray_direction))
 
@@ -284,12 +286,18 @@ class LiveApp:
             self._notices.console(said or f"{member.name} keeps up again")
 
     def _draw_at(self, ray_origin: Any, ray_direction: Any) -> None:
-        """Add a point to the path at a click: the ray's origin and direction, three numbers each, checked for that."""
+        """Send the chosen character where a click meets the ground, or add a point to the path there: the ray's origin
+        and direction, three numbers each, checked for that."""
 
         def added() -> None:
             ray = ground.parse_ray(ray_origin, ray_direction)
             shift = np.asarray(self._world.position)
-            if self._panel.draw.value and (place := ground.intersect_ground(ray[0] - shift, ray[1])) is not None:
+            place = ground.intersect_ground(ray[0] - shift, ray[1])
+            if place is None:
+                return
+            if self._going.send(self._chosen_member, place, self.targets.obstacles):
+                self._panel.show(self._chosen_member.orders)
+            elif self._panel.draw.value:
                 self._path.add(*place)
 
         self._enqueue(added)

@@ -88,3 +88,21 @@ def test_what_is_aimed_at_on_a_path_keeps_the_path_and_stays_at_its_end():
         at_place(pilot, 0.0, 0.1 * step)
         last = pilot.at(0.0)
     assert (last.speed, last.reach, last.look_at, last.obstacles) == (0.0, {"leftHand": place}, place, disc)
+
+
+def test_an_order_to_be_somewhere_counts_its_seconds_from_the_next_step_and_stays_one_order():
+    pilot = Autopilot(Command(1.0, 0.0), SteeringLimits())
+    pilot.go(Command(0.5, 0.2), (1.0, 2.0), 1.5, 0.3)
+    command = pilot.at(4.0)
+    assert (command.speed, command.arrival.place, command.arrival.by) == (0.5, (1.0, 2.0), 5.5)
+    assert pilot.at(4.1).arrival is command.arrival
+    pilot.aim(Command(0.0, 0.0, look_at=(1.0, 1.0, 1.0)))
+    assert pilot.at(4.2).arrival is command.arrival
+    pilot.command(Command(1.0, 0.0))
+    assert pilot.at(4.3).arrival is None
+    pilot.go(Command(0.5, 0.2), (1.0, 2.0), 1.5, None)
+    pilot.stay()
+    assert pilot.at(5.0).arrival is None
+    pilot.go(Command(0.5, 0.2), (1.0, 2.0), 1.5, None)
+    pilot.walk(LINE, 1.0)
+    assert pilot.at(5.0).arrival is None

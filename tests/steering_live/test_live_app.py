@@ -206,3 +206,29 @@ def test_gauges_count_late_frames_and_know_the_speed(show):
     assert gauges.speed == pytest.approx(float((way[29] - way[14]).norm()) * 2, rel=1e-6)
     assert "2 of 30 frames late" in gauges._text.content
     assert [len(plot.data) for plot in gauges._plots] == [3, 3]
+
+
+def test_a_click_sends_the_chosen_one_there(show, actors):
+    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
+    run(show, 1)
+    assert not [heard for heard in actors[0].heard if heard[0] == "go"]  # clicks are for nothing yet
+    show._going.on.value, show._going.within.value = True, 1.5
+    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
+    run(show, 1)
+    _, command, place, within, facing = actors[0].heard[-1]
+    assert (place, within, facing) == (pytest.approx((1.0, 2.0)), 1.5, None)
+    assert command.speed > 0
+    show._going.faces.value, show._going.facing.value, show._going.then.value = True, 90.0, "stand"
+    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
+    run(show, 1)
+    _, command, _, _, facing = actors[0].heard[-1]
+    assert (command.speed, facing) == (0.0, pytest.approx(math.pi / 2))
+    assert show._panel.speed.value == 0.0
+
+
+@pytest.mark.parametrize("wrong", [0.0, math.nan, 1e300])
+def test_times_that_no_slider_gives_send_nobody(show, actors, wrong):
+    show._going.on.value, show._going.within.value = True, wrong
+    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
+    run(show, 1)
+    assert not [heard for heard in actors[0].heard if heard[0] == "go"]

@@ -11,6 +11,7 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 from tiny_prior import save_tiny_prior
+from tiny_stitcher import save_tiny_stitcher
 
 import priors
 from controllers.steering.process import CharacterProcess, CharacterRequest
@@ -26,8 +27,10 @@ def load(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def remote(load):
-    made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), at=(3.0, -1.0)))
+def remote(load, tmp_path_factory):
+    stitcher = save_tiny_stitcher(tmp_path_factory.mktemp("s") / "tiny.safetensors")
+    transitions = functools.partial(priors.load_stitcher, str(stitcher))
+    made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), at=(3.0, -1.0), transitions=transitions))
     made.wait()
     yield made
     made.close()
@@ -57,6 +60,33 @@ def test_a_hand_goes_to_what_is_aimed_at(remote):
     assert min(away) < 0.5 * away[0]
     remote.aim(Command(0.0, 0.0))
     remote.command(Command(1.2, 0.0))
+
+
+def test_it_goes_where_it_is_sent_and_says_what_is_too_far(remote):
+    remote.command(Command(0.5, 0.0))
+    remote.reset()
+    x, _, z = collected(remote, 1.0)[-1].root[-1]
+    remote.go(Command(0.5, 0.0), (x + 0.2, z + 0.4), 0.7, 1.0)
+    pieces = collected(remote, 1.5)
+    away = np.concatenate([piece.root[:, ::2] for piece in pieces]) - np.array([x + 0.2, z + 0.4])
+    assert np.linalg.norm(away, axis=1).min() < 0.001
+    assert not [note for piece in pieces for note in piece.notes]
+    remote.go(Command(0.5, 0.0), (x + 100.0, z), 0.7)
+    notes = [note for piece in collected(remote, 1.0) for note in piece.notes]
+    assert len(notes) == 1
+    assert "m away, in 0.7 s is not obeyed" in notes[0]
+    with pytest.raises(RequestError, match="finite"):
+        remote.go(Command(0.5, 0.0), (np.nan, 0.0), 0.7)
+
+
+def test_who_was_made_without_transitions_is_sent_nowhere(load):
+    made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0)))
+    try:
+        with pytest.raises(RequestError, match="without transitions"):
+            made.go(Command(1.0, 0.0), (1.0, 1.0), 1.0)
+    finally:
+        made.wait()
+        made.close()
 
 
 def test_it_is_a_live_character_that_walks_in_time(remote):

@@ -72,7 +72,10 @@ def _start_characters(command: Live) -> Sequence[CharacterProcess]:
     found: list[CharacterProcess] = []
     try:
         for number, at in enumerate(positions):
-            found.append(CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), command.seed + number, at)))
+            request = CharacterRequest(
+                load, Command(1.2, 0.0), command.seed + number, at, transitions=priors.load_stitcher
+            )
+            found.append(CharacterProcess(request))
         for character in found:
             character.wait()
     except BaseException:
