@@ -132,7 +132,7 @@ def _refuse(state: SteerState, order: Arrival) -> str:
     away = math.dist(order.place, (state.committed.place.position_xz * scale).tolist())
     if away * PRIOR_FPS / left > fastest:
         return (
-            f"an arrival at {order.place[0]:g}, {order.place[1]:g} m, {away:.1f} m away, in {left / PRIOR_FPS:.1f} s is"
+            f"an arrival at {order.place[0]:.2f}, {order.place[1]:.2f} m, {away:.1f} m away, in {left / PRIOR_FPS:.1f} s is"
             f" not obeyed: it needs {away * PRIOR_FPS / left:.1f} m/s, and {fastest:.1f} m/s is the fastest"
         )
     return ""
