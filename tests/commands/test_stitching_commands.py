@@ -48,6 +48,12 @@ def test_the_first_variation_is_the_calm_one_and_the_others_are_the_same_however
     assert len({Path(f"many_00{number}.bvh").read_bytes() for number in range(4)}) == 4
 
 
+def test_one_answer_is_the_calm_one_whatever_the_seed(clip):
+    for out, seed in (("a.bvh", 0), ("b.bvh", 5)):
+        assert run("tween", clip, "-o", out, "--keyframes", "0,20", *STITCH, "--seed", seed) == 0
+    assert Path("a.bvh").read_bytes() == Path("b.bvh").read_bytes()
+
+
 def test_the_best_of_some_names_its_pick(clip):
     words = ("tween", clip, "-o", "best.bvh", "--keyframes", "0,20", *STITCH, "--best-of", 3, "--report", "best.json")
     assert run(*words) == 0

@@ -48,7 +48,9 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
     if command.variations > 1 and command.best_of > 1:
         raise RequestError("--variations keeps all answers and --best-of one; choose one")
     if command.variations == 1:
-        if command.seed and command.best_of < _FIRST_SAMPLED and command.method != "rollouts":
+        # Of the stitcher, whose draws are asked for by number, one answer is the calm one whatever the seed.
+        sampled = command.method in ("rollouts", "stitcher")
+        if command.seed and command.best_of < _FIRST_SAMPLED and not sampled:
             raise RequestError(
                 "--seed is of what is drawn, and nothing is; ask for --variations, --best-of 3 or --method rollouts"
             )
