@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
+from controllers.steering.steer import Refusal, SteerFrames, SteerState, condition_prior, step
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, reversed_features
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
@@ -58,13 +58,16 @@ class TransitionMaker(Protocol):
 class Approach:
     """How far an order is carried out."""
 
-    order: Arrival
-    """The order."""
+    order: Arrival | None
+    """The last order, if the last command had one."""
+    held: Command
+    """The command that is steered by, without an order: the last one, or the one before it where its order is refused.
+    """
     planned: Float[Tensor, "frames size"] | None = None
     """Features of the frames to the place that are not delivered yet, none of them once it is there; None while it is
     walked to."""
-    refused: str = ""
-    """Why it is not obeyed, with numbers."""
+    refused: bool = False
+    """Whether the order is not obeyed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,28 +80,27 @@ class Arriver:
     def __call__(
         self, state: SteerState, command: Command, *, seconds: float | None = None
     ) -> tuple[SteerState, SteerFrames]:
-        """Solve or deliver the next frames, as `controllers.steering.steer.step`. Orders that cannot be met are said in
-        the frames' `refusal` and not obeyed; the rest of their command holds at once."""
-        order, plain = command.arrival, replace(command, arrival=None)
+        """Solve or deliver the next frames, as `controllers.steering.steer.step`. A command whose order cannot be met
+        is not obeyed: the one before it holds, and the frames' `refusal` says why."""
+        order, plain, refusal = command.arrival, replace(command, arrival=None), None
+        approach = state.approach if isinstance(state.approach, Approach) else None
         if order is None:
-            return step(replace(state, approach=None), plain, seconds=seconds)
-        approach, left = state.approach, _arrival_frame(order) - state.frames + 1
-        begun = isinstance(approach, Approach) and approach.order is order
-        if not begun:
-            approach = Approach(order, refused=_refuse(state, order))
-        assert isinstance(approach, Approach)
-        if approach.refused:
-            state, frames = step(replace(state, approach=approach), plain, seconds=seconds)
-            return state, frames if begun else replace(frames, refusal=Refusal(order, approach.refused))
-        if approach.planned is not None and not len(approach.planned):
-            return step(state, plain, seconds=seconds)
+            return step(replace(state, approach=Approach(None, plain)), plain, seconds=seconds)
+        left, new = _arrival_frame(order) - state.frames + 1, approach is None or approach.order is not order
+        if approach is None or new:
+            refusal = _refuse(state, order)
+            before = approach.held if approach and refusal else plain
+            approach = Approach(order, before, refused=refusal is not None)
         # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
-        most = _STITCHED_FRAMES if begun else self.transitions.longest + 1
-        if approach.planned is None and left <= most:
+        most = self.transitions.longest + 1 if new else _STITCHED_FRAMES
+        if approach.planned is None and not approach.refused and left <= most:
             approach = replace(approach, planned=self._plan(state, command, order, left))
-        if approach.planned is not None:
+        if approach.planned is not None and len(approach.planned):
             return _deliver(state, approach, plain)
-        return step(replace(state, approach=approach), _lead_to(state, plain, order, left), seconds=seconds)
+        there = approach.refused or approach.planned is not None
+        led = approach.held if there else _lead_to(state, plain, order, left)
+        state, frames = step(replace(state, approach=approach), led, seconds=seconds)
+        return state, replace(frames, refusal=refusal)
 
     def _plan(self, state: SteerState, command: Command, order: Arrival, frames: int) -> Tensor:
         """Plan the frames to a place, in the pose there to which the way is smoothest."""
@@ -123,19 +125,20 @@ def _arrival_frame(order: Arrival) -> int:
     return round(order.by * PRIOR_FPS)
 
 
-def _refuse(state: SteerState, order: Arrival) -> str:
-    """Say why an order cannot be met; empty where it can."""
-    left = _arrival_frame(order) - state.frames + 1
-    if left < _LEAST_FRAMES:
-        return f"an arrival in {left / PRIOR_FPS:.2f} s is not obeyed: nobody comes anywhere in less than 0.13 s"
-    scale, fastest = state.character.scale, state.prior.limits.max_steering_speed * state.character.scale
+def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
+    """Say why an order cannot be met; None where it can."""
+    frames, scale = _arrival_frame(order) - state.frames + 1, state.character.scale
+    left, least = frames / PRIOR_FPS, _LEAST_FRAMES / PRIOR_FPS
+    if frames < _LEAST_FRAMES:
+        reason = f"an arrival in {left:.2f} s is not obeyed: nobody comes anywhere in less than {least:.2f} s"
+        return Refusal(order, reason)
     away = math.dist(order.place, (state.committed.place.position_xz * scale).tolist())
-    if away * PRIOR_FPS / left > fastest:
-        return (
-            f"an arrival at {order.place[0]:.2f}, {order.place[1]:.2f} m, {away:.1f} m away, in {left / PRIOR_FPS:.1f} s is"
-            f" not obeyed: it needs {away * PRIOR_FPS / left:.1f} m/s, and {fastest:.1f} m/s is the fastest"
-        )
-    return ""
+    fastest = state.prior.limits.max_steering_speed * scale
+    if away / left <= fastest:
+        return None
+    where = f"{order.place[0]:.2f}, {order.place[1]:.2f} m, {away:.1f} m away"
+    needed = f"it needs {away / left:.1f} m/s, and {fastest:.1f} m/s is the fastest"
+    return Refusal(order, f"an arrival at {where}, in {left:.1f} s is not obeyed: {needed}")
 
 
 def _lead_to(state: SteerState, command: Command, order: Arrival, left: int) -> Command:
@@ -158,7 +161,7 @@ def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Flo
             pose.skeleton, pose.fps, pose.root_position.expand(2, -1), pose.local_quat_xyzw.expand(2, -1, -1)
         )
         return encode(still)[0][:1].float()[None]
-    prior = state.prior.conditioned_on(command.told) if command.told else state.prior
+    prior = condition_prior(state.prior, command.told) if command.told else state.prior
     starts = prior.initial_states
     speed = command.speed / state.character.scale
     near = (starts.speed - speed).abs().argsort()[:_CANDIDATES]

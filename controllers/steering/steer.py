@@ -110,7 +110,7 @@ class SteerState:
     overlay: Overlay = field(default_factory=Overlay)
     """What hands and head are doing beside the walk."""
     approach: object | None = None
-    """How far an order to be somewhere is carried out (`controllers.steering.arrival`)."""
+    """Last order to be somewhere, and how far it is carried out (`controllers.steering.arrival`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def begin(
     chosen = settings or SteerSettings()
     character = Character(skeleton, chosen.footing.rest_height)
     command = character.command(command)
-    starts = (_condition_prior(prior, command.told) if command.told else prior).initial_states
+    starts = (condition_prior(prior, command.told) if command.told else prior).initial_states
     nearest = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(nearest[torch.randint(len(nearest), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
@@ -188,7 +188,7 @@ def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
     RequestError for labels that the prior does not know.
     """
     if command.told:
-        _condition_prior(prior, command.told)
+        condition_prior(prior, command.told)
     return command.within(prior.limits.max_steering_speed)
 
 
@@ -205,7 +205,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     if stuck:
         state = _restart_target(state)
     targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
-    conditioned = replace(state, prior=_condition_prior(state.prior, command.told)) if command.told else state
+    conditioned = replace(state, prior=condition_prior(state.prior, command.told)) if command.told else state
     terms = (*_build_steering_terms(state, targets, command.step_length), *state.terms)
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
@@ -261,7 +261,7 @@ def _scale_to_character(target: SteeringTarget, character: Character) -> Steerin
 
 
 @lru_cache(maxsize=64)
-def _condition_prior(prior: Density, labels: tuple[str, ...]) -> Density:
+def condition_prior(prior: Density, labels: tuple[str, ...]) -> Density:
     """Condition the prior on labels; cached, since it takes as long as a step may last."""
     return prior.conditioned_on(labels)
 

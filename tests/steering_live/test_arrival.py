@@ -81,8 +81,20 @@ def test_a_new_command_on_the_way_leaves_it_at_once():
     state, first = begun()
     recorder.show(first, 0.0)
     state, _ = drive(state, track, [recorder], frames=40, clock=StreamClock(), stepper=ARRIVER)
-    assert state.approach is None
+    assert state.approach.order is None
     assert recorder.pieces[-1].evaluations > 0
+
+
+def test_who_cannot_goes_on_as_before():
+    """Also where the rest of the command would have been to stand."""
+    stand = replace(AHEAD, speed=0.0, heading=1.0, arrival=Arrival((50.0, 0.0), 0.9))
+    track, recorder = CommandTrack((0.0, 0.2), (AHEAD, stand)), Recorder()
+    state, first = begun()
+    recorder.show(first, 0.0)
+    drive(state, track, [recorder], frames=40, clock=StreamClock(), stepper=ARRIVER)
+    plain, _ = play(frames=40)
+    assert len(recorder.refusals) == 1
+    assert torch.equal(recorder.motion().root_position, plain.motion().root_position)
 
 
 def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
