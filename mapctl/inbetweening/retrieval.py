@@ -39,7 +39,7 @@ class MotionCollection:
         two poses (motions of one frame) in the mean square over joints: the nearest of each of `count` clips, those
         not farther than `within`, metres, root mean square. ValueError if no clip is long enough.
         """
-        starts, ends = _see_ends(self, steps)
+        starts, clip, ends = _see_ends(self, steps)
         if not len(starts):
             raise ValueError(f"no clip has {steps + 1} frames")
         wanted = torch.cat([first.joint_positions(), last.joint_positions()]).float()
@@ -47,7 +47,6 @@ class MotionCollection:
         target = _see_from(wanted[None], wanted[:1, 0], facing).flatten()
         # A part at a time, as differences of all windows at once would not fit into the processor's cache.
         square = torch.cat([(part - target).square().sum(dim=1) for part in ends.split(5000)])
-        clip = self.find_clips(starts)
         least = torch.full((len(self.motions),), torch.inf).scatter_reduce(0, clip, square, "amin")
         joints, windows = wanted.shape[0] * wanted.shape[1], []
         for number in least.argsort(stable=True)[:count].tolist():
@@ -63,10 +62,6 @@ class MotionCollection:
         lengths = torch.tensor([motion.num_frames for motion in self.motions])
         return lengths.cumsum(0) - lengths
 
-    def find_clips(self, frames: Int[Tensor, " windows"]) -> Int[Tensor, " windows"]:
-        """Return the number of the clip that each frame is of."""
-        return torch.searchsorted(self.firsts, frames, right=True) - 1
-
     def find_starts(self, steps: int) -> Int[Tensor, " windows"]:
         """Return the first frames of all windows of so many steps."""
         starts, first = [], 0
@@ -76,15 +71,17 @@ class MotionCollection:
         return torch.cat(starts)
 
 
-# Of one length, as every gap of a length asks for it in turn.
-@lru_cache(maxsize=1)
+# Of one length, as every gap of a length asks for it in turn: of the training clips, and of those with the gap.
+@lru_cache(maxsize=2)
 def _see_ends(
     collection: MotionCollection, steps: int
-) -> tuple[Int[Tensor, " windows"], Float[Tensor, "windows columns"]]:
-    """Return the first frames of all windows, and both ends' joint positions seen from the first hips."""
+) -> tuple[Int[Tensor, " windows"], Int[Tensor, " windows"], Float[Tensor, "windows columns"]]:
+    """Return the first frames of all windows, the numbers of their clips, and both ends' joint positions seen from the
+    first hips."""
     starts = collection.find_starts(steps)
+    clip = torch.searchsorted(collection.firsts, starts, right=True) - 1
     ends = torch.stack([collection.positions[starts], collection.positions[starts + steps]], dim=1)
-    return starts, _see_from(ends, collection.positions[starts, 0], collection.heading[starts]).flatten(1)
+    return starts, clip, _see_from(ends, collection.positions[starts, 0], collection.heading[starts]).flatten(1)
 
 
 def bend_to_ends(motion: Motion, first: Motion, last: Motion) -> Motion:
