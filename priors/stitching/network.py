@@ -139,6 +139,10 @@ class Gaussian:
         mean, log_sigma = raw.chunk(2, dim=-1)
         return Gaussian(mean, log_sigma.clamp(_LEAST_LOG_SIGMA, _MOST_LOG_SIGMA))
 
+    def row(self, part: slice) -> "Gaussian":
+        """Return some rows."""
+        return Gaussian(self.mean[part], self.log_sigma[part])
+
     def draw(self, noise: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch latent"]:
         """Return what standard normal noise becomes."""
         return self.mean + self.log_sigma.exp() * noise

@@ -39,6 +39,10 @@ class Ends:
         """1 where step, turn and contacts of the end are known: not of a bare pose, without a frame before it."""
         return self.present[:, :, -2] if self.present.shape[2] > 1 else torch.zeros_like(self.present[:, :, 0])
 
+    def first(self, count: int) -> "Ends":
+        """Return those of the first transitions."""
+        return Ends(self.features[:, :count], self.present[:, :count], self.place[:count], self.turn[:count])
+
 
 @runtime_checkable
 class Latents(Protocol):

@@ -13,7 +13,7 @@ from priors.stitching.network import StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Latents, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
-from priors.training.recipes.stitcher_losses import TaughtLatents, interpolate
+from priors.training.recipes.stitcher_losses import TaughtLatents, interpolate, miss_calmly
 
 VALIDATED_GAPS = (5, 15, 30, 45)
 """Frames between the two poses."""
@@ -83,7 +83,7 @@ def _measure_draws(
     latents = TaughtLatents(
         posterior,
         (truth.truth() - network.mean) / network.std,
-        torch.ones(batch, dtype=torch.bool),
+        miss_calmly(network, truth, truth.ends()),
         torch.zeros(batch, config.shared),
         torch.zeros(2, batch, made, config.own),
     )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
@@ -12,10 +12,10 @@ from mapctl.kinematics.fast import compute_joints_world
 from mapctl.pose import BodyPose
 from mapctl.rotations import lift_ground
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.stitching.latents import draw_slow_noise
+from priors.stitching.latents import DrawnLatents, draw_slow_noise
 from priors.stitching.network import PACE, POSE, SEEN_FUTURE, Gaussian, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
-from priors.stitching.sides import Sides, count_made, walk_sides
+from priors.stitching.sides import Ends, Sides, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Transition
 
 _EASE, _EASE_METRES = 0.4, 0.05
@@ -43,8 +43,6 @@ class LossWeights:
     """Divergence of that posterior, as it is, from its prior, which is to learn it, nats."""
     own: float = 0.02
     """Divergence of the frames' latents from their prior, nats a transition."""
-    expected: float = 1.0
-    """Mean square error of what the ends let expect of the posterior, which learns nothing by it."""
     phase: float = 0.3
     """Absolute error of the phases."""
 
@@ -58,8 +56,8 @@ class TaughtLatents:
     """Sees the truth."""
     truth: Float[Tensor, "2 batch frames size"]
     """Normalised features from each end's next frame to the other end."""
-    informed: Bool[Tensor, " batch"]
-    """Rows that are given the posterior's."""
+    missed: Float[Tensor, "2 informed made size"]
+    """What the calm answer misses of it, in the first rows, which are given the posterior's."""
     shared: Float[Tensor, "batch shared"]
     """Standard normal noise; zeros in rows at the mean."""
     slow: Float[Tensor, "2 batch made own"]
@@ -68,19 +66,20 @@ class TaughtLatents:
     """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
     cost: Tensor = field(default_factory=lambda: torch.zeros(()))
     """The transition's divergence from a standard normal distribution, by row and dimension."""
-    unexpected: Tensor = field(default_factory=lambda: torch.zeros(()))
-    """Mean square of what the posterior tells and its ends did not let expect."""
     means: list[Tensor] = field(default_factory=list)
     """Means of the posterior: the transition's, and then those of frames."""
 
     def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
         """What both sides share over the transition."""
-        told, off = self.posterior.tell_shared(self.truth[0], seen)
-        self.unexpected = off.square().mean()
+        count = self.missed.shape[1]
+        if not count:
+            self._count(self.shared[:0], self.shared[:0])
+            return prior.draw(self.shared)
+        told = self.posterior.tell_shared(self.missed)
         self.cost = told.diverge(Gaussian(torch.zeros_like(told.mean), torch.zeros_like(told.mean)))
         # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
-        self._count(told.detach().diverge(prior), told.mean)
-        return torch.where(self.informed[:, None], told.draw(self.shared), prior.draw(self.shared))
+        self._count(told.detach().diverge(prior.row(slice(count))), told.mean)
+        return torch.cat([told.draw(self.shared[:count]), prior.row(slice(count, None)).draw(self.shared[count:])])
 
     def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
@@ -89,9 +88,10 @@ class TaughtLatents:
         told = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
         self._count(told.diverge(prior).mean(dim=0), told.mean[0])
         noise = self.slow[:, :, step]
-        return torch.where(self.informed[:, None], told.draw(noise), prior.draw(noise))
+        informed = torch.arange(len(self.shared)) < self.missed.shape[1]
+        return torch.where(informed[:, None], told.draw(noise), prior.draw(noise))
 
-    def count_nats(self) -> tuple[Float[Tensor, "batch shared"], Float[Tensor, "batch own"]]:
+    def count_nats(self) -> tuple[Float[Tensor, "informed shared"], Float[Tensor, "batch own"]]:
         """Count those of what is shared, and sum those of all frames."""
         return self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
 
@@ -118,15 +118,15 @@ def compute_stitcher_losses(
     informed, compared = (round(batch * share) for share in (shares[0], sum(shares)))
     row = torch.arange(batch)
     calm = ((row >= informed) & (row < compared)).float()
-    config = network.config
+    config, known = network.config, truth.ends()
     latents = TaughtLatents(
         posterior,
         (wanted - network.mean) / network.std,
-        row < informed,
+        miss_calmly(network, truth, known.first(informed)),
         torch.randn(batch, config.shared, generator=generator) * (1 - calm)[:, None],
         draw_slow_noise(batch, made, config.own, generator) * (1 - calm)[:, None, None],
     )
-    sides = walk_sides(network, truth.ends(), frames, latents)
+    sides = walk_sides(network, known, frames, latents)
     if sides.alone:
         sides = _forget_backward(sides)
     count = len(sides.features)
@@ -153,10 +153,9 @@ def compute_stitcher_losses(
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
         "stitching": torch.zeros(()) if apart is None else apart.mean(),
-        "shared": latents.cost.mean(dim=0).sum(),
+        "shared": latents.cost.mean(dim=0).sum() if informed else torch.zeros(()),
         "prior": nats[0].sum(),
         "own": nats[1].sum(),
-        "expected": latents.unexpected,
         "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
     }
     loss = sum((getattr(weights, name) * value for name, value in parts.items()), start=torch.zeros(()))
@@ -173,6 +172,18 @@ def compute_stitcher_losses(
         "own_nats": parts["own"],
         "phase": parts["phase"],
     }
+
+
+@torch.no_grad()
+def miss_calmly(network: StitcherNetwork, truth: Transition, ends: Ends) -> Float[Tensor, "2 informed made size"]:
+    """Return what the calm answer to the ends of the first transitions misses of the truth, in units of the features'
+    spread."""
+    count, made = len(ends.place), count_made(network, truth.frames)
+    if not count:
+        return ends.features.new_zeros(2, 0, made, LAYOUT.size)
+    calm = DrawnLatents.calm(count, made, network.config.shared, network.config.own)
+    found = walk_sides(network, ends, truth.frames, calm).features
+    return (truth.truth()[:, :count, :made] - found) / network.std
 
 
 def place_joints(sides: Sides) -> Float[Tensor, "sides batch made joints 3"]:
