@@ -89,6 +89,8 @@ def shorten(line: str) -> list[str]:
         tiny.pop(word, None)
         if word == "--method" and words[place + 1] == "tweener":
             tiny.clear()  # the bundled one is small, and without the MAP stage no density is asked
+        if word == "--method" and words[place + 1] == "stitcher" and "--no-finish" in words:
+            tiny.clear()  # likewise
     if name == "measure" and "--curve" not in words:
         tiny.clear()
     return [*words, *(part for option in tiny.items() for part in option)]

@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.steering.steer import Refusal, SteerFrames, SteerState, condition_prior, step
+from controllers.steering.steer import KEPT_FRAMES, Refusal, SteerFrames, SteerState, condition_prior, step
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, reversed_features
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.problem.ledger import Ledger
+from mapctl.problem.receding_horizon import replay
 from mapctl.problem.solution import Outcome, Status
 
 _STITCHED_FRAMES = 45  # of the end of a way that is walked first
@@ -194,17 +195,16 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
     motion = character.motion(unit)
     overlay, motion = state.overlay.pose(motion, command, forecast * character.scale)
     targets = _read_targets(new, committed.place, state.target)
-    density_state = state.prior.advance(committed.state, new[None])  # pyright: ignore[reportArgumentType]
     joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
     after = replace(
         committed,
-        state=density_state,
+        state=replay(state.prior, new, committed.state),  # pyright: ignore[reportArgumentType]
         place=at,
         features=torch.cat([committed.features, new]),
         joints_world=joints[-_PAST_FRAMES:],
         warm_start=committed.warm_start[:0],
         forecast=None,
-    ).discard_history(len(committed.features))
+    ).discard_history(KEPT_FRAMES)
     velocities = torch.tensor([target.velocity for target in targets])
     frames = SteerFrames(
         motion,

@@ -200,7 +200,7 @@ def iterate_steps(
     *,
     clock: Clock,
     settings: LoopSettings | None = None,
-    stepper: Stepper = step,
+    stepper: Stepper | None = None,
 ) -> Iterator[tuple[SteerState, StepRecord]]:
     """Yield one step after the other without end; the first pose counts as delivered.
 
@@ -214,7 +214,7 @@ def iterate_steps(
         clock.wait_until(begun + due - lead)
         asked = clock.now() - begun
         left = due - asked - settings.margin if clock.real else None
-        state, new = stepper(state, source.at(asked), seconds=None if left is None else max(0.0, left))
+        state, new = (stepper or step)(state, source.at(asked), seconds=None if left is None else max(0.0, left))
         delivered = clock.now() - begun
         held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
         if held:
@@ -234,7 +234,7 @@ def drive(
     clock: Clock | None = None,
     settings: LoopSettings | None = None,
     stop: Callable[[], bool] = lambda: False,
-    stepper: Stepper = step,
+    stepper: Stepper | None = None,
 ) -> tuple[SteerState, list[StepRecord]]:
     """Steer until `frames` have been delivered, `stop()` is true, or Ctrl-C."""
     records: list[StepRecord] = []

@@ -35,8 +35,9 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
+KEPT_FRAMES = 11
+"""Last frames whose features are kept: who goes to a place begins as it came here."""
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
-_KEPT_FRAMES = 11  # whose features are kept: who goes to a place begins as it came here
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _KNOTS, _KNOT_SIGMA = 7, 0.8  # samples for a stuck character: noise of every feature, slow enough for a step
@@ -237,7 +238,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     velocities = torch.tensor([target.velocity for target in committed_targets])
     next_state = replace(
         state,
-        committed=done.discard_history(max(len(new), _KEPT_FRAMES)),
+        committed=done.discard_history(max(len(new), KEPT_FRAMES)),
         target=committed_targets[-1],
         past_targets=torch.cat([state.past_targets, velocities])[-_PAST_TARGET_FRAMES:],
         frames=state.frames + len(new),
