@@ -8,11 +8,17 @@ from linear_inbetweener import LinearInbetweener
 from tiny_infiller import CONFIG as TINY_INFILLER
 from tiny_infiller import tiny_infiller
 from tiny_refiner import refiner_of
+from tiny_stitcher import tiny_stitcher
 from tiny_transformer import tiny_transformer
 from tiny_tweener import tiny_tweener
 from toy_density import toy_density
 
-from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
+from controllers.inbetweening.proposers import (
+    AutoInbetweener,
+    RolloutInbetweener,
+    SlerpInbetweener,
+    StitchedInbetweener,
+)
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from mapctl import curves
 from mapctl.curves import Curve
@@ -164,6 +170,7 @@ INBETWEENERS: dict[str, Inbetweener] = {
     "auto with the transformer": AutoInbetweener(tiny_transformer(drawn=0.05), [tiny_density()]),
     "tweener": tiny_tweener(),
     "auto with the tweener": AutoInbetweener(tiny_transformer(drawn=0.05), [tiny_density()], tweener=tiny_tweener()),
+    "stitcher": StitchedInbetweener(tiny_stitcher(drawn=0.05), SlerpInbetweener),
     "linear": LinearInbetweener(),
 }
 """One of each method, and one that knows only `mapctl.protocols`."""
