@@ -15,7 +15,7 @@ from torch import Tensor
 
 from controllers.steering.steer import KEPT_FRAMES, Refusal, SteerFrames, SteerState, condition_prior, step
 from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, reversed_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, reversed_features
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.pose import decode
@@ -189,7 +189,9 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
     assert planned is not None
     new, rest = planned[: state.settings.commit], planned[state.settings.commit :]
     unit = decode(new, committed.place, skeleton=character.unit_skeleton)
-    at = _end_place(new, committed.place)
+    start = GroundPose(committed.place.position_xz.double(), committed.place.heading.double())
+    ground, facing = integrate_root(new.double(), start)  # in single precision a long way would not end on the place
+    at = GroundPose(ground[-1].float(), facing[-1].float())
     ahead = decode(rest, at, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
     forecast = unit.joint_positions()[:0] if ahead is None else ahead
     motion = character.motion(unit)
@@ -225,14 +227,6 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
         approach=replace(approach, planned=rest),
     )
     return next_state, frames
-
-
-def _end_place(features: Tensor, start: GroundPose) -> GroundPose:
-    """Ground pose after some frames, summed in double precision."""
-    at = GroundPose(start.position_xz.double(), start.heading.double())
-    for row in features.double():
-        at = at.displace(LAYOUT.pick(row, "root_displacement_heading"), LAYOUT.pick(row, "heading_change")[0])
-    return GroundPose(at.position_xz.float(), at.heading.float())
 
 
 def _read_targets(features: Tensor, start: GroundPose, before: SteeringTarget) -> list[SteeringTarget]:

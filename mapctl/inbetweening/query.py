@@ -1,5 +1,6 @@
 """Query to an in-betweener, a motion with gaps, and its proposal, a motion without them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -108,6 +109,19 @@ class Proposal:
     spread: Float[Tensor, "frames joints 2"] | None = None
     """Distances, metres, within which a joint's true position lies in half and in nine of ten of cases; None from an
     in-betweener that does not know how sure it is."""
+
+    def take(self, other: "Proposal", gaps: Sequence[tuple[int, int]]) -> "Proposal":
+        """Return this proposal with the motion and contacts that another one has in some gaps, first frames and one
+        past the last; who made what is not changed."""
+        root, quats = self.motion.root_position.clone(), self.motion.local_quat_xyzw.clone()
+        logits = self.contact_logits.clone()
+        for start, stop in gaps:
+            part = slice(start, stop)
+            root[part], quats[part] = other.motion.root_position[part], other.motion.local_quat_xyzw[part]
+            logits[part] = other.contact_logits[part].to(logits)
+        return replace(
+            self, motion=replace(self.motion, root_position=root, local_quat_xyzw=quats), contact_logits=logits
+        )
 
     def attribute(self, query: GapQuery) -> tuple[GapSource, ...]:
         """Name the source of each gap with known frames on both sides, and of the others' gaps, in temporal order."""

@@ -48,11 +48,11 @@ class MotionCollection:
         # A part at a time, as differences of all windows at once would not fit into the processor's cache.
         square = torch.cat([(part - target).square().sum(dim=1) for part in ends.split(5000)])
         least = torch.full((len(self.motions),), torch.inf).scatter_reduce(0, clip, square, "amin")
-        joints, windows = wanted.shape[0] * wanted.shape[1], []
+        joints, firsts, windows = wanted.shape[0] * wanted.shape[1], self.firsts, []
         for number in least.argsort(stable=True)[:count].tolist():
             if not (bool(least[number].isfinite()) and float(least[number]) <= joints * within**2):
                 break
-            nearest = int(starts[torch.where(clip == number, square, torch.inf).argmin()]) - int(self.firsts[number])
+            nearest = int(starts[torch.where(clip == number, square, torch.inf).argmin()]) - int(firsts[number])
             windows.append(self.motions[number].slice(nearest, nearest + steps + 1))
         return windows
 

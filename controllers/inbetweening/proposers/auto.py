@@ -119,17 +119,10 @@ def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
 
 def _fill_from(proposal: Proposal, made: Proposal, query: GapQuery, gaps: Sequence[tuple[int, int]]) -> Proposal:
     """Fill gaps as another proposal has them."""
-    root, quats = made.motion.root_position.clone(), made.motion.local_quat_xyzw.clone()
-    logits = made.contact_logits.clone()
-    for start, stop in gaps:
-        part = slice(start, stop)
-        root[part], quats[part] = proposal.motion.root_position[part], proposal.motion.local_quat_xyzw[part]
-        logits[part] = proposal.contact_logits[part].to(logits)
     reasons = {other.start: other.reason for other in proposal.others}
     filled = [gap for gap in query.enclosed_gaps if _is_within(gap, gaps)]
     others = tuple(GapSource(*gap, proposal.source, reasons.get(gap[0], "")) for gap in filled)
-    motion = replace(made.motion, root_position=root, local_quat_xyzw=quats)
-    return replace(made, motion=motion, contact_logits=logits, others=(*made.others, *others))
+    return replace(made.take(proposal, gaps), others=(*made.others, *others))
 
 
 def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceSettings) -> bool:

@@ -53,15 +53,7 @@ def _pass_on(left: list[GapSource], made: Proposal) -> tuple[GapSource, ...]:
 
 def _put_in(stitched: Proposal, made: Proposal, query: GapQuery) -> Proposal:
     """Put the gaps that were stitched into another proposal."""
-    root, quats = made.motion.root_position.clone(), made.motion.local_quat_xyzw.clone()
-    logits = made.contact_logits.clone()
     sources = [source for source in stitched.attribute(query) if source.by != INTERPOLATION]
-    for source in sources:
-        part = slice(source.start, source.stop)
-        root[part] = stitched.motion.root_position[part]
-        quats[part] = stitched.motion.local_quat_xyzw[part]
-        logits[part] = stitched.contact_logits[part].to(logits)
     starts = {source.start for source in sources}
     others = (*(other for other in made.others if other.start not in starts), *sources)
-    motion = replace(made.motion, root_position=root, local_quat_xyzw=quats)
-    return replace(made, motion=motion, contact_logits=logits, others=others)
+    return replace(made.take(stitched, [(source.start, source.stop) for source in sources]), others=others)

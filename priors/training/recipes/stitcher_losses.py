@@ -129,34 +129,12 @@ def compute_stitcher_losses(
     sides = walk_sides(network, known, frames, latents)
     if sides.alone:
         sides = _forget_backward(sides)
-    count = len(sides.features)
-    true, places = wanted[:count, :compared, :made], place_joints(sides)
-    target = _place_truth(truth, made)[:count]
-    # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
-    ease = weigh_windows(truth)[:compared]
-    wrong = places[:, :compared] - target[:, :compared]
-    distance = _measure_length(wrong)
-    slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
-    off = ((sides.features[:, :compared] - true) / network.std).abs()
-    toes = list(TOE_JOINTS)
-    steps = _measure_length(torch.diff(places[..., toes, :], dim=2))
-    # Who was drawn is compared with no truth: toes that its own sides call planted are to stand.
-    stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
-    planted = stand[:, :, 1:] * stand[:, :, :-1]
-    phases = torch.cat([sides.at_ends[:count, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
-    apart = None if sides.alone else measure_apart(places, frames)
+    parts, distance, slip = _compare(network, truth, sides, compared)
     nats = [each[:informed].mean(dim=0) if informed else torch.zeros(1) for each in latents.count_nats()]
-    parts = {
-        "places": (ease * distance.mean(dim=(0, 2, 3))).mean(),
-        "pace": (ease * slip.mean(dim=(0, 2, 3))).mean(),
-        "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
-        "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
-        "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
-        "stitching": torch.zeros(()) if apart is None else apart.mean(),
+    parts |= {
         "shared": latents.cost.mean(dim=0).sum() if informed else torch.zeros(()),
         "prior": nats[0].sum(),
         "own": nats[1].sum(),
-        "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
     }
     loss = sum((getattr(weights, name) * value for name, value in parts.items()), start=torch.zeros(()))
     return {
@@ -172,6 +150,36 @@ def compute_stitcher_losses(
         "own_nats": parts["own"],
         "phase": parts["phase"],
     }
+
+
+def _compare(
+    network: StitcherNetwork, truth: Transition, sides: Sides, compared: int
+) -> tuple[dict[str, Tensor], Float[Tensor, "sides compared made joints"], Float[Tensor, "sides compared made joints"]]:
+    """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
+    from their true places, and the errors of their steps, metres."""
+    count, _, made = sides.features.shape[:3]
+    true, places = truth.truth()[:count, :compared, :made], place_joints(sides)
+    # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
+    ease = weigh_windows(truth)[:compared]
+    wrong = places[:, :compared] - _place_truth(truth, made)[:count, :compared]
+    distance = _measure_length(wrong)
+    slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
+    off = ((sides.features[:, :compared] - true) / network.std).abs()
+    steps = _measure_length(torch.diff(places[..., list(TOE_JOINTS), :], dim=2))
+    # Who was drawn is compared with no truth: toes that its own sides call planted are to stand.
+    stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
+    planted = stand[:, :, 1:] * stand[:, :, :-1]
+    phases = torch.cat([sides.at_ends[:count, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
+    parts = {
+        "places": (ease * distance.mean(dim=(0, 2, 3))).mean(),
+        "pace": (ease * slip.mean(dim=(0, 2, 3))).mean(),
+        "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
+        "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
+        "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
+        "stitching": torch.zeros(()) if sides.alone else measure_apart(places, truth.frames).mean(),
+        "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
+    }
+    return parts, distance, slip
 
 
 @torch.no_grad()
