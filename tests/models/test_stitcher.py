@@ -18,7 +18,7 @@ from priors.stitching.draws import Draws
 from priors.stitching.inbetweener import see_ends
 from priors.stitching.joining import join_sides
 from priors.stitching.latents import DrawnLatents
-from priors.stitching.network import PARTS
+from priors.stitching.network import PARTS, POSE, StitcherNetwork
 from priors.stitching.sides import count_made, reverse_sense, walk_sides
 
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])
@@ -101,6 +101,20 @@ def test_the_backward_side_reads_the_motion_run_backwards():
     # What led to a frame leads on from there for who comes the other way.
     pace = slice(0, 3)
     torch.testing.assert_close(reverse_sense(features)[1:, pace], back.flip(0)[:-1, pace], atol=1e-9, rtol=0)
+
+
+def test_each_side_reads_how_the_other_end_moves_on_in_its_own_sense_of_time(monkeypatch):
+    seen, embed = [], StitcherNetwork.embed
+    monkeypatch.setattr(StitcherNetwork, "embed", lambda self, now: (seen.append(now), embed(self, now))[1])
+    motion = walk(60, turn_rate=0.6)
+    missing = torch.zeros(60, dtype=torch.bool)
+    missing[11:30] = True
+    tiny_stitcher().answer(see_ends(motion, missing, 11, 30), 20)
+    ends, poses = seen[0], encode(motion)[0][:, POSE].float()
+    for side, (own, other) in enumerate((((10, 9), (30, 31)), ((30, 31), (10, 9)))):
+        came, goes = poses[own[0]] - poses[own[1]], poses[other[1]] - poses[other[0]]
+        torch.testing.assert_close(ends.change[side, 0], came, atol=1e-5, rtol=0)
+        torch.testing.assert_close(ends.target_change[side, 0], goes, atol=1e-5, rtol=0)
 
 
 def test_the_answer_moves_and_turns_with_its_ends():
