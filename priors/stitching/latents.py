@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from priors.stitching.network import Gaussian
@@ -30,6 +30,19 @@ class DrawnLatents:
         """Drawn."""
         noise = torch.randn(batch, shared, generator=generator)
         return DrawnLatents(noise, draw_slow_noise(batch, made, own, generator))
+
+    def still(self, rows: Bool[Tensor, " batch"]) -> "DrawnLatents":
+        """Return the same with some rows at the mean."""
+        drawn = (~rows).float()
+        return DrawnLatents(self.shared * drawn[:, None], self.slow * drawn[:, None, None])
+
+    def rows(self, index: Int[Tensor, " rows"]) -> "DrawnLatents":
+        """Return some rows."""
+        return DrawnLatents(self.shared[index], self.slow[:, index])
+
+    def put(self, index: Int[Tensor, " rows"], other: "DrawnLatents") -> "DrawnLatents":
+        """Return the same with other latents in some rows."""
+        return DrawnLatents(self.shared.index_copy(0, index, other.shared), self.slow.index_copy(1, index, other.slow))
 
     def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
         """What both sides share over the transition."""

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose
+from mapctl.kinematics.fast import compute_joints_world
+from mapctl.skeleton import CANONICAL
 from priors.stitching.network import POSE, Gaussian, Memory, Situation, StitcherNetwork
 
 Frame = tuple[Float[Tensor, "2 batch size"], Float[Tensor, "2 batch pose"], Float[Tensor, "2 batch"]]
@@ -39,9 +41,9 @@ class Ends:
         """1 where step, turn and contacts of the end are known: not of a bare pose, without a frame before it."""
         return self.present[:, :, -2] if self.present.shape[2] > 1 else torch.zeros_like(self.present[:, :, 0])
 
-    def first(self, count: int) -> "Ends":
-        """Return those of the first transitions."""
-        return Ends(self.features[:, :count], self.present[:, :count], self.place[:count], self.turn[:count])
+    def rows(self, index: Tensor) -> "Ends":
+        """Return those of some transitions."""
+        return Ends(self.features[:, index], self.present[:, index], self.place[index], self.turn[index])
 
 
 @runtime_checkable
@@ -85,6 +87,13 @@ class Sides:
         """First and last frame, counted from the first pose, that both sides made; none if the first is the later."""
         made = self.features.shape[2]
         return self.frames - made, made
+
+    def place_joints(self) -> Float[Tensor, "2 batch made joints 3"]:
+        """Place the joints, metres, seen from the first end."""
+        shape = self.features.shape[:2]
+        return compute_joints_world(
+            self.features.flatten(0, 1), self.place.flatten(0, 1), self.heading.flatten(0, 1), CANONICAL
+        ).unflatten(0, shape)
 
 
 def count_made(network: StitcherNetwork, frames: int) -> int:

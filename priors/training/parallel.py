@@ -2,7 +2,7 @@
 
 import multiprocessing
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
@@ -21,9 +21,12 @@ class BatchTrainer(Protocol):
     generator: torch.Generator
     step: int
 
-    @property
-    def network(self) -> nn.Module:
-        """What learns."""
+    def networks(self) -> Mapping[str, nn.Module]:
+        """All whose weights change."""
+        ...
+
+    def weights(self) -> list[nn.Parameter]:
+        """All that the loss is differentiated by."""
         ...
 
     def losses(self) -> dict[str, Tensor]:
@@ -38,10 +41,11 @@ class GradientHelpers:
     """
 
     def __init__(self, trainer: BatchTrainer, count: int):
-        """Fork so many, whose data is the trainer's; the network's weights move to shared memory."""
+        """Fork so many, whose data is the trainer's; its networks' weights move to shared memory."""
         self._trainer = trainer
-        trainer.network.share_memory()
-        self._weights = [weight for weight in trainer.network.parameters() if weight.requires_grad]
+        for network in trainer.networks().values():
+            network.share_memory()
+        self._weights = [weight for weight in trainer.weights() if weight.requires_grad]
         size = sum(weight.numel() for weight in self._weights)
         if "fork" not in multiprocessing.get_all_start_methods():
             raise RequestError("training in several processes needs a system that can fork them")

@@ -88,7 +88,11 @@ class GradientTrainer(Trainer[Network]):
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """For the network's weights, by their names in checkpoints; all have the same learning rate."""
-        return {"optimiser": make_adam(self.network.parameters(), self.learning_rate)}
+        return {"optimiser": make_adam(self.weights(), self.learning_rate)}
+
+    def weights(self) -> list[nn.Parameter]:
+        """All that the loss is differentiated by."""
+        return list(self.network.parameters())
 
     def compute_learning_rate(self) -> float:
         """At the current step."""
@@ -96,7 +100,7 @@ class GradientTrainer(Trainer[Network]):
 
     def limit_gradients(self) -> None:
         """Clip what the loss has left in the weights, before the optimiser's step."""
-        nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+        nn.utils.clip_grad_norm_(self.weights(), _MAX_GRADIENT_NORM)
 
     def train_step(self) -> dict[str, float]:
         """One update; the parts of its loss. MapctlError, and no update, where that is no number."""

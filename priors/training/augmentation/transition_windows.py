@@ -1,7 +1,7 @@
 """Windows of a corpus as transitions between two poses: what is known of each end, and what truly comes between."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -10,6 +10,8 @@ from torch import Tensor
 
 from mapctl.contacts.phases import compute_phases, mirror_phases, reversed_phases
 from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features, reversed_features
+from mapctl.kinematics.fast import compute_joints_world
+from mapctl.skeleton import CANONICAL
 from priors.stitching.sides import Ends
 from priors.training.augmentation.pose_windows import WindowPicker
 from priors.training.corpus import Corpus
@@ -44,6 +46,10 @@ class Transition:
         """Frames after the first pose, up to and with the second."""
         return slice(self.lead + 1, self.lead + self.frames + 1)
 
+    def rows(self, index: Tensor) -> "Transition":
+        """Return some of the transitions."""
+        return replace(self, features=self.features[index], phases=self.phases[index])
+
     def ends(self) -> Ends:
         """What a stitcher is given."""
         known, back = self.known, reversed_features(self.features)
@@ -67,6 +73,12 @@ class Transition:
         first = self.features.shape[1] - self.lead - self.frames
         back = reversed_features(self.features)[:, first : first + self.frames]
         return torch.stack([self.features[:, self.between], back])
+
+    def place_joints(self, made: int) -> Float[Tensor, "2 batch made joints 3"]:
+        """Place the joints of the frames that each side is to make first, metres, seen from the first pose."""
+        ground, heading = self.integrate()
+        places = compute_joints_world(self.features[:, self.between].contiguous(), ground, heading, CANONICAL)
+        return torch.stack([places[:, :made], places[:, :-1].flip(1)[:, :made]])
 
     def true_phases(self) -> Float[Tensor, "2 batch frames 4"]:
         """Phases of each end and of all frames up to the last before the other end, in the sides' senses of time."""

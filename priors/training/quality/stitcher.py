@@ -13,7 +13,8 @@ from priors.stitching.network import StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Latents, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
-from priors.training.recipes.stitcher_losses import TaughtLatents, interpolate, miss_calmly
+from priors.training.recipes.stitcher_latents import TaughtLatents, miss_calmly
+from priors.training.recipes.stitcher_losses import interpolate
 
 VALIDATED_GAPS = (5, 15, 30, 45)
 """Frames between the two poses."""
@@ -81,11 +82,7 @@ def _measure_draws(
     config, generator = network.config, torch.Generator().manual_seed(0)
     batch, made = len(truth.features), count_made(network, truth.frames)
     latents = TaughtLatents(
-        posterior,
-        (truth.truth() - network.mean) / network.std,
-        miss_calmly(network, truth, truth.ends()),
-        torch.zeros(batch, config.shared),
-        torch.zeros(2, batch, made, config.own),
+        posterior, (truth.truth() - network.mean) / network.std, miss_calmly(network, truth), make_calm(network, truth)
     )
     informed = place(answer(network, truth, latents))
     draws = torch.stack(

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -14,11 +14,12 @@ from priors.config import require_at_least
 from priors.stitching.layers import multiply_in_bfloat16
 from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
-from priors.training.augmentation.transition_windows import Known, TransitionWindows
+from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.corpus import Corpus, Split
 from priors.training.quality.stitcher import measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
-from priors.training.recipes.stitcher_losses import LossWeights, compute_stitcher_losses
+from priors.training.recipes.stitcher_critics import CriticSettings, StitcherCritics
+from priors.training.recipes.stitcher_losses import LossWeights, Shares, compute_stitcher_losses
 from priors.training.trainer import GradientTrainer
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
@@ -27,7 +28,6 @@ _CONTEXT = 10  # frames told before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
 _AVERAGE = 0.999
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
-_MAX_NORM = 1.0
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class StitcherSettings:
     """Frames from one pose to the other in the longest."""
     learning_rate: float = 1e-3
     """At its highest; it falls to nothing along a cosine."""
-    informed: float = 0.5
-    """Share of transitions whose latents come from the posterior, which has seen the truth."""
-    calm: float = 0.35
-    """Share whose latents are the prior's mean; the rest is drawn."""
+    shares: Shares = field(default_factory=Shares)
+    """Where the transitions' latents come from."""
     weights: LossWeights = field(default_factory=LossWeights)
     """Of what is learnt."""
+    critics: CriticSettings = field(default_factory=CriticSettings)
+    """When critics join, unless the network is without them."""
     evenness: float = 0.85
     """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
     kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
@@ -61,8 +61,9 @@ class StitcherSettings:
         require_at_least(self, 1, "steps", "batch")
         if self.window < _LEAST_WINDOW:
             raise RequestError(f"window must be at least {_LEAST_WINDOW} frames, got {self.window}")
-        if not 0 < self.informed + self.calm <= 1:
-            raise RequestError("shares of informed and calm transitions are 0 to 1 together, and more than nothing")
+        shares = astuple(self.shares)
+        if min(shares) < 0 or not 0 < sum(shares) <= 1:
+            raise RequestError("shares of a batch are 0 to 1 together, and more than nothing")
 
 
 class StitcherTrainer(GradientTrainer[StitcherNetwork]):
@@ -80,6 +81,10 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
             lambda: self._make(config), steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
         )
         _set_moments(self.network, corpus)
+        self.critics = (
+            None if "d" in config.without else StitcherCritics(settings.critics, settings.seed, self.generator)
+        )
+        self._truth: Transition | None = None
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         """Moving average of the weights: what is measured and exported."""
 
@@ -90,15 +95,20 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """AdamW with a short memory."""
-        return {"optimiser": torch.optim.AdamW(self._weights(), lr=self.learning_rate, betas=(0.5, 0.9))}
+        return {"optimiser": torch.optim.AdamW(self.weights(), lr=self.learning_rate, betas=(0.5, 0.9))}
 
-    def limit_gradients(self) -> None:
-        """Clip those of the posterior too."""
-        nn.utils.clip_grad_norm_(self._weights(), _MAX_NORM)
+    def weights(self) -> list[nn.Parameter]:
+        """Those of the posterior too."""
+        return [*super().weights(), *self.posterior.parameters()]
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
-        return super().networks() | {"posterior": self.posterior, "average": self.average}
+        critics = {} if self.critics is None else {"critics": self.critics.network}
+        return super().networks() | {"posterior": self.posterior, "average": self.average} | critics
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """One for each of the two that contend."""
+        return super().optimisers() | ({} if self.critics is None else {"critics-optimiser": self.critics.optimiser})
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
@@ -107,13 +117,26 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(settings.batch, frames, self._draw_known(), self.generator)
-        weights, shares = settings.weights, (settings.informed, settings.calm)
+        weights, judge = settings.weights, None
+        if self.critics is not None and self._criticised >= 0:
+            self._truth, judge = truth, self.critics.hear
+            weights = replace(weights, critics=weights.critics * settings.critics.ramp(self._criticised))
         with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
-            return compute_stitcher_losses(self.network, self.posterior, truth, shares, weights, self.generator)
+            return compute_stitcher_losses(
+                self.network, self.posterior, truth, settings.shares, weights, self.generator, judge
+            )
 
     def train_step(self) -> dict[str, float]:
-        """Take one update, and bring the average nearer."""
+        """Take one update, and one of the critics where they have joined, and bring the average nearer.
+
+        `critics` is what the stitcher wants to make smaller, `critic` the critics' own loss, 1 where they know nothing.
+        """
         parts = super().train_step()
+        if self.critics is not None:
+            parts = {"critics": 0.0, **parts, "critic": 1.0, "told": 0.5}
+            if self._truth is not None:
+                parts |= self.critics.learn(self._truth, self.step)
+                self._truth = None
         keep = min(_AVERAGE, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
@@ -126,8 +149,10 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         windows = TransitionWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
         return measure_transitions(self.average, self.posterior, windows)
 
-    def _weights(self) -> list[nn.Parameter]:
-        return [*self.network.parameters(), *self.posterior.parameters()]
+    @property
+    def _criticised(self) -> int:
+        """Updates since the critics joined; below 0 before."""
+        return self.step - round(self.settings.critics.begin * self.steps)
 
     def _draw_known(self) -> Known:
         """Two bare poses in two fifths of the cases; in the rest up to 10 frames before, and after or not."""

@@ -1,22 +1,23 @@
 """What a stitcher is taught: the true way between two poses, and that its sides meet."""
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.features import LAYOUT
-from mapctl.kinematics.fast import compute_joints_world
 from mapctl.pose import BodyPose
 from mapctl.rotations import lift_ground
-from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.stitching.latents import DrawnLatents, draw_slow_noise
-from priors.stitching.network import PACE, POSE, SEEN_FUTURE, Gaussian, StitcherNetwork
+from mapctl.skeleton import TOE_JOINTS
+from priors.stitching.latents import DrawnLatents
+from priors.stitching.network import PACE, POSE, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Ends, Sides, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Transition
+from priors.training.recipes.stitcher_latents import TaughtLatents, miss_calmly, sample_nearest
 
 _EASE, _EASE_METRES = 0.4, 0.05
 
@@ -45,86 +46,51 @@ class LossWeights:
     """Divergence of the frames' latents from their prior, nats a transition."""
     phase: float = 0.3
     """Absolute error of the phases."""
+    critics: float = 0.1
+    """What critics say of motion with latents that are not at the mean, where there are critics."""
 
 
-@dataclass(eq=False)
-class TaughtLatents:
-    """Latents by three parts of a batch: the posterior's, which has seen the truth; the prior's mean; the prior's
-    draws."""
+@dataclass(frozen=True)
+class Shares:
+    """Shares of a batch by where latents come from; the rest has draws from the prior, which have only to meet."""
 
-    posterior: PosteriorNetwork
-    """Sees the truth."""
-    truth: Float[Tensor, "2 batch frames size"]
-    """Normalised features from each end's next frame to the other end."""
-    missed: Float[Tensor, "2 informed made size"]
-    """What the calm answer misses of it, in the first rows, which are given the posterior's."""
-    shared: Float[Tensor, "batch shared"]
-    """Standard normal noise; zeros in rows at the mean."""
-    slow: Float[Tensor, "2 batch made own"]
-    """The same, of frames."""
-    nats: list[Tensor] = field(default_factory=list)
-    """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
-    cost: Tensor = field(default_factory=lambda: torch.zeros(()))
-    """The transition's divergence from a standard normal distribution, by row and dimension."""
-    means: list[Tensor] = field(default_factory=list)
-    """Means of the posterior: the transition's, and then those of frames."""
+    informed: float = 0.4
+    """From the posterior, which has seen the truth."""
+    calm: float = 0.3
+    """The prior's mean."""
+    nearest: float = 0.2
+    """The one of several draws from the prior that comes nearest to the truth (the variety loss of Gupta et al. 2018,
+    "Social GAN"): so draws are taught to come near to all that may be meant, where the posterior teaches what a latent
+    is to say."""
 
-    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
-        """What both sides share over the transition."""
-        count = self.missed.shape[1]
-        if not count:
-            self._count(self.shared[:0], self.shared[:0])
-            return prior.draw(self.shared)
-        told = self.posterior.tell_shared(self.missed)
-        self.cost = told.diverge(Gaussian(torch.zeros_like(told.mean), torch.zeros_like(told.mean)))
-        # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
-        self._count(told.detach().diverge(prior.row(slice(count))), told.mean)
-        return torch.cat([told.draw(self.shared[:count]), prior.row(slice(count, None)).draw(self.shared[count:])])
-
-    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
-        """A frame's, of both sides."""
-        last = self.truth.shape[2] - 1
-        ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
-        told = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
-        self._count(told.diverge(prior).mean(dim=0), told.mean[0])
-        noise = self.slow[:, :, step]
-        informed = torch.arange(len(self.shared)) < self.missed.shape[1]
-        return torch.where(informed[:, None], told.draw(noise), prior.draw(noise))
-
-    def count_nats(self) -> tuple[Float[Tensor, "informed shared"], Float[Tensor, "batch own"]]:
-        """Count those of what is shared, and sum those of all frames."""
-        return self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
-
-    def _count(self, nats: Tensor, mean: Tensor) -> None:
-        self.nats.append(nats)
-        self.means.append(mean)
+    def count(self, batch: int) -> tuple[int, int, int]:
+        """Return the rows at which the first three end."""
+        told = self.informed, self.informed + self.calm, self.informed + self.calm + self.nearest
+        informed, calm, nearest = (round(batch * share) for share in told)
+        return informed, calm, nearest
 
 
 def compute_stitcher_losses(
     network: StitcherNetwork,
     posterior: PosteriorNetwork,
     truth: Transition,
-    shares: tuple[float, float],
+    shares: Shares,
     weights: LossWeights,
     generator: torch.Generator,
+    judge: Callable[[Sides, Ends, Bool[Tensor, " batch"]], Tensor] | None = None,
 ) -> dict[str, Tensor]:
-    """Compute the loss, and in plain units the errors it is made of.
-
-    `shares` of the batch, from its first row on, have the posterior's latents, and the prior's mean; these are compared
-    with the truth. The rest has draws from the prior, which have only to meet.
-    """
+    """Compute the loss, and in plain units the errors it is made of; `judge` says what critics say of some rows."""
     wanted, batch, frames = truth.truth(), len(truth.features), truth.frames
-    made = count_made(network, frames)
-    informed, compared = (round(batch * share) for share in (shares[0], sum(shares)))
-    row = torch.arange(batch)
-    calm = ((row >= informed) & (row < compared)).float()
-    config, known = network.config, truth.ends()
+    informed, calm, compared = shares.count(batch)
+    row, known = torch.arange(batch), truth.ends()
+    at_mean = (row >= informed) & (row < calm)
+    noise = DrawnLatents.sample(
+        batch, count_made(network, frames), network.config.shared, network.config.own, generator
+    )
+    noise = noise.still(at_mean)
+    noise = noise.put(row[calm:compared], sample_nearest(network, truth.rows(row[calm:compared]), generator))
     latents = TaughtLatents(
-        posterior,
-        (wanted - network.mean) / network.std,
-        miss_calmly(network, truth, known.first(informed)),
-        torch.randn(batch, config.shared, generator=generator) * (1 - calm)[:, None],
-        draw_slow_noise(batch, made, config.own, generator) * (1 - calm)[:, None, None],
+        posterior, (wanted - network.mean) / network.std, miss_calmly(network, truth.rows(row[:informed])), noise
     )
     sides = walk_sides(network, known, frames, latents)
     if sides.alone:
@@ -136,11 +102,14 @@ def compute_stitcher_losses(
         "prior": nats[0].sum(),
         "own": nats[1].sum(),
     }
+    # A mean is smooth, and is to be: only what stands for one of many ways is to pass for one.
+    parts |= {} if judge is None else {"critics": judge(sides, known, ~at_mean)}
     loss = sum((getattr(weights, name) * value for name, value in parts.items()), start=torch.zeros(()))
     return {
         "loss": loss,
         "places_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
-        "calm_cm": 100 * distance[:, informed:].mean() if compared > informed else torch.zeros(()),
+        "calm_cm": 100 * distance[:, informed:calm].mean() if calm > informed else torch.zeros(()),
+        "nearest_cm": 100 * distance[:, calm:].mean() if compared > calm else torch.zeros(()),
         "pace_cm": 100 * slip.mean(),
         "state": parts["state"],
         "contacts": parts["contacts"],
@@ -149,7 +118,7 @@ def compute_stitcher_losses(
         "shared_nats": parts["prior"],
         "own_nats": parts["own"],
         "phase": parts["phase"],
-    }
+    } | {name: parts[name] for name in ("critics",) if name in parts}
 
 
 def _compare(
@@ -158,10 +127,10 @@ def _compare(
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true places, and the errors of their steps, metres."""
     count, _, made = sides.features.shape[:3]
-    true, places = truth.truth()[:count, :compared, :made], place_joints(sides)
+    true, places = truth.truth()[:count, :compared, :made], sides.place_joints()
     # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
     ease = weigh_windows(truth)[:compared]
-    wrong = places[:, :compared] - _place_truth(truth, made)[:count, :compared]
+    wrong = places[:, :compared] - truth.place_joints(made)[:count, :compared]
     distance = _measure_length(wrong)
     slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
     off = ((sides.features[:, :compared] - true) / network.std).abs()
@@ -180,26 +149,6 @@ def _compare(
         "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
     }
     return parts, distance, slip
-
-
-@torch.no_grad()
-def miss_calmly(network: StitcherNetwork, truth: Transition, ends: Ends) -> Float[Tensor, "2 informed made size"]:
-    """Return what the calm answer to the ends of the first transitions misses of the truth, in units of the features'
-    spread."""
-    count, made = len(ends.place), count_made(network, truth.frames)
-    if not count:
-        return ends.features.new_zeros(2, 0, made, LAYOUT.size)
-    calm = DrawnLatents.calm(count, made, network.config.shared, network.config.own)
-    found = walk_sides(network, ends, truth.frames, calm).features
-    return (truth.truth()[:, :count, :made] - found) / network.std
-
-
-def place_joints(sides: Sides) -> Float[Tensor, "sides batch made joints 3"]:
-    """Place the joints of the sides, metres, seen from the first end."""
-    shape = sides.features.shape[:2]
-    return compute_joints_world(
-        sides.features.flatten(0, 1), sides.place.flatten(0, 1), sides.heading.flatten(0, 1), CANONICAL
-    ).unflatten(0, shape)
 
 
 def measure_apart(places: Float[Tensor, "2 batch made joints 3"], frames: int) -> Float[Tensor, "batch overlap"]:
@@ -232,13 +181,6 @@ def _make_body(features: Tensor, ground: Tensor, heading: Tensor) -> BodyPose:
     root = lift_ground(ground) + torch.nn.functional.pad(LAYOUT.pick(features, "root_height"), (1, 1))
     joints = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))
     return BodyPose(root, heading, LAYOUT.pick(features, "root_tilt"), joints)
-
-
-def _place_truth(truth: Transition, made: int) -> Float[Tensor, "2 batch made joints 3"]:
-    """Place the joints of the frames that the sides are to make."""
-    ground, heading = truth.integrate()
-    places = compute_joints_world(truth.features[:, truth.between].contiguous(), ground, heading, CANONICAL)
-    return torch.stack([places[:, :made], places[:, :-1].flip(1)[:, :made]])
 
 
 def _forget_backward(sides: Sides) -> Sides:

@@ -1,0 +1,195 @@
+"""What a stitcher is taught with: latents that come nearest, critics that join late, and processes that all learn."""
+
+from dataclasses import replace
+
+import pytest
+import tiny_stitcher
+import torch
+from helpers import corpus
+
+from mapctl.errors import RequestError
+from mapctl.rotations import rotate_ground
+from priors.stitching.latents import DrawnLatents
+from priors.stitching.network import POSE
+from priors.stitching.sides import Ends, Sides, walk_sides
+from priors.training.adversaries.sliding_windows import (
+    LONG,
+    SHORT,
+    SlidingCritics,
+    compute_critic_loss,
+    compute_generator_loss,
+    compute_slope,
+)
+from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
+from priors.training.recipes.stitcher import StitcherSettings, StitcherTrainer
+from priors.training.recipes.stitcher_critics import CriticSettings, show_sides, show_truth
+from priors.training.recipes.stitcher_latents import TRIES, sample_nearest
+from priors.training.recipes.stitcher_losses import Shares, compute_stitcher_losses
+
+SETTINGS = StitcherSettings(steps=10, batch=6, window=24, critics=CriticSettings(begin=0.3, head_start=2))
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+BARE = Known()
+
+
+def transitions(count=6, frames=20, known=BARE) -> Transition:
+    return TransitionWindows(corpus(2, 80), kinds=(), evenness=0.0).draw(count, frames, known, seeded())
+
+
+def follow_truth(truth: Transition, made: int) -> Sides:
+    """Both sides as they were captured."""
+    features, (ground, heading) = truth.truth()[:, :, :made], truth.integrate()
+    place = torch.stack([ground[:, :made], ground[:, :-1].flip(1)[:, :made]])
+    facing = torch.stack([heading[:, :made], heading[:, :-1].flip(1)[:, :made]])
+    nothing = torch.zeros(2, len(ground), made, 4)
+    return Sides(truth.frames, features, features[..., -2:], place, facing, nothing, nothing, nothing[:, :, 0])
+
+
+def make_trainer(without=(), **settings):
+    config = replace(tiny_stitcher.CONFIG, without=without)
+    return StitcherTrainer(config, replace(SETTINGS, **settings), corpus(2, 80))
+
+
+@pytest.mark.parametrize("known", [BARE, Known(10, 3)])
+def test_critics_see_of_captured_motion_what_they_see_of_sides_that_follow_it(known):
+    truth = transitions(known=known)
+    shown = show_sides(follow_truth(truth, 12), truth.ends())
+    torch.testing.assert_close(shown.flatten(0, 1), show_truth(truth, 12), atol=1e-4, rtol=0)
+
+
+def test_what_critics_see_depends_neither_on_place_nor_on_heading():
+    truth = transitions()
+    ends, sides = truth.ends(), follow_truth(truth, 12)
+    there, turn = torch.tensor([3.0, -2.0]), torch.tensor(0.7)
+    moved = replace(sides, place=rotate_ground(sides.place, turn) + there, heading=sides.heading + turn)
+    at = Ends(ends.features, ends.present, rotate_ground(ends.place, turn) + there, ends.turn + turn)
+    # The first end stands where the frame of reference begins: the side that starts from the second is compared.
+    torch.testing.assert_close(show_sides(moved, at)[1], show_sides(sides, ends)[1], atol=1e-3, rtol=0)
+
+
+def test_critics_score_every_window_and_motion_too_short_for_one_has_none_of_it():
+    critics, rows = SlidingCritics(), show_truth(transitions(), 12)
+    assert [scores.shape for scores in critics(rows)] == [(12, 13 - SHORT), (12, 13 - LONG)]
+    assert [scores.shape for scores in critics(rows[:, : LONG - 1])] == [(12, LONG - SHORT)]
+
+
+def test_losses_of_the_two_that_contend_are_least_squares():
+    real, made = [torch.tensor([[1.0, 2.0]])], [torch.tensor([[0.0, 3.0]])]
+    assert float(compute_critic_loss(real, made)) == pytest.approx(0.5 + 4.5)
+    assert float(compute_generator_loss(made)) == pytest.approx((1 + 4) / 2)
+
+
+def test_the_slope_is_that_of_finite_differences():
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        critics = SlidingCritics().double()
+    rows = show_truth(transitions(1), 12)[:1].double()
+
+    def score(at):
+        return sum(float(scores.detach().mean()) for scores in critics(at))
+
+    slope, step = 0.0, 1e-4
+    for place in range(rows.numel()):
+        off = torch.zeros_like(rows).flatten().index_fill(0, torch.tensor([place]), step).view_as(rows)
+        slope += ((score(rows + off) - score(rows - off)) / (2 * step)) ** 2
+    assert float(compute_slope(critics, rows).detach()) == pytest.approx(slope, rel=1e-3)
+
+
+def test_critics_join_after_their_share_of_the_steps_and_are_heard_after_a_head_start():
+    trainer = make_trainer()
+    before = [weight.clone() for weight in trainer.critics.network.parameters()]
+    rows = [trainer.train_step() for _ in range(3)]
+    assert all(torch.equal(one, other) for one, other in zip(before, trainer.critics.network.parameters(), strict=True))
+    assert {row["told"] for row in rows} == {0.5}
+    rows = [trainer.train_step() for _ in range(4)]
+    assert not all(
+        torch.equal(one, other) for one, other in zip(before, trainer.critics.network.parameters(), strict=True)
+    )
+    assert [SETTINGS.critics.ramp(updates) for updates in (0, 2, 3, 4, 9)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+
+
+def test_critics_learn_to_tell_what_trembles_from_what_was_captured():
+    trainer = make_trainer(critics=CriticSettings(rate=3e-3))
+    truth = transitions(32)
+    sides = follow_truth(truth, 12)
+    noise = 0.05 * torch.randn(sides.features[..., POSE].shape, generator=seeded())
+    trembling = sides.features.clone()
+    trembling[..., POSE] += noise
+    for _ in range(60):
+        trainer.critics.hear(replace(sides, features=trembling), truth.ends(), torch.ones(32, dtype=torch.bool))
+        found = trainer.critics.learn(truth, 1)
+    assert found["told"] > 0.9
+    assert found["critic"] < 0.5
+
+
+def test_without_critics_there_are_none():
+    trainer = make_trainer(without=("d",))
+    rows = [trainer.train_step() for _ in range(5)]
+    assert trainer.critics is None
+    assert not any("critic" in name for row in rows for name in row)
+    assert "critics" not in trainer.networks()
+
+
+def test_motion_at_the_mean_is_not_judged():
+    trainer, truth, asked = make_trainer(), transitions(10), []
+
+    def judge(sides, ends, rows):
+        asked.append(rows)
+        return torch.zeros(())
+
+    shares = Shares(informed=0.3, calm=0.4, nearest=0.2)
+    losses = compute_stitcher_losses(
+        trainer.network, trainer.posterior, truth, shares, SETTINGS.weights, seeded(), judge
+    )
+    assert asked[0].tolist() == [True] * 3 + [False] * 4 + [True] * 3
+    assert "critics" in losses
+
+
+def test_the_nearest_of_several_draws_is_kept():
+    network, truth, count = tiny_stitcher.network(drawn=1.0), transitions(8), 8
+    nearest = sample_nearest(network, truth, seeded())
+    made = nearest.slow.shape[2]
+    tried = DrawnLatents.sample(TRIES * count, made, network.config.shared, network.config.own, seeded())
+
+    def measure(latents):
+        away = walk_sides(network, truth.ends(), truth.frames, latents).place_joints() - truth.place_joints(made)
+        return away.norm(dim=-1).mean(dim=(0, 2, 3))
+
+    every = torch.stack([measure(tried.rows(torch.arange(count) + count * number)) for number in range(TRIES)])
+    torch.testing.assert_close(measure(nearest), every.amin(dim=0))
+    assert float((every.amax(dim=0) - every.amin(dim=0)).min()) > 1e-4
+
+
+def test_of_no_transitions_none_is_kept():
+    nothing = sample_nearest(tiny_stitcher.network(), transitions().rows(torch.arange(0)), seeded())
+    assert nothing.shared.shape[0] == nothing.slow.shape[1] == 0
+
+
+def test_a_step_of_two_processes_has_the_mean_gradient_of_two_batches_for_the_posterior_too(monkeypatch):
+    trainer, alone = make_trainer(), make_trainer()
+    trainer.processes = 2
+    draws = torch.Generator()
+    draws.set_state(trainer.generator.get_state())
+    seed = int(torch.randint(2**62, (), generator=draws))
+    found = []
+    for begin in (lambda: alone.generator.set_state(draws.get_state()), lambda: alone.generator.manual_seed(seed)):
+        begin()
+        alone.network.zero_grad()
+        alone.posterior.zero_grad()
+        alone.losses()["loss"].backward()
+        found.append([torch.zeros_like(each) if each.grad is None else each.grad.clone() for each in alone.weights()])
+    monkeypatch.setattr(trainer, "limit_gradients", lambda: None)
+    trainer.train_step()
+    assert all(weight.is_shared() for weight in trainer.posterior.parameters())
+    for weight, one, other in zip(trainer.weights(), *found, strict=True):
+        torch.testing.assert_close(weight.grad, (one + other) / 2, atol=1e-5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("shares", [Shares(-0.1, 0.5, 0.2), Shares(0.6, 0.4, 0.1), Shares(0.0, 0.0, 0.0)])
+def test_shares_that_are_none_are_refused(shares):
+    with pytest.raises(RequestError, match="shares of a batch"):
+        StitcherSettings(shares=shares)
