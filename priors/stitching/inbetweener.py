@@ -72,10 +72,10 @@ class Stitcher(Inbetweener):
 
     def _draw_chunk(self, ends: Ends, frames: int, generator: torch.Generator, temperature: float) -> Joined:
         config, made = self.network.config, count_made(self.network, frames)
-        latents = DrawnLatents.sample(CHUNK, made, config.shared, config.own, generator)
+        latents = DrawnLatents.sample(config, CHUNK, made, generator)
         latents = DrawnLatents(temperature * latents.shared, temperature * latents.slow)
         ends = _repeat(ends, CHUNK)
-        return join_sides(walk_sides(self.network, ends, frames, latents), ends)
+        return join_sides(walk_sides(self.network, ends, frames, latents))
 
     @torch.no_grad()
     def answer(self, ends: Ends, frames: int, *, mirrored: bool = True) -> Joined:
@@ -83,16 +83,16 @@ class Stitcher(Inbetweener):
         first alone, which takes half of the time."""
         config, batch = self.network.config, len(ends.place)
         if not mirrored:
-            calm = DrawnLatents.calm(batch, count_made(self.network, frames), config.shared, config.own)
-            return join_sides(walk_sides(self.network, ends, frames, calm), ends)
+            calm = DrawnLatents.calm(config, batch, count_made(self.network, frames))
+            return join_sides(walk_sides(self.network, ends, frames, calm))
         both = Ends(
             torch.cat([ends.features, mirror_features(ends.features)], dim=1),
             torch.cat([ends.present, ends.present], dim=1),
             torch.cat([ends.place, ends.place * ends.place.new_tensor([-1.0, 1.0])]),
             torch.cat([ends.turn, -ends.turn]),
         )
-        calm = DrawnLatents.calm(2 * batch, count_made(self.network, frames), config.shared, config.own)
-        joined = join_sides(walk_sides(self.network, both, frames, calm), both)
+        calm = DrawnLatents.calm(config, 2 * batch, count_made(self.network, frames))
+        joined = join_sides(walk_sides(self.network, both, frames, calm))
         return _average_mirrored(joined, batch)
 
     @torch.no_grad()

@@ -1,7 +1,7 @@
 """Two sides joined to one transition: their overlap blended, and what they disagree on in place spread over all of it.
 
 Ren et al. 2024, section 3.2, blend the overlap alone. Ten centimetres between two sides blended over eight frames would
-slide both feet; spread over the whole way they are a slightly longer or shorter walk.
+slide both feet; spread over the whole way they are a slightly longer or shorter walk. `Sides.spread` tells whether.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from priors.stitching.sides import Ends, Sides
+from priors.stitching.sides import Sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Joined:
         return Joined(self.root_position[part], self.quats[part], self.contacts[part], self.apart[part])
 
 
-def join_sides(sides: Sides, ends: Ends) -> Joined:
+def join_sides(sides: Sides) -> Joined:
     """Join the sides of a transition of two frames or more."""
     between, made = sides.frames - 1, sides.features.shape[2]
     first, last = sides.overlap
@@ -58,7 +58,7 @@ def join_sides(sides: Sides, ends: Ends) -> Joined:
     rows = []
     for side, body in enumerate(bodies):
         frame = torch.arange(1, made + 1) if side == 0 else torch.arange(made, 0, -1)
-        share = _ease((frame / (sides.frames / 2)).clamp_max(1)) * (0.5 if side == 0 else -0.5)
+        share = _ease((frame / (sides.frames / 2)).clamp_max(1)) * (0.5 if side == 0 else -0.5) * sides.spread
         order = slice(None) if side == 0 else torch.arange(made - 1, -1, -1)
         root, quats = body.root_position[:, order], body.local_quat_xyzw[:, order]
         heading = rotations.about_y(share * twist[:, None])

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from priors.stitching.network import Gaussian
+from priors.stitching.network import Gaussian, StitcherConfig
 
 _MEMORY = 0.7165  # exp(-1/3): what a frame's noise keeps of the frame before, so that it changes over three frames
 
@@ -21,15 +21,16 @@ class DrawnLatents:
     """Of unit variance, slow over frames."""
 
     @staticmethod
-    def calm(batch: int, made: int, shared: int, own: int) -> "DrawnLatents":
+    def calm(config: StitcherConfig, batch: int, made: int) -> "DrawnLatents":
         """At the mean."""
-        return DrawnLatents(torch.zeros(batch, shared), torch.zeros(2, batch, made, own))
+        return DrawnLatents(torch.zeros(batch, config.shared), torch.zeros(2, batch, made, config.own))
 
     @staticmethod
-    def sample(batch: int, made: int, shared: int, own: int, generator: torch.Generator) -> "DrawnLatents":
+    def sample(config: StitcherConfig, batch: int, made: int, generator: torch.Generator) -> "DrawnLatents":
         """Drawn."""
-        noise = torch.randn(batch, shared, generator=generator)
-        return DrawnLatents(noise, draw_slow_noise(batch, made, own, generator))
+        noise = torch.randn(batch, config.shared, generator=generator)
+        memory = 0.0 if config.printed else _MEMORY
+        return DrawnLatents(noise, _draw_noise(batch, made, config.own, memory, generator))
 
     def still(self, rows: Bool[Tensor, " batch"]) -> "DrawnLatents":
         """Return the same with some rows at the mean."""
@@ -53,12 +54,12 @@ class DrawnLatents:
         return prior.draw(self.slow[:, :, step])
 
 
-def draw_slow_noise(
-    batch: int, frames: int, numbers: int, generator: torch.Generator
+def _draw_noise(
+    batch: int, frames: int, numbers: int, memory: float, generator: torch.Generator
 ) -> Float[Tensor, "2 batch frames numbers"]:
-    """Draw noise of unit variance for both sides whose correlation falls by e in three frames."""
+    """Draw noise of unit variance for both sides of which a frame keeps a share of the frame before."""
     white = torch.randn(2, batch, frames, numbers, generator=generator)
     slow = [white[:, :, 0]]
     for frame in range(1, frames):
-        slow.append(_MEMORY * slow[-1] + (1 - _MEMORY**2) ** 0.5 * white[:, :, frame])
+        slow.append(memory * slow[-1] + (1 - memory**2) ** 0.5 * white[:, :, frame])
     return torch.stack(slow, dim=2)

@@ -2,7 +2,7 @@
 
 Each side sees its current frame, how far the frame is to which it goes, that frame, and when it is to be there. An
 LSTM encodes them, heads tell the distribution of the latent now and on arrival, and a decoder LSTM with experts gated
-by the phase makes the next frame. Departures from the printed sizes and inputs, kept out by `StitcherConfig.printed`:
+by the phase makes the next frame. Departures from what is printed; with `StitcherConfig.printed` all but the last:
 
 - The paper's encoder sees the two frames and never what comes between, so that its latent can tell nothing of it. Here
   a posterior, in training alone, sees the true in-between, and the paper's encoder is the prior that it is held to.
@@ -12,7 +12,9 @@ by the phase makes the next frame. Departures from the printed sizes and inputs,
   would lead to the target at an even pace. Untrained, it interpolates bare poses.
 - The decoder is given the offset and the encoder's output too, not the embeddings and the latent alone; the experts
   are given what both sides share of the latent.
-- Features of `mapctl.features` (68) replace root positions and quaternions; the head has 68 numbers, not 88.
+- Both sides step at once, and arrival counts by the way to the target in force (see `priors.stitching.sides`).
+- Widths make 2 million weights a generator, not 13.4. Features of `mapctl.features` (68), of frames and of changes,
+  replace root positions and quaternions, and the head has as many numbers, not 88.
 """
 
 from dataclasses import dataclass
@@ -72,6 +74,8 @@ class StitcherConfig(NetworkConfig):
     """Frames from one pose to the other in the longest transition."""
     without: tuple[str, ...] = ()
     """Parts that are left out (see PARTS)."""
+    printed: bool = False
+    """The scheme as the paper prints it, at these widths."""
 
     def __post_init__(self):
         unknown = [part for part in self.without if part not in PARTS]
@@ -79,6 +83,14 @@ class StitcherConfig(NetworkConfig):
             raise RequestError(f"a stitcher has no part {unknown[0]!r}; parts are {', '.join(PARTS)}")
         if self.embedding[-1] % 2 or self.longest < 2:
             raise RequestError("a stitcher's embedding is even, and its longest transition of 2 frames at least")
+        if self.printed and self.shared:
+            raise RequestError("as the paper prints it, the sides of a stitcher share nothing of the latent")
+
+    @property
+    def told(self) -> int:
+        """Numbers that the decoder is given beside the latent: the embeddings and what the encoder made of them, or as
+        printed the embeddings of state and target."""
+        return 2 * self.embedding[-1] if self.printed else 3 * self.embedding[-1] + self.encoder
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,19 +197,20 @@ class StitcherNetwork(nn.Module):
         )
         self.now = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
-        self.decoder = SidedLstm(seen + config.encoder + config.shared + config.own, config.decoder)
+        self.decoder = SidedLstm(config.told + config.shared + config.own, config.decoder)
         experts = 1 if "pm" in config.without else config.experts
         self.experts = SidedExperts(experts, (config.decoder + config.shared, *config.expert, LAYOUT.size))
         self.carry = nn.Parameter(torch.zeros(2, SIDES, 1, POSE.stop))
         self.gate = SidedLayers(PHASES, *config.gate, experts)
         self.first_phase = SidedLayers(seen, config.phase, PHASES)
         self.next_phase = SidedLayers(LAYOUT.size + PHASES, config.phase, config.phase, PHASES)
-        self.prior = nn.Sequential(
-            nn.Linear(SIDES * seen, config.head), nn.ELU(), nn.Linear(config.head, 2 * config.shared)
-        )
+        if config.shared:
+            self.prior = nn.Sequential(
+                nn.Linear(SIDES * seen, config.head), nn.ELU(), nn.Linear(config.head, 2 * config.shared)
+            )
         for layers in (self.experts, self.next_phase, self.now, self.arrived):
             layers.shrink_last(0.1)
-        told = seen + config.encoder
+        told = config.told
         with torch.no_grad():  # few numbers among many: at the usual size they would be learnt to be ignored
             self.decoder.gates.weight[:, told : told + config.shared + config.own].mul_(4)
         self.register_buffer("mean", torch.zeros(LAYOUT.size))
@@ -231,14 +244,15 @@ class StitcherNetwork(nn.Module):
 
     def tell_shared(self, seen: Float[Tensor, "2 batch seen"]) -> Gaussian:
         """Tell the distribution of what both sides share, from what they see at first."""
+        if not self.config.shared:
+            return Gaussian.of(seen.new_zeros(seen.shape[1], 0))
         return Gaussian.of(self.prior(seen.transpose(0, 1).flatten(1)))
 
     def encode(
-        self, seen: Float[Tensor, "2 batch seen"], now: Situation, memory: Memory, done: Float[Tensor, "2 batch"]
+        self, seen: Float[Tensor, "2 batch seen"], now: Situation, memory: Memory, arrived: Float[Tensor, "2 batch"]
     ) -> tuple[Float[Tensor, "2 batch width"], tuple[Tensor, Tensor], Gaussian]:
-        """Encode a frame of which `done` frames are behind the side's own end; also returns the LSTM's memory and the
-        prior's distribution of the frame's latent: that of now, and more of that on arrival the nearer this is (Eq. 1
-        and 2)."""
+        """Encode a frame at which a side has `arrived` by some share; also returns the LSTM's memory and the prior's
+        distribution of the frame's latent: that of now, and by this share that on arrival (Eq. 1)."""
         if not self.lstm:
             output = self.encoder(seen)
             memory_after = memory.encoder
@@ -263,7 +277,7 @@ class StitcherNetwork(nn.Module):
             )
         )
         arrival = self.encoder(there, memory.encoder)[0] if self.lstm else self.encoder(there)
-        return output, memory_after, prior.blend(Gaussian.of(self.arrived(arrival)), done / (done + now.left))
+        return output, memory_after, prior.blend(Gaussian.of(self.arrived(arrival)), arrived)
 
     def decode(
         self,
@@ -276,21 +290,34 @@ class StitcherNetwork(nn.Module):
     ) -> tuple[Float[Tensor, "2 batch size"], Float[Tensor, "2 batch 2"], Memory, Float[Tensor, "2 batch experts"]]:
         """Make the next frame's features, contacts as probabilities; also returns the contacts' logits, the memory
         after it, and the experts' shares."""
-        output, cell = self.decoder(torch.cat([seen, encoded, latent], dim=-1), memory.decoder)
+        if self.config.printed:
+            state, _, target = seen.chunk(3, dim=-1)
+            told = torch.cat([state, target], dim=-1)
+        else:
+            told = torch.cat([seen, encoded], dim=-1)
+        output, cell = self.decoder(torch.cat([told, latent], dim=-1), memory.decoder)
         share = torch.softmax(self.gate(memory.phase.detach()), dim=-1)
         made = self.experts(torch.cat([output, latent[..., : self.config.shared]], dim=-1), share)
-        kept = self._keep_pace(now)
-        even = 1 / now.left.clamp_min(1)[..., None]
-        pace = torch.lerp(
-            torch.cat([now.place, now.turn[..., None]], dim=-1) * even, now.features[..., PACE], kept[..., PACE]
-        )
+        pace, change = self._lean(now)
         pace = pace + made[..., PACE] * self.std[PACE]
-        change = torch.lerp((now.target - now.features)[..., POSE] * even, now.change, kept[..., POSE])
         pose = now.features[..., POSE] + change + made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
         logits = made[..., POSE.stop :]
         features = torch.cat([pace, pose, torch.sigmoid(logits)], dim=-1)
         step = self.next_phase(torch.cat([(features.detach() - self.mean) / self.std, memory.phase], dim=-1))
         return features, logits, Memory(encoder, (output, cell), memory.phase + step), share
+
+    def _lean(self, now: Situation) -> tuple[Float[Tensor, "2 batch pace"], Float[Tensor, "2 batch pose"]]:
+        """Return the step, turn and change of pose that what is made is added to: between those that led to the frame
+        and those that lead to the target at an even pace; as printed the mean step and turn, and no change."""
+        if self.config.printed:
+            return self.mean[PACE].expand_as(now.features[..., PACE]), torch.zeros_like(now.change)
+        kept, even = self._keep_pace(now), 1 / now.left.clamp_min(1)[..., None]
+        pace = torch.cat([now.place, now.turn[..., None]], dim=-1) * even
+        change = (now.target - now.features)[..., POSE] * even
+        return (
+            torch.lerp(pace, now.features[..., PACE], kept[..., PACE]),
+            torch.lerp(change, now.change, kept[..., POSE]),
+        )
 
     def _keep_pace(self, now: Situation) -> Float[Tensor, "2 batch continuous"]:
         """Return the share of the step that led to a frame in the one on from there: none of a bare pose's, and none

@@ -1,8 +1,8 @@
 """Both sides of a transition, walked towards each other (Ren et al. 2024, section 3.2 and Eq. 3).
 
-Both step at once, each towards the other's latest frame, so that one call serves both; the paper has them in turn. Once
-they have met, each goes on towards the true far end for the frames of the overlap. Features of the backward side are
-those of the motion run backwards (`mapctl.features.reversed_features`).
+Both step at once, each towards the other's latest frame, so that one call serves both; the paper has them in turn, as
+here with `StitcherConfig.printed`. Once they have met, each goes on towards the true far end for the frames of the
+overlap. Features of the backward side are those of the motion run backwards (`mapctl.features.reversed_features`).
 """
 
 from dataclasses import dataclass
@@ -81,6 +81,8 @@ class Sides:
     """Phases of the ends themselves."""
     alone: bool = False
     """Whether the forward side walks the whole way, and the other counts nothing: without the bi-directional scheme."""
+    spread: bool = True
+    """Whether what the sides disagree on in place is spread over the whole way, before the overlap is blended."""
 
     @property
     def overlap(self) -> tuple[int, int]:
@@ -107,30 +109,85 @@ def count_made(network: StitcherNetwork, frames: int) -> int:
 
 def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Sides:
     """Walk both sides of a transition of so many frames from pose to pose until they overlap."""
-    without = network.config.without
     made = count_made(network, frames)
     memory, shared, at = _enter(network, ends, frames, latents)
-    now, change, paced = far, far_change, far_paced = _pick_end(ends)
-    at_ends, far_at, rows = memory.phase, at, []
+    walker = _Walker(network, ends, frames, latents, shared, at)
+    standing, rows = _Standing(*_pick_end(ends), at, memory), []
     for step in range(made):
         left = frames - 2 * step
-        aligned = left >= 1 and "ba" not in without
-        target, target_at = ((now, change, paced), at) if aligned else ((far, far_change, far_paced), far_at)
-        situation = _look((now, change, paced), at, target, target_at, float(left if aligned else frames - step))
-        seen = network.embed(situation)
-        encoded, encoder, prior = network.encode(seen, situation, memory, torch.full_like(paced, float(step)))
-        own = latents.own(prior, encoded, step)
-        latent = torch.cat([shared.expand(2, -1, -1), own], dim=-1)
-        before = now
-        now, logits, memory, share = network.decode(seen, encoded, latent, situation, memory, encoder)
-        change = (now - before)[..., POSE]
-        at = at.displace(*_pick_pace(now))
-        paced = torch.ones_like(paced)
-        rows.append((now, logits, at.position_xz, at.heading, memory.phase, share))
+        after, row = walker.step(standing, step, left)
+        if network.config.printed:
+            # In turn (Eq. 3): the backward side goes to the frame that the forward side has just made.
+            last, again = walker.step(after.merge(standing), step, left - 1)
+            after = after.merge(last)
+            row = tuple(_take_sides(*pair) for pair in zip(row, again, strict=True))
+        standing = after
+        rows.append((standing.now, row[0], standing.at.position_xz, standing.at.heading, standing.memory.phase, row[1]))
     features, logits, places, headings, phases, shares = (
         torch.stack(column, dim=2) for column in zip(*rows, strict=True)
     )
-    return Sides(frames, features, logits, places, headings, phases, shares, at_ends, "bs" in without)
+    alone, spread = "bs" in network.config.without, not network.config.printed
+    return Sides(frames, features, logits, places, headings, phases, shares, memory.phase, alone, spread)
+
+
+@dataclass(frozen=True, eq=False)
+class _Standing:
+    """Where both sides are."""
+
+    now: Float[Tensor, "2 batch size"]
+    change: Float[Tensor, "2 batch pose"]
+    paced: Float[Tensor, "2 batch"]
+    at: GroundPose
+    memory: Memory
+
+    def merge(self, backward: "_Standing") -> "_Standing":
+        """Return the forward side of this and the backward side of another."""
+        forward = torch.tensor([1.0, 0.0])[:, None].expand_as(self.paced)
+        position = _take_sides(self.at.position_xz, backward.at.position_xz)
+        return _Standing(
+            _take_sides(self.now, backward.now),
+            _take_sides(self.change, backward.change),
+            _take_sides(self.paced, backward.paced),
+            GroundPose(position, _take_sides(self.at.heading, backward.at.heading)),
+            self.memory.keep(backward.memory, forward),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Walker:
+    """Steps of both sides at once."""
+
+    network: StitcherNetwork
+    ends: Ends
+    frames: int
+    latents: Latents
+    shared: Float[Tensor, "batch shared"]
+    far_at: GroundPose
+
+    def step(self, standing: _Standing, step: int, left: int) -> tuple[_Standing, tuple[Tensor, ...]]:
+        """Take one step of each side towards the other, `left` frames away, or towards the far end once they have met;
+        also returns the contacts' logits and the experts' shares."""
+        network, memory, paced = self.network, standing.memory, standing.paced
+        here = standing.now, standing.change, paced
+        aligned = left >= 1 and "ba" not in network.config.without
+        target, target_at = (here, standing.at) if aligned else (_pick_end(self.ends), self.far_at)
+        situation = _look(here, standing.at, target, target_at, float(left if aligned else self.frames - step))
+        seen = network.embed(situation)
+        arrived = torch.full_like(paced, self._arrive(step, left if aligned else self.frames - step))
+        encoded, encoder, prior = network.encode(seen, situation, memory, arrived)
+        own = self.latents.own(prior, encoded, step)
+        latent = torch.cat([self.shared.expand(2, -1, -1), own], dim=-1)
+        now, logits, memory, share = network.decode(seen, encoded, latent, situation, memory, encoder)
+        change, at = (now - standing.now)[..., POSE], standing.at.displace(*_pick_pace(now))
+        return _Standing(now, change, torch.ones_like(paced), at, memory), (logits, share)
+
+    def _arrive(self, step: int, left: int) -> float:
+        """Return the share of the distribution on arrival: of the way to the target in force, or as printed in Eq. 2,
+        which comes to the end in the middle and once more beyond it."""
+        if not self.network.config.printed:
+            return step / (step + left)
+        middle = max(1, self.frames // 2)
+        return step / middle if step < middle else min(1.0, step / max(1, count_made(self.network, self.frames)))
 
 
 def reverse_sense(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
@@ -172,6 +229,11 @@ def _enter(
     if context > 1:
         memory = network.begin(first).keep(memory, 1 - before)
     return memory, shared, at
+
+
+def _take_sides(forward: Float[Tensor, "2 *shape"], backward: Float[Tensor, "2 *shape"]) -> Float[Tensor, "2 *shape"]:
+    """Take the forward side of the one and the backward side of the other."""
+    return torch.stack([forward[0], backward[1]])
 
 
 def _pick_end(ends: Ends) -> Frame:

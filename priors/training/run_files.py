@@ -15,6 +15,7 @@ from priors.checkpoints import encode_json
 from priors.tensor_files import write_tensors
 
 _TENSORS, _INDEX = "checkpoint.safetensors", "checkpoint.json"
+_MOVED = "moved"  # how many weights an optimiser has moved
 
 # What json, safetensors and torch raise for files that are damaged or are something else.
 UNREADABLE_ERRORS = (
@@ -79,12 +80,13 @@ def read_last_step(run: Path) -> int | None:
 
 
 def flatten_optimiser(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, torch.Tensor]:
-    """What an optimiser keeps of each weight, flat."""
+    """What an optimiser keeps of each weight that it has moved, flat, and how many these are."""
+    state = optimiser.state_dict()["state"]
     return {
         f"{prefix}.{number}.{key}": torch.as_tensor(value)
-        for number, entries in optimiser.state_dict()["state"].items()
+        for number, entries in state.items()
         for key, value in entries.items()
-    }
+    } | {f"{prefix}.{_MOVED}": torch.tensor(len(state))}
 
 
 def unflatten_optimiser(
@@ -92,12 +94,14 @@ def unflatten_optimiser(
 ) -> dict[str, Any]:
     """For `load_state_dict`, from what `flatten_optimiser` gave; KeyError unless it is whole."""
     state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in select_prefixed(f"{prefix}.", tensors).items():
+    kept = select_prefixed(f"{prefix}.", tensors)
+    moved = int(kept.pop(_MOVED))
+    for name, tensor in kept.items():
         number, key = name.split(".", 1)
         state.setdefault(int(number), {})[key] = tensor
     groups = optimiser.state_dict()["param_groups"]
-    # Torch takes a partial state, and fails at the next step.
-    if len(state) != sum(len(group["params"]) for group in groups) or len(set(map(frozenset, state.values()))) > 1:
+    # Torch takes a partial state, and fails at the next step or begins anew.
+    if len(state) != moved or len(set(map(frozenset, state.values()))) > 1:
         raise KeyError("the optimiser's state is not whole")
     return {"state": state, "param_groups": groups}
 

@@ -21,10 +21,10 @@ from priors.training.adversaries.sliding_windows import (
     compute_slope,
 )
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
-from priors.training.recipes.stitcher import StitcherSettings, StitcherTrainer
+from priors.training.recipes.stitcher import PAPER, StitcherSettings, StitcherTrainer
 from priors.training.recipes.stitcher_critics import CriticSettings, show_sides, show_truth
 from priors.training.recipes.stitcher_latents import TRIES, sample_nearest
-from priors.training.recipes.stitcher_losses import Shares, compute_stitcher_losses
+from priors.training.recipes.stitcher_losses import Shares, find_stitcher_losses
 
 SETTINGS = StitcherSettings(steps=10, batch=6, window=24, critics=CriticSettings(begin=0.3, head_start=2))
 
@@ -142,18 +142,19 @@ def test_motion_at_the_mean_is_not_judged():
         return torch.zeros(())
 
     shares = Shares(informed=0.3, calm=0.4, nearest=0.2)
-    losses = compute_stitcher_losses(
-        trainer.network, trainer.posterior, truth, shares, SETTINGS.weights, seeded(), judge
+    parts, told = find_stitcher_losses(
+        trainer.network, trainer.posterior, truth, shares, SETTINGS.weights.ease, seeded(), judge
     )
     assert asked[0].tolist() == [True] * 3 + [False] * 4 + [True] * 3
-    assert "critics" in losses
+    assert "critics" in parts
+    assert "critics" in told
 
 
 def test_the_nearest_of_several_draws_is_kept():
     network, truth, count = tiny_stitcher.network(drawn=1.0), transitions(8), 8
     nearest = sample_nearest(network, truth, seeded())
     made = nearest.slow.shape[2]
-    tried = DrawnLatents.sample(TRIES * count, made, network.config.shared, network.config.own, seeded())
+    tried = DrawnLatents.sample(network.config, TRIES * count, made, seeded())
 
     def measure(latents):
         away = walk_sides(network, truth.ends(), truth.frames, latents).place_joints() - truth.place_joints(made)
@@ -187,6 +188,54 @@ def test_a_step_of_two_processes_has_the_mean_gradient_of_two_batches_for_the_po
     assert all(weight.is_shared() for weight in trainer.posterior.parameters())
     for weight, one, other in zip(trainer.weights(), *found, strict=True):
         torch.testing.assert_close(weight.grad, (one + other) / 2, atol=1e-5, rtol=1e-3)
+
+
+def make_printed(**settings):
+    config = replace(tiny_stitcher.CONFIG, shared=0, own=4, printed=True)
+    return StitcherTrainer(config, replace(PAPER[1], steps=10, batch=6, window=24, **settings), corpus(2, 80))
+
+
+def test_as_printed_all_are_drawn_and_compared_and_the_encoder_is_held_to_a_standard_normal():
+    trainer, truth = make_printed(), transitions()
+    shares, settings = trainer.settings.shares, trainer.settings.weights
+    parts, told = find_stitcher_losses(trainer.network, None, truth, shares, settings.ease, seeded())
+    assert [name for name, value in told.items() if name[-3:] == "_cm" and not value.any()] == ["places_cm", "calm_cm"]
+    assert "posterior" not in trainer.networks()
+    with torch.no_grad():  # a prior that says standard normal costs nothing
+        for heads in (trainer.network.now, trainer.network.arrived):
+            for layer in heads.parameters():
+                layer.zero_()
+    still, _ = find_stitcher_losses(trainer.network, None, truth, shares, settings.ease, seeded())
+    assert float(parts["own"].detach()) > 0 == float(still["own"].detach())
+
+
+def test_as_printed_losses_count_by_what_they_are_before_training():
+    trainer = make_printed()
+    assert set(trainer.untrained) == {"places", "state", "contacts", "stitching"}
+    weights = trainer.settings.weights
+    parts = {name: torch.tensor(value) for name, value in trainer.untrained.items()}
+    loss = weights.weigh(parts, trainer.untrained)
+    assert float(loss) == pytest.approx(weights.places + weights.state + weights.contacts + weights.stitching)
+    assert make_trainer().untrained == {}
+
+
+def test_as_printed_training_makes_errors_smaller():
+    trainer = make_printed()
+    first = trainer.train_step()
+    assert first["told"] == 0.5 or first["critic"] != 1.0  # the critics are there from the first step on
+    truth, shares = transitions(), trainer.settings.shares
+
+    def measure():
+        with torch.no_grad():
+            return float(find_stitcher_losses(trainer.network, None, truth, shares, 0.0, seeded())[0]["places"])
+
+    before = measure()
+    for group in trainer.optimisers()["optimiser"].param_groups:
+        group["lr"] = 3e-3
+    trainer.learning_rate = 3e-3
+    for _ in range(8):
+        trainer.train_step()
+    assert measure() < before
 
 
 @pytest.mark.parametrize("shares", [Shares(-0.1, 0.5, 0.2), Shares(0.6, 0.4, 0.1), Shares(0.0, 0.0, 0.0)])

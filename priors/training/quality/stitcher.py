@@ -25,15 +25,15 @@ _ACTIVE = 0.01  # variance of a posterior's mean from which on a dimension is in
 
 @torch.no_grad()
 def measure_transitions(
-    network: StitcherNetwork, posterior: PosteriorNetwork, windows: TransitionWindows
+    network: StitcherNetwork, posterior: PosteriorNetwork | None, windows: TransitionWindows
 ) -> dict[str, float]:
     """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
     distance of joints; and in a gap of 30 frames what the latents do.
 
-    Distances are in cm: `apart` of the sides before they are joined, `spread` of 8 draws from each other. `informed`,
-    `draw` and `best` are errors of an answer with the posterior's latents, of one draw and of the best of 8; `jitter`
-    is the mean acceleration over mocap's; `active` counts latent dimensions, `nats` a
-    transition's divergence.
+    Distances are in cm: `apart` of the sides before they are joined, `spread` of 8 draws from each other. `calm`,
+    `informed`, `draw` and `best` are errors of an answer with latents at the prior's mean, with the posterior's, of one
+    draw and of the best of 8; `jitter` is the mean acceleration over mocap's; `active` counts latent dimensions, `nats`
+    a transition's divergence.
     """
     row: dict[str, float] = {}
     for name, known in (("bare", Known()), ("past", Known(before=10))):
@@ -55,13 +55,12 @@ def measure_transitions(
 def answer(network: StitcherNetwork, truth: Transition, latents: Latents) -> Joined:
     """Return what a stitcher makes of the ends of transitions."""
     ends = truth.ends()
-    return join_sides(walk_sides(network, ends, truth.frames, latents), ends)
+    return join_sides(walk_sides(network, ends, truth.frames, latents))
 
 
 def make_calm(network: StitcherNetwork, truth: Transition) -> DrawnLatents:
     """Make latents at the mean."""
-    config = network.config
-    return DrawnLatents.calm(len(truth.features), count_made(network, truth.frames), config.shared, config.own)
+    return DrawnLatents.calm(network.config, len(truth.features), count_made(network, truth.frames))
 
 
 def place(joined: Joined) -> Float[Tensor, "batch frames joints 3"]:
@@ -77,39 +76,45 @@ def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
 
 
 def _measure_draws(
-    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, places: Tensor
+    network: StitcherNetwork, posterior: PosteriorNetwork | None, truth: Transition, places: Tensor
 ) -> dict[str, float]:
-    config, generator = network.config, torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     batch, made = len(truth.features), count_made(network, truth.frames)
-    latents = TaughtLatents(
-        posterior, (truth.truth() - network.mean) / network.std, miss_calmly(network, truth), make_calm(network, truth)
-    )
-    informed = place(answer(network, truth, latents))
+    calm = place(answer(network, truth, make_calm(network, truth)))
     draws = torch.stack(
         [
-            place(answer(network, truth, DrawnLatents.sample(batch, made, config.shared, config.own, generator)))
+            place(answer(network, truth, DrawnLatents.sample(network.config, batch, made, generator)))
             for _ in range(_DRAWS)
         ]
     )
     errors = (draws - places).norm(dim=-1).mean(dim=(2, 3))
     pairs = [(a - b).norm(dim=-1).mean() for n, a in enumerate(draws) for b in draws[:n]]
-    active = [(means.var(dim=0) > _ACTIVE).sum() for means in (latents.means[0], torch.cat(latents.means[1:]))]
     shares = walk_sides(network, truth.ends(), truth.frames, make_calm(network, truth)).shares
     return {
-        "informed_cm": 100 * float((informed - places).norm(dim=-1).mean()),
+        "calm_cm": 100 * float((calm - places).norm(dim=-1).mean()),
         "draw_cm": 100 * float(errors[0].mean()),
         "best_cm": 100 * float(errors.amin(dim=0).mean()),
         "spread_cm": 100 * float(torch.stack(pairs).mean()),
         "jitter": float(_measure_acceleration(draws[0]) / _measure_acceleration(places)),
-        "calm_jitter": float(
-            _measure_acceleration(place(answer(network, truth, make_calm(network, truth))))
-            / _measure_acceleration(places)
-        ),
+        "calm_jitter": float(_measure_acceleration(calm) / _measure_acceleration(places)),
+        "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
+    } | ({} if posterior is None else _measure_posterior(network, posterior, truth, places))
+
+
+def _measure_posterior(
+    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, places: Tensor
+) -> dict[str, float]:
+    latents = TaughtLatents(
+        posterior, (truth.truth() - network.mean) / network.std, miss_calmly(network, truth), make_calm(network, truth)
+    )
+    informed = place(answer(network, truth, latents))
+    active = [(means.var(dim=0) > _ACTIVE).sum() for means in (latents.means[0], torch.cat(latents.means[1:]))]
+    return {
+        "informed_cm": 100 * float((informed - places).norm(dim=-1).mean()),
         "active_shared": float(active[0]),
         "active_own": float(active[1]),
         "shared_nats": float(latents.count_nats()[0].sum(dim=1).mean()),
         "own_nats": float(latents.count_nats()[1].sum(dim=1).mean()),
-        "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
     }
 
 

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from priors.training.corpus import Corpus, Split
 from priors.training.quality.stitcher import measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.recipes.stitcher_critics import CriticSettings, StitcherCritics
-from priors.training.recipes.stitcher_losses import LossWeights, Shares, compute_stitcher_losses
+from priors.training.recipes.stitcher_losses import LossWeights, Shares, find_stitcher_losses
 from priors.training.trainer import GradientTrainer
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
@@ -27,6 +28,7 @@ _LEAST_WINDOW = 16  # frames of the longest transition
 _CONTEXT = 10  # frames told before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
 _AVERAGE = 0.999
+_RELATIVE, _UNTRAINED_BATCHES = ("places", "state", "contacts", "stitching"), 8
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 
 
@@ -81,6 +83,8 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
             lambda: self._make(config), steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
         )
         _set_moments(self.network, corpus)
+        self.untrained = self._measure_untrained() if settings.weights.relative else {}
+        """What some losses are divided by."""
         self.critics = (
             None if "d" in config.without else StitcherCritics(settings.critics, settings.seed, self.generator)
         )
@@ -90,7 +94,8 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def _make(self, config: StitcherConfig) -> StitcherNetwork:
         network = StitcherNetwork(config)
-        self.posterior = PosteriorNetwork(config)
+        self.posterior = None if config.printed else PosteriorNetwork(config)
+        """Sees the truth; the paper prints none."""
         return network
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -99,12 +104,13 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def weights(self) -> list[nn.Parameter]:
         """Those of the posterior too."""
-        return [*super().weights(), *self.posterior.parameters()]
+        return [*super().weights(), *([] if self.posterior is None else self.posterior.parameters())]
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
-        critics = {} if self.critics is None else {"critics": self.critics.network}
-        return super().networks() | {"posterior": self.posterior, "average": self.average} | critics
+        critics = None if self.critics is None else self.critics.network
+        others = {"posterior": self.posterior, "average": self.average, "critics": critics}
+        return super().networks() | {name: network for name, network in others.items() if network is not None}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """One for each of the two that contend."""
@@ -115,16 +121,16 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         settings, done = self.settings, 1.0 if self.grown else self.step / self.steps
         longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
-        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
-        truth = self.windows.draw(settings.batch, frames, self._draw_known(), self.generator)
+        truth = self._draw_transitions(longest, self.generator)
         weights, judge = settings.weights, None
         if self.critics is not None and self._criticised >= 0:
             self._truth, judge = truth, self.critics.hear
             weights = replace(weights, critics=weights.critics * settings.critics.ramp(self._criticised))
-        with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
-            return compute_stitcher_losses(
-                self.network, self.posterior, truth, settings.shares, weights, self.generator, judge
+        with self._in_bfloat16():
+            parts, told = find_stitcher_losses(
+                self.network, self.posterior, truth, settings.shares, weights.ease, self.generator, judge
             )
+        return {"loss": weights.weigh(parts, self.untrained), **told}
 
     def train_step(self) -> dict[str, float]:
         """Take one update, and one of the critics where they have joined, and bring the average nearer.
@@ -154,15 +160,38 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         """Updates since the critics joined; below 0 before."""
         return self.step - round(self.settings.critics.begin * self.steps)
 
-    def _draw_known(self) -> Known:
-        """Two bare poses in two fifths of the cases; in the rest up to 10 frames before, and after or not."""
-        share = float(torch.rand((), generator=self.generator))
-        before, after = torch.randint(0, _CONTEXT + 1, (2,), generator=self.generator).tolist()
-        if share < 0.4:
-            return Known()
-        if share < 0.55:
-            return Known(1, min(1, after))
-        return Known(max(1, before) if share < 0.75 else _CONTEXT, after if share < 0.8 else 0)
+    def _draw_transitions(self, longest: int, generator: torch.Generator) -> Transition:
+        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=generator))
+        return self.windows.draw(self.settings.batch, frames, _draw_known(generator), generator)
+
+    @torch.no_grad()
+    def _measure_untrained(self) -> dict[str, float]:
+        """Measure the losses that are weighed by what they are before training (the rule of Harvey et al. 2020)."""
+        generator, found = torch.Generator().manual_seed(self.settings.seed), []
+        for _ in range(_UNTRAINED_BATCHES):
+            truth = self._draw_transitions(self.longest, generator)
+            settings = self.settings
+            found.append(
+                find_stitcher_losses(
+                    self.network, self.posterior, truth, settings.shares, settings.weights.ease, generator
+                )[0]
+            )
+        return {name: sum(float(parts[name]) for parts in found) / len(found) for name in _RELATIVE}
+
+    def _in_bfloat16(self) -> AbstractContextManager[None]:
+        networks = [network for network in (self.network, self.posterior) if network is not None]
+        return multiply_in_bfloat16(*networks, wanted=self.settings.bfloat16)
+
+
+def _draw_known(generator: torch.Generator) -> Known:
+    """Two bare poses in two fifths of the cases; in the rest up to 10 frames before, and after or not."""
+    share = float(torch.rand((), generator=generator))
+    before, after = torch.randint(0, _CONTEXT + 1, (2,), generator=generator).tolist()
+    if share < 0.4:
+        return Known()
+    if share < 0.55:
+        return Known(1, min(1, after))
+    return Known(max(1, before) if share < 0.75 else _CONTEXT, after if share < 0.8 else 0)
 
 
 @dataclass(frozen=True)
@@ -194,7 +223,23 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
 
     def format_shape(self) -> list[str]:
         """The parts that are left out."""
-        return [f"--without {','.join(self.config.without)}"] if self.config.without else []
+        parts = ["--paper"] if self.config.printed else []
+        return parts + ([f"--without {','.join(self.config.without)}"] if self.config.without else [])
+
+
+PAPER = (
+    StitcherConfig(shared=0, own=16, printed=True),
+    StitcherSettings(
+        steps=58_000,
+        batch=32,
+        learning_rate=1e-4,
+        weights=LossWeights(
+            places=0.5, pace=0.0, state=1.0, contacts=0.1, feet=0.0, stitching=0.5, own=1.0, ease=0.0, relative=True
+        ),
+        critics=CriticSettings(begin=0.0, head_start=0),
+    ),
+)
+"""Scheme, losses, weights and batches as Ren et al. 2024 print them (sections 3.2 to 4.3), at our widths."""
 
 
 def _set_moments(network: StitcherNetwork, corpus: Corpus) -> None:

@@ -63,9 +63,35 @@ class TaughtLatents:
         """Count those of what is shared, and sum those of all frames."""
         return self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
 
+    def diverge(self) -> dict[str, Tensor]:
+        """Return the divergences that are learnt, nats a transition, by the names of their weights."""
+        count = self.missed.shape[1]
+        if not count:
+            return {name: torch.zeros(()) for name in ("shared", "prior", "own")}
+        prior, own = (each[:count].mean(dim=0).sum() for each in self.count_nats())
+        return {"shared": self.cost.mean(dim=0).sum(), "prior": prior, "own": own}
+
     def _count(self, nats: Tensor, mean: Tensor) -> None:
         self.nats.append(nats)
         self.means.append(mean)
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedLatents(DrawnLatents):
+    """Drawn from the prior, which is held to a standard normal distribution: what the paper prints as its encoder."""
+
+    nats: list[Tensor] = field(default_factory=list)
+    """Mean divergence over rows, of each call."""
+
+    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
+        """A frame's, of both sides."""
+        standard = Gaussian(torch.zeros_like(prior.mean), torch.zeros_like(prior.mean))
+        self.nats.append(prior.diverge(standard).sum(dim=-1).mean())
+        return super().own(prior, encoded, step)
+
+    def diverge(self) -> dict[str, Tensor]:
+        """Return the divergence, nats a frame, by the name of its weight."""
+        return {"own": torch.stack(self.nats).mean()}
 
 
 @torch.no_grad()
@@ -74,7 +100,7 @@ def miss_calmly(network: StitcherNetwork, truth: Transition) -> Float[Tensor, "2
     count, made = len(truth.features), count_made(network, truth.frames)
     if not count:
         return network.mean.new_zeros(2, 0, made, len(network.mean))
-    calm = DrawnLatents.calm(count, made, network.config.shared, network.config.own)
+    calm = DrawnLatents.calm(network.config, count, made)
     found = walk_sides(network, truth.ends(), truth.frames, calm).features
     return (truth.truth()[:, :, :made] - found) / network.std
 
@@ -86,7 +112,7 @@ def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch
     count, made = len(truth.features), count_made(network, truth.frames)
     tries = TRIES if count else 0
     every = torch.arange(count).repeat(tries)
-    noise = DrawnLatents.sample(len(every), made, network.config.shared, network.config.own, generator)
+    noise = DrawnLatents.sample(network.config, len(every), made, generator)
     if not tries:
         return noise
     repeated = truth.rows(every)

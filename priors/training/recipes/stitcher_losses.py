@@ -1,6 +1,6 @@
 """What a stitcher is taught: the true way between two poses, and that its sides meet."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,14 +17,14 @@ from priors.stitching.network import PACE, POSE, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Ends, Sides, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Transition
-from priors.training.recipes.stitcher_latents import TaughtLatents, miss_calmly, sample_nearest
+from priors.training.recipes.stitcher_latents import PrintedLatents, TaughtLatents, miss_calmly, sample_nearest
 
-_EASE, _EASE_METRES = 0.4, 0.05
+_EASE_METRES = 0.05
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of what is learnt."""
+    """Weights of what is learnt; each loss is divided by its mean before training where `relative`."""
 
     places: float = 10.0
     """Mean distance of joints from their true places, metres (the paper's FK loss, Eq. 7)."""
@@ -48,6 +48,15 @@ class LossWeights:
     """Absolute error of the phases."""
     critics: float = 0.1
     """What critics say of motion with latents that are not at the mean, where there are critics."""
+    ease: float = 0.4
+    """Power of the interpolation's error by which windows count less; 0 lets all count the same."""
+    relative: bool = False
+    """Whether places, poses, contacts and the stitching are divided by what they are of an untrained network."""
+
+    def weigh(self, parts: Mapping[str, Tensor], untrained: Mapping[str, float]) -> Tensor:
+        """Return the loss."""
+        terms = [getattr(self, name) / untrained.get(name, 1.0) * value for name, value in parts.items()]
+        return torch.stack(terms).sum()
 
 
 @dataclass(frozen=True)
@@ -70,43 +79,40 @@ class Shares:
         return informed, calm, nearest
 
 
-def compute_stitcher_losses(
+def find_stitcher_losses(
     network: StitcherNetwork,
-    posterior: PosteriorNetwork,
+    posterior: PosteriorNetwork | None,
     truth: Transition,
     shares: Shares,
-    weights: LossWeights,
+    ease: float,
     generator: torch.Generator,
     judge: Callable[[Sides, Ends, Bool[Tensor, " batch"]], Tensor] | None = None,
-) -> dict[str, Tensor]:
-    """Compute the loss, and in plain units the errors it is made of; `judge` says what critics say of some rows."""
-    wanted, batch, frames = truth.truth(), len(truth.features), truth.frames
-    informed, calm, compared = shares.count(batch)
-    row, known = torch.arange(batch), truth.ends()
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Find the losses by the names of their weights, and in plain units the errors that they are made of.
+
+    Without a posterior all latents are drawn (as printed), and all rows are compared with the truth. `judge` says what
+    critics say of some rows.
+    """
+    batch, known = len(truth.features), truth.ends()
+    informed, calm, compared = (0, 0, batch) if posterior is None else shares.count(batch)
+    row = torch.arange(batch)
     at_mean = (row >= informed) & (row < calm)
-    noise = DrawnLatents.sample(
-        batch, count_made(network, frames), network.config.shared, network.config.own, generator
-    )
-    noise = noise.still(at_mean)
-    noise = noise.put(row[calm:compared], sample_nearest(network, truth.rows(row[calm:compared]), generator))
-    latents = TaughtLatents(
-        posterior, (wanted - network.mean) / network.std, miss_calmly(network, truth.rows(row[:informed])), noise
-    )
-    sides = walk_sides(network, known, frames, latents)
+    noise = DrawnLatents.sample(network.config, batch, count_made(network, truth.frames), generator).still(at_mean)
+    if posterior is None:
+        latents = PrintedLatents(noise.shared, noise.slow)
+    else:
+        nearest = row[calm:compared]
+        noise = noise.put(nearest, sample_nearest(network, truth.rows(nearest), generator))
+        wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
+        latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
+    sides = walk_sides(network, known, truth.frames, latents)
     if sides.alone:
         sides = _forget_backward(sides)
-    parts, distance, slip = _compare(network, truth, sides, compared)
-    nats = [each[:informed].mean(dim=0) if informed else torch.zeros(1) for each in latents.count_nats()]
-    parts |= {
-        "shared": latents.cost.mean(dim=0).sum() if informed else torch.zeros(()),
-        "prior": nats[0].sum(),
-        "own": nats[1].sum(),
-    }
+    parts, distance, slip = _compare(network, truth, sides, compared, ease)
+    parts |= latents.diverge()
     # A mean is smooth, and is to be: only what stands for one of many ways is to pass for one.
     parts |= {} if judge is None else {"critics": judge(sides, known, ~at_mean)}
-    loss = sum((getattr(weights, name) * value for name, value in parts.items()), start=torch.zeros(()))
-    return {
-        "loss": loss,
+    told = {
         "places_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
         "calm_cm": 100 * distance[:, informed:calm].mean() if calm > informed else torch.zeros(()),
         "nearest_cm": 100 * distance[:, calm:].mean() if compared > calm else torch.zeros(()),
@@ -115,21 +121,22 @@ def compute_stitcher_losses(
         "contacts": parts["contacts"],
         "feet_cm": 100 * parts["feet"],
         "apart_cm": 100 * parts["stitching"],
-        "shared_nats": parts["prior"],
+        "shared_nats": parts.get("prior", torch.zeros(())),
         "own_nats": parts["own"],
         "phase": parts["phase"],
-    } | {name: parts[name] for name in ("critics",) if name in parts}
+    }
+    return parts, told | {name: parts[name] for name in ("critics",) if name in parts}
 
 
 def _compare(
-    network: StitcherNetwork, truth: Transition, sides: Sides, compared: int
+    network: StitcherNetwork, truth: Transition, sides: Sides, compared: int, power: float
 ) -> tuple[dict[str, Tensor], Float[Tensor, "sides compared made joints"], Float[Tensor, "sides compared made joints"]]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true places, and the errors of their steps, metres."""
     count, _, made = sides.features.shape[:3]
     true, places = truth.truth()[:count, :compared, :made], sides.place_joints()
     # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
-    ease = weigh_windows(truth)[:compared]
+    ease = weigh_windows(truth, power)[:compared]
     wrong = places[:, :compared] - truth.place_joints(made)[:count, :compared]
     distance = _measure_length(wrong)
     slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
@@ -159,11 +166,11 @@ def measure_apart(places: Float[Tensor, "2 batch made joints 3"], frames: int) -
 
 
 @torch.no_grad()
-def weigh_windows(truth: Transition) -> Float[Tensor, " batch"]:
-    """Weigh transitions by the mean error of the interpolation: 1 at 5 cm."""
+def weigh_windows(truth: Transition, power: float) -> Float[Tensor, " batch"]:
+    """Weigh transitions by a power of the mean error of the interpolation: 1 at 5 cm."""
     body, guess = interpolate(truth)
     error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))
-    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** _EASE
+    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** power
 
 
 def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
