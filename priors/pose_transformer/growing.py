@@ -15,6 +15,7 @@ _NORMS = (".first.", ".second.", ".norm.")
 def can_grow(small: PoseTransformerConfig, large: PoseTransformerConfig) -> bool:
     """Whether the heads are equally wide, the convolutions equally long, and nothing is smaller."""
     alike = small.kernel == large.kernel and small.width * large.heads == large.width * small.heads
+    alike = alike and small.detail == large.detail
     return alike and small.width <= large.width and small.layers <= large.layers
 
 

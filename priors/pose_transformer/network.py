@@ -7,7 +7,7 @@ the hips' place, and two contacts. Bones are rigid by construction.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -48,6 +48,10 @@ class PoseTransformerConfig(NetworkConfig):
     """Heads of each."""
     kernel: int = 5
     """Frames of each layer's convolution, one number at a time, before its attention; odd, 0 for none."""
+    detail: int = 0
+    """Layers of attention of a second stage, which corrects what the first proposes; the first then looks at frames of
+    which something is known, alone (Qin et al. 2022, "Motion In-betweening via Two-stage Transformers": context and
+    detail transformer, here with this network's tokens, rotary positions and losses). 0 for none."""
 
     def __post_init__(self):
         if min(self.width, self.layers, self.heads) < 1 or self.width % (2 * self.heads):
@@ -68,6 +72,8 @@ class ProposedPoses:
     """Contact logits of the left and the right toe."""
     log_spread: Float[Tensor, "batch frames joints 2"]
     """Logarithm of the distance, metres, within which a joint's true position lies with the chances QUANTILES."""
+    rough: "ProposedPoses | None" = None
+    """What the first of two stages proposed."""
 
     def poses(self, offsets: Float[Tensor, "batch joints 3"]) -> tuple[Tensor, Tensor]:
         """Return world positions, metres, and world rotation matrices of all joints on these bones."""
@@ -99,23 +105,41 @@ class PoseTransformerNetwork(nn.Module):
         self.bones = nn.Linear(3 * _JOINTS, width, bias=False)
         self.embed = nn.Sequential(nn.Linear(_ROWS, width), nn.GELU(), nn.Linear(width, width))
         self.layers = nn.ModuleList(_Layer(config) for _ in range(config.layers))
-        self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, _OUT_ROWS)
+        self.norm, self.head = nn.LayerNorm(width), _make_head(width)
         self.spread = nn.Sequential(nn.Linear(width, width // 2), nn.GELU(), nn.Linear(width // 2, 2 * _JOINTS))
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
+        self.detail = _Detail(config) if config.detail else None
 
     def forward(self, motion: PartialMotion) -> ProposedPoses:
         """Propose poses for an interpolated motion."""
         shown = rotations.to_matrix(motion.quats)
+        if self.detail is None:
+            return self._propose(motion, shown, self)
+        seen = motion.known.rotations.any(dim=-1) | motion.known.ground | motion.known.effectors.any(dim=-1)
+        rough = self._propose(motion, shown, self, seen)
+        # Rotations are shown from the interpolated heading.
+        hips = _about_y(-motion.heading) @ rough.local_matrix[..., 0, :, :]
+        shown = torch.cat([hips.unsqueeze(-3), rough.local_matrix[..., 1:, :, :]], dim=-3)
+        contacts = torch.where(motion.contacts == 0.5, torch.sigmoid(rough.contacts), motion.contacts)
+        corrected = replace(motion, root_position=rough.root_position, contacts=contacts)
+        return replace(self._propose(corrected, shown, self.detail), rough=rough)
+
+    def _propose(
+        self,
+        motion: PartialMotion,
+        shown: Float[Tensor, "batch frames joints 3 3"],
+        stage: "PoseTransformerNetwork | _Detail",
+        seen: Bool[Tensor, "batch frames"] | None = None,
+    ) -> ProposedPoses:
+        """Propose poses with the layers of a stage, which look at the `seen` frames alone."""
         rows = self._encode(motion, shown)
         bones = (motion.offsets - CANONICAL.offsets.to(motion.offsets)).flatten(1) / _BONE_UNIT
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
-            tokens = self.embed(rows) + self.bones(bones)[:, None]
+            tokens = stage.embed(rows) + self.bones(bones)[:, None]
             phases = _rotary_phases(rows.shape[1], self.config.width // self.config.heads, tokens.device)
-            for layer in self.layers:
-                tokens = layer(tokens, phases)
-            tokens = self.norm(tokens)
-            out, spread = self.head(tokens).float(), self.spread(tokens.detach()).float()
+            for layer in stage.layers:
+                tokens = layer(tokens, phases, seen)
+            tokens = stage.norm(tokens)
+            out, spread = stage.head(tokens).float(), self.spread(tokens.detach()).float()
         local = self._decode_rotations(out[..., :_ROTATION_ROWS], shown, motion)
         moved = out[..., _ROTATION_ROWS : _ROTATION_ROWS + 3] * _HIPS_UNIT
         moved = rotations.rotate_about_y(moved, motion.heading)
@@ -176,6 +200,17 @@ class PoseTransformerNetwork(nn.Module):
         return torch.cat([(_about_y(motion.heading) @ hips).unsqueeze(-3), others], dim=-3)
 
 
+class _Detail(nn.Module):
+    """Layers of the second stage."""
+
+    def __init__(self, config: PoseTransformerConfig):
+        super().__init__()
+        width = config.width
+        self.embed = nn.Sequential(nn.Linear(_ROWS, width), nn.GELU(), nn.Linear(width, width))
+        self.layers = nn.ModuleList(_Layer(config) for _ in range(config.detail))
+        self.norm, self.head = nn.LayerNorm(width), _make_head(width)
+
+
 class _Layer(nn.Module):
     """Attention among all frames, and a perceptron for each."""
 
@@ -190,17 +225,28 @@ class _Layer(nn.Module):
             nn.Conv1d(width, width, config.kernel, padding=config.kernel // 2, groups=width) if config.kernel else None
         )
 
-    def forward(self, tokens: Tensor, phases: tuple[Tensor, Tensor]) -> Tensor:
+    def forward(
+        self, tokens: Tensor, phases: tuple[Tensor, Tensor], seen: Bool[Tensor, "batch frames"] | None = None
+    ) -> Tensor:
         if self.near is not None:
             tokens = tokens + self.near(tokens.transpose(1, 2)).transpose(1, 2)
         parts = self.split(self.first(tokens)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         query, key, value = parts.float().unbind()
+        mask = None if seen is None else seen[:, None, None]
         # Attention itself is slower in bfloat16 on a CPU.
         with torch.autocast(tokens.device.type, enabled=False):
             query, key = _rotate_pairs(query, phases), _rotate_pairs(key, phases)
-            mixed = functional.scaled_dot_product_attention(query, key, value)
+            mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         tokens = tokens + self.join(mixed.transpose(1, 2).flatten(2))
         return tokens + self.perceptron(self.second(tokens))
+
+
+def _make_head(width: int) -> nn.Linear:
+    """Make a layer that puts out nothing at first."""
+    head = nn.Linear(width, _OUT_ROWS)
+    nn.init.zeros_(head.weight)
+    nn.init.zeros_(head.bias)
+    return head
 
 
 def _rotary_phases(frames: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
 from mapctl.commands.train.options import ParallelOptions
+from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from priors.training.recipes.pose_transformer import PoseTransformerRecipe
@@ -23,10 +24,14 @@ class TrainPoseTransformer(ParallelOptions):
     """Layers of attention."""
     plain: bool = False
     """The plainest network of the kind, to compare: no convolutions, AdamW for all weights."""
+    two_stage: bool = False
+    """Two networks in turn after Qin et al. 2022, for gaps of up to 60 frames between whole poses alone, to compare;
+    width and layers are its own."""
 
     def recipe(self) -> "PoseTransformerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.training.recipes.pose_transformer import (
+            TWO_STAGE,
             PoseTransformerConfig,
             PoseTransformerRecipe,
             PoseTransformerSettings,
@@ -37,11 +42,14 @@ class TrainPoseTransformer(ParallelOptions):
         shape = self.select_given("width", "layers")
         if self.width is not None:
             shape["heads"] = max(1, self.width // 32)
+        if self.two_stage and (shape or self.plain):
+            raise RequestError("--two-stage has a shape of its own: leave out --width, --layers and --plain")
+        usual = TWO_STAGE if self.two_stage else (PoseTransformerConfig(), PoseTransformerSettings())
         plain = ({"kernel": 0}, {"optimiser": "adam", "learning_rate": 8e-4}) if self.plain else ({}, {})
         return PoseTransformerRecipe(
             **common,
-            config=replace(PoseTransformerConfig(), **plain[0], **shape),
-            settings=replace(PoseTransformerSettings(), bfloat16=self.bfloat16, **{**plain[1], **given}),
+            config=replace(usual[0], **plain[0], **shape),
+            settings=replace(usual[1], bfloat16=self.bfloat16, **{**plain[1], **given}),
             skip_first=self.skip_first,
             init=self.init,
             processes=self.processes,

@@ -82,6 +82,18 @@ class PoseTransformerSettings:
             raise RequestError(f"window must be at least {2 * _SHORTEST_WINDOW} frames, got {self.window}")
 
 
+TWO_STAGE = (
+    PoseTransformerConfig(width=192, layers=4, kernel=0, detail=4),
+    PoseTransformerSettings(
+        window=72,
+        parts=PartSettings(joints=0.0, keys=0.0, several=0.0, bare=0.5, context=11, open=0.0, parts=0.0, reaching=0.0),
+        variation=Variation(share=0.0),
+    ),
+)
+"""The two-stage transformer of Qin et al. 2022, of about the stitcher's weights, trained on the stitcher's question
+alone: gaps of up to 60 frames between whole poses with up to 10 frames on either side."""
+
+
 class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
     """Draws windows, hides parts of them, and brings the network nearer to proposing them."""
 
@@ -103,7 +115,7 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         weights = dict(self.network.named_parameters())
         if self.settings.optimiser == "adam":
             return {"optimiser": make_adam(weights.values(), self.learning_rate)}
-        matrices = {name for name, weight in weights.items() if name.startswith("layers.") and weight.ndim == 2}
+        matrices = {name for name, weight in weights.items() if ".layers." in f".{name}" and weight.ndim == 2}
         muon = torch.optim.Muon(
             [weights[name] for name in weights if name in matrices],
             lr=self.learning_rate,
@@ -176,6 +188,8 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
         usual, plain = PoseTransformerConfig(), self.config.kernel == 0 and self.settings.optimiser == "adam"
         words = [f"--{name} {getattr(self.config, name)}" for name in ("width", "layers")]
         changed = [getattr(self.config, name) != getattr(usual, name) for name in ("width", "layers")]
+        if self.config.detail:
+            return ["--two-stage"]
         return [word for word, told in zip(words, changed, strict=True) if told] + ["--plain"] * plain
 
     def export(self, trainer: PoseTransformerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
@@ -247,8 +261,18 @@ def compute_losses(
     count as much as a gap. They are the same however the motion is turned. Windows that interpolation nearly solves
     count for more, or the network learns to fidget where nobody moves.
     """
-    shown, known = hide(network, hidden), hidden.known
+    shown = hide(network, hidden)
     proposed = network(shown)
+    losses = _compare(proposed, truth, shown, settings)
+    if proposed.rough is not None:
+        losses["loss"] = losses["loss"] + _compare(proposed.rough, truth, shown, settings)["loss"]
+    return losses
+
+
+def _compare(
+    proposed: ProposedPoses, truth: PartialMotion, shown: PartialMotion, settings: PoseTransformerSettings
+) -> dict[str, Tensor]:
+    known = shown.known
     wanted, wanted_world = truth.world_poses()
     guess = shown.world_poses()[0]
     made, made_world = proposed.poses(truth.offsets)

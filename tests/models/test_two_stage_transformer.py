@@ -1,0 +1,102 @@
+"""The two-stage pose transformer: what the first stage looks at, and that the second corrects it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import corpus, run
+from tiny_transformer import CONFIG, card, network
+
+import priors
+from mapctl.inbetweening.partial_motion import KnownParts
+from priors import checkpoints
+from priors.pose_transformer.growing import can_grow
+from priors.pose_transformer.inbetweener import PoseTransformer
+from priors.pose_transformer.network import _Layer, _rotary_phases
+from priors.training.augmentation.pose_windows import PoseWindows, add_targets
+from priors.training.recipes.pose_transformer import TWO_STAGE, PoseTransformerSettings, compute_losses, hide
+
+TWO = replace(CONFIG, detail=2)
+
+
+def windows(count=3, frames=30):
+    drawn = PoseWindows(corpus(2, 80), kinds=(), evenness=0.0).draw(count, frames, torch.Generator().manual_seed(0))
+    return add_targets(drawn)
+
+
+def with_gap(motion, start, stop):
+    told = torch.ones(motion.heading.shape, dtype=torch.bool)
+    told[:, start:stop] = False
+    return replace(motion, known=KnownParts.whole(told))
+
+
+def test_untrained_both_stages_interpolate_and_what_is_known_stays():
+    hidden = with_gap(windows(), 10, 20)
+    untrained = network(config=TWO)
+    shown = hide(untrained, hidden)
+    proposed = untrained(shown)
+    places, guess = proposed.poses(hidden.offsets)[0], shown.world_poses()[0]
+    torch.testing.assert_close(places, guess, atol=1e-4, rtol=0)
+    torch.testing.assert_close(proposed.rough.poses(hidden.offsets)[0], guess, atol=1e-4, rtol=0)
+    drawn = network(drawn=0.2, config=TWO)
+    made = drawn(hide(drawn, hidden))
+    truth = hidden.world_poses()[0]
+    torch.testing.assert_close(made.poses(hidden.offsets)[0][:, :10], truth[:, :10], atol=1e-4, rtol=0)
+    assert float((made.poses(hidden.offsets)[0] - truth)[:, 10:20].norm(dim=-1).mean()) > 0.02
+
+
+def test_the_second_stage_adds_to_what_the_first_proposes():
+    hidden = with_gap(windows(), 10, 20)
+    # The first stage's head is drawn; the second's is still nil.
+    made = network(drawn=0.2, config=TWO)
+    proposed = made(hide(made, hidden))
+    torch.testing.assert_close(proposed.local_matrix, proposed.rough.local_matrix, atol=1e-5, rtol=0)
+    torch.testing.assert_close(proposed.root_position, proposed.rough.root_position)
+    torch.nn.init.normal_(made.detail.head.weight, std=0.2)
+    corrected = made(hide(made, hidden))
+    torch.testing.assert_close(corrected.rough.local_matrix, proposed.rough.local_matrix)
+    assert float((corrected.local_matrix - proposed.local_matrix)[:, 10:20].abs().max()) > 0.01
+
+
+def test_a_stage_that_looks_at_some_frames_learns_nothing_from_the_others():
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        layer = _Layer(replace(CONFIG, kernel=0)).requires_grad_(False)
+    tokens, phases = (
+        torch.randn(2, 12, 16, generator=torch.Generator().manual_seed(0)),
+        _rotary_phases(12, 8, torch.device("cpu")),
+    )
+    seen = torch.ones(2, 12, dtype=torch.bool)
+    seen[:, 4:8] = False
+    others = torch.where(seen[..., None], tokens, -tokens)
+    one, other = (layer(each, phases, seen)[seen] for each in (tokens, others))
+    torch.testing.assert_close(one, other)
+    assert float((layer(tokens, phases)[seen] - layer(others, phases)[seen]).abs().max()) > 1e-3
+
+
+def test_both_stages_learn():
+    made = network(config=TWO).requires_grad_(True)
+    truth = windows()
+    compute_losses(made, truth, with_gap(truth, 8, 20), PoseTransformerSettings())["loss"].backward()
+    assert all(float(head.weight.grad.abs().max()) > 0 for head in (made.head, made.detail.head))
+
+
+def test_two_stages_are_saved_and_loaded(tmp_path):
+    path = tmp_path / "two.safetensors"
+    checkpoints.save(network(drawn=0.1, config=TWO).state_dict(), card(TWO), path)
+    loaded = priors.load_inbetweener(str(path))
+    assert isinstance(loaded, PoseTransformer)
+    assert loaded.network.config == TWO
+    assert not can_grow(CONFIG, TWO)
+
+
+def test_its_weights_are_about_as_many_as_a_stitchers():
+    count = sum(weight.numel() for weight in network(config=TWO_STAGE[0]).parameters())
+    assert 3.5e6 < count < 4.5e6
+
+
+@pytest.mark.parametrize("option", [("--width", "64"), ("--layers", "2"), ("--plain",)])
+def test_a_shape_of_its_own_takes_no_other(option, tmp_path, capsys):
+    words = ["train", "pose-transformer", "--data", tmp_path, "-o", tmp_path / "run", "--two-stage", *option]
+    assert run(*words) == 2
+    assert "--two-stage has a shape of its own" in capsys.readouterr().err
