@@ -73,7 +73,7 @@ def benchmark_live(
     try:
         for process in processes:
             process.wait()
-        for now in _iterate_ticks(60 * minutes):
+        for now in iterate_ticks(60 * minutes):
             for process, log in zip(processes, logs, strict=True):
                 for delivered in process.poll():
                     log.add(delivered)
@@ -81,7 +81,7 @@ def benchmark_live(
                     log.check_command()
                     log.memory.append(process.memory_mb())
                     log.command = _sample_command(generator)
-                    log.until = now + _sample_uniform(generator, *_COMMAND_SECONDS)
+                    log.until = now + sample_uniform(generator, *_COMMAND_SECONDS)
                     process.command(log.command)
             if progress is not None:
                 progress(round(now), round(60 * minutes))
@@ -91,7 +91,7 @@ def benchmark_live(
     return _summarise_logs(logs, minutes)
 
 
-def _iterate_ticks(seconds: float) -> Iterator[float]:
+def iterate_ticks(seconds: float) -> Iterator[float]:
     began = time.perf_counter()
     while (now := time.perf_counter() - began) < seconds:
         yield now
@@ -100,10 +100,10 @@ def _iterate_ticks(seconds: float) -> Iterator[float]:
 
 def _sample_command(generator: torch.Generator) -> Command:
     speed = _SPEEDS[int(torch.randint(len(_SPEEDS), (1,), generator=generator))]
-    return Command(speed, _sample_uniform(generator, -math.pi, math.pi))
+    return Command(speed, sample_uniform(generator, -math.pi, math.pi))
 
 
-def _sample_uniform(generator: torch.Generator, low: float, high: float) -> float:
+def sample_uniform(generator: torch.Generator, low: float, high: float) -> float:
     return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 
 

@@ -6,53 +6,26 @@ prior begins, walking on or standing. The density's state is then advanced over 
 """
 
 import math
+import time
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.steering.steer import KEPT_FRAMES, Refusal, SteerFrames, SteerState, condition_prior, step
+from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
+from controllers.steering.way import LEAST_FRAMES, TransitionMaker, begin_way, commit_frames
 from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, reversed_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
-from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.problem.ledger import Ledger
-from mapctl.problem.receding_horizon import replay
 from mapctl.problem.solution import Outcome, Status
+from mapctl.runtime.stepwise import StepwiseWork
 
 _STITCHED_FRAMES = 45  # of the end of a way that is walked first
-_LEAST_FRAMES = 4
 _LEAST_SPEED = 0.3  # m/s below which nobody sets out: there is time to stand first
-_FAR = 0.3  # metres from which on the way to a place says where to face there
-_CANDIDATES = 4  # moments of the prior that are tried at the place
-_AFTER = 10  # frames of the prior's own continuation that say how motion goes on from there
-_PAST_FRAMES = 60  # that are kept for terms that look back
-
-
-@runtime_checkable
-class TransitionMaker(Protocol):
-    """Who makes the frames between two poses."""
-
-    @property
-    def longest(self) -> int:
-        """Most frames between two poses."""
-        ...
-
-    def connect(
-        self,
-        before: Float[Tensor, "before size"],
-        after: Float[Tensor, "batch after size"],
-        place: Float[Tensor, "batch 2"],
-        turn: Float[Tensor, " batch"],
-        frames: int,
-    ) -> Float[Tensor, "batch frames size"]:
-        """Make features from the frame after the last of `before` to the last of `after`, which is run backwards and
-        `frames` later: there, seen from the last of `before`, is `place`, metres, and the heading another by `turn`.
-        """
-        ...
+_PAST_FRAMES = 60  # of targets that are kept for terms that look back
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +38,20 @@ class Approach:
     """The command that is steered by, without an order: the last one, or the one before it where its order is refused.
     """
     planned: Float[Tensor, "frames size"] | None = None
-    """Features of the frames to the place that are not delivered yet, none of them once it is there; None while it is
-    walked to."""
+    """Features of the next frames to the place that are not delivered yet, none of them once it is there; None while it
+    is walked to."""
+    rest: StepwiseWork[Float[Tensor, "rest size"]] | None = None
+    """Work that makes the frames after these."""
     refused: bool = False
     """Whether the order is not obeyed."""
+
+    @property
+    def _has_planned(self) -> bool:
+        return self.planned is not None and len(self.planned) > 0
+
+    def ahead(self) -> Tensor | None:
+        """Return what is planned of the next step, if anything is."""
+        return self.rest.finish() if self.rest is not None and not self._has_planned else self.planned
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +66,13 @@ class Arriver:
     ) -> tuple[SteerState, SteerFrames]:
         """Solve or deliver the next frames, as `controllers.steering.steer.step`. A command whose order cannot be met
         is not obeyed: the one before it holds, and the frames' `refusal` says why."""
+        began = time.perf_counter()
         order, plain, refusal = command.arrival, replace(command, arrival=None), None
         approach = state.approach if isinstance(state.approach, Approach) else None
         if order is None:
             return step(replace(state, approach=Approach(None, plain)), plain, seconds=seconds)
         left, new = _arrival_frame(order) - state.frames + 1, approach is None or approach.order is not order
+        ahead = None if approach is None else approach.ahead()
         if approach is None or new:
             refusal = _refuse(state, order)
             before = approach.held if approach and refusal else plain
@@ -95,31 +80,19 @@ class Arriver:
         # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
         most = self.transitions.longest + 1 if new else _STITCHED_FRAMES
         if approach.planned is None and not approach.refused and left <= most:
-            approach = replace(approach, planned=self._plan(state, command, order, left))
+            held, rest = begin_way(self.transitions, state, command, order, left, planned=ahead)
+            approach = replace(approach, planned=held, rest=rest)
+        if approach.rest is not None and approach.planned is not None and not len(approach.planned):
+            approach = replace(approach, planned=approach.rest.finish(), rest=None)
         if approach.planned is not None and len(approach.planned):
-            return _deliver(state, approach, plain)
+            delivered = _deliver(state, approach, plain)
+            if approach.rest is not None and seconds is not None:
+                approach.rest.advance(seconds - (time.perf_counter() - began))
+            return delivered
         there = approach.refused or approach.planned is not None
         led = approach.held if there else _lead_to(state, plain, order, left)
         state, frames = step(replace(state, approach=approach), led, seconds=seconds)
         return state, replace(frames, refusal=refusal)
-
-    def _plan(self, state: SteerState, command: Command, order: Arrival, frames: int) -> Tensor:
-        """Plan the frames to a place, in the pose there to which the way is smoothest."""
-        character = state.character
-        after = _pose_candidates(state, command, order)
-        here = state.committed.place
-        place = torch.tensor(order.place, dtype=torch.float32) / character.scale
-        facing = order.facing
-        if facing is None:
-            away = place - here.position_xz
-            facing = float(here.heading) if float(away.norm()) < _FAR else math.atan2(*away.tolist())
-        seen = rotations.rotate_ground(place - here.position_xz, -here.heading)
-        turn = rotations.wrap_angle(torch.tensor(facing, dtype=torch.float32) - here.heading)
-        count = len(after)
-        ways = self.transitions.connect(
-            state.committed.features, after, seen.expand(count, -1), turn.expand(count), frames
-        )
-        return ways[int(_measure_roughness(state, ways).argmin())]
 
 
 def _arrival_frame(order: Arrival) -> int:
@@ -129,8 +102,8 @@ def _arrival_frame(order: Arrival) -> int:
 def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
     """Say why an order cannot be met; None where it can."""
     frames, scale = _arrival_frame(order) - state.frames + 1, state.character.scale
-    left, least = frames / PRIOR_FPS, _LEAST_FRAMES / PRIOR_FPS
-    if frames < _LEAST_FRAMES:
+    left, least = frames / PRIOR_FPS, LEAST_FRAMES / PRIOR_FPS
+    if frames < LEAST_FRAMES:
         reason = f"an arrival in {left:.2f} s is not obeyed: nobody comes anywhere in less than {least:.2f} s"
         return Refusal(order, reason)
     away = math.dist(order.place, (state.committed.place.position_xz * scale).tolist())
@@ -153,60 +126,18 @@ def _lead_to(state: SteerState, command: Command, order: Arrival, left: int) -> 
     return replace(command, speed=speed, heading=math.atan2(*away), facing=None, turning=None, step_length=None)
 
 
-def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Float[Tensor, "batch after size"]:
-    """Frames at the place run backwards, the pose there last: the given pose alone, or moments of the prior and how
-    motion goes on from them."""
-    if order.pose is not None:
-        pose = order.pose
-        still = Motion(
-            pose.skeleton, pose.fps, pose.root_position.expand(2, -1), pose.local_quat_xyzw.expand(2, -1, -1)
-        )
-        return encode(still)[0][:1].float()[None]
-    prior = condition_prior(state.prior, command.told) if command.told else state.prior
-    starts = prior.initial_states
-    speed = command.speed / state.character.scale
-    near = (starts.speed - speed).abs().argsort()[:_CANDIDATES]
-    begun = starts.state.pick(near)
-    noise = torch.zeros(len(near), _AFTER, LAYOUT.continuous)
-    with torch.no_grad():
-        on, _ = prior.rollout(begun, noise, prior.plan(begun, noise))
-    return reversed_features(torch.cat([begun.last_frame[:, None], on], dim=1))
-
-
-def _measure_roughness(state: SteerState, ways: Float[Tensor, "batch frames size"]) -> Float[Tensor, " batch"]:
-    """Measure the root mean square acceleration of the joints on ways from where the character is."""
-    rough = []
-    for way in ways:
-        joints = decode(way, state.committed.place, skeleton=state.character.unit_skeleton).joint_positions()
-        whole = torch.cat([state.committed.joints_world[-2:].to(joints), joints])
-        rough.append(torch.diff(whole, n=2, dim=0).square().sum(dim=-1).mean().sqrt())
-    return torch.stack(rough)
-
-
 def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[SteerState, SteerFrames]:
     """Deliver the next planned frames, and advance the density over them."""
     planned, character, committed = approach.planned, state.character, state.committed
     assert planned is not None
     new, rest = planned[: state.settings.commit], planned[state.settings.commit :]
     unit = decode(new, committed.place, skeleton=character.unit_skeleton)
-    start = GroundPose(committed.place.position_xz.double(), committed.place.heading.double())
-    ground, facing = integrate_root(new.double(), start)  # in single precision a long way would not end on the place
-    at = GroundPose(ground[-1].float(), facing[-1].float())
-    ahead = decode(rest, at, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
+    after = commit_frames(state, new)
+    ahead = decode(rest, after.place, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
     forecast = unit.joint_positions()[:0] if ahead is None else ahead
     motion = character.motion(unit)
     overlay, motion = state.overlay.pose(motion, command, forecast * character.scale)
     targets = _read_targets(new, committed.place, state.target)
-    joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
-    after = replace(
-        committed,
-        state=replay(state.prior, new, committed.state),  # pyright: ignore[reportArgumentType]
-        place=at,
-        features=torch.cat([committed.features, new]),
-        joints_world=joints[-_PAST_FRAMES:],
-        warm_start=committed.warm_start[:0],
-        forecast=None,
-    ).discard_history(KEPT_FRAMES)
     velocities = torch.tensor([target.velocity for target in targets])
     frames = SteerFrames(
         motion,

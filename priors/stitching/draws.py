@@ -8,7 +8,7 @@ import torch
 from priors.stitching.joining import Joined
 from priors.stitching.sides import Ends
 
-CHUNK = 8
+CHUNK = 16
 """Draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count."""
 _LARGEST_SEED = 2**63
 

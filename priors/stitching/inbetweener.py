@@ -1,5 +1,6 @@
 """The stitcher as an in-betweener: short gaps between whole poses, in as many ways as are drawn."""
 
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -21,7 +22,7 @@ from priors.stitching.draws import CHUNK, Draws
 from priors.stitching.joining import Joined, join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import StitcherConfig, StitcherNetwork
-from priors.stitching.sides import Ends, count_made, walk_sides
+from priors.stitching.sides import Ends, count_made, walk_sides, walk_stepwise
 
 SOURCE = "stitcher"
 """Name of the in-betweener in notes."""
@@ -78,13 +79,9 @@ class Stitcher(Inbetweener):
         return join_sides(walk_sides(self.network, ends, frames, latents))
 
     @torch.no_grad()
-    def answer(self, ends: Ends, frames: int, *, mirrored: bool = True) -> Joined:
-        """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image, or the
-        first alone, which takes half of the time."""
+    def answer(self, ends: Ends, frames: int) -> Joined:
+        """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image."""
         config, batch = self.network.config, len(ends.place)
-        if not mirrored:
-            calm = DrawnLatents.calm(config, batch, count_made(self.network, frames))
-            return join_sides(walk_sides(self.network, ends, frames, calm))
         both = Ends(
             torch.cat([ends.features, mirror_features(ends.features)], dim=1),
             torch.cat([ends.present, ends.present], dim=1),
@@ -103,10 +100,11 @@ class Stitcher(Inbetweener):
         place: Float[Tensor, "batch 2"],
         turn: Float[Tensor, " batch"],
         frames: int,
-    ) -> Float[Tensor, "batch frames size"]:
-        """Make the calm ways from the last frame of `before` to the last of `after`, which are run backwards, as
-        features from the next frame on to that one, `frames` later. Seen from the first, it is at `place`, metres, and
-        its heading another by `turn`, radians. All others of these frames say how motion came here and goes on."""
+    ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
+        """Make, a frame at a time, the calm ways from the last frame of `before` to the last of `after`, which are run
+        backwards, as features from the next frame on to that one, `frames` later. Seen from the first, it is at
+        `place`, metres, and its heading another by `turn`, radians. All others of these frames say how motion came here
+        and goes on."""
         before = before[-1 - MAX_CONTEXT :].expand(len(after), -1, -1)
         after = after[:, -1 - MAX_CONTEXT :]
         context = max(before.shape[1], after.shape[1])
@@ -115,7 +113,9 @@ class Stitcher(Inbetweener):
             lead = context - known.shape[1]
             sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
             present.append((torch.arange(context) >= lead).float().expand(len(after), -1))
-        joined = self.answer(Ends(torch.stack(sides), torch.stack(present), place, turn), frames, mirrored=False)
+        ends = Ends(torch.stack(sides), torch.stack(present), place, turn)
+        calm = DrawnLatents.calm(self.network.config, len(place), count_made(self.network, frames))
+        joined = join_sides((yield from walk_stepwise(self.network, ends, frames, calm)))
         origin = GroundPose(torch.zeros_like(place), torch.zeros_like(turn))
         first, last = _stand_at(before[:, -1], origin), _stand_at(after[:, -1], GroundPose(place, turn))
         root = torch.cat([first.root_position, joined.root_position, last.root_position], dim=1)

@@ -5,6 +5,7 @@ here with `StitcherConfig.printed`. Once they have met, each goes on towards the
 overlap. Features of the backward side are those of the motion run backwards (`mapctl.features.reversed_features`).
 """
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.kinematics.fast import compute_joints_world
+from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL
 from priors.stitching.network import POSE, Gaussian, Memory, Situation, StitcherNetwork
 
@@ -109,8 +111,13 @@ def count_made(network: StitcherNetwork, frames: int) -> int:
 
 def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Sides:
     """Walk both sides of a transition of so many frames from pose to pose until they overlap."""
+    return StepwiseWork(walk_stepwise(network, ends, frames, latents)).finish()
+
+
+def walk_stepwise(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Generator[None, None, Sides]:
+    """Walk both sides as `walk_sides`, a frame at a time."""
     made = count_made(network, frames)
-    memory, shared, at = _enter(network, ends, frames, latents)
+    memory, shared, at = yield from _enter(network, ends, frames, latents)
     walker = _Walker(network, ends, frames, latents, shared, at)
     standing, rows = _Standing(*_pick_end(ends), at, memory), []
     for step in range(made):
@@ -122,6 +129,7 @@ def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Laten
             after = after.merge(last)
             row = tuple(_take_sides(*pair) for pair in zip(row, again, strict=True))
         standing = after
+        yield
         rows.append((standing.now, row[0], standing.at.position_xz, standing.at.heading, standing.memory.phase, row[1]))
     features, logits, places, headings, phases, shares = (
         torch.stack(column, dim=2) for column in zip(*rows, strict=True)
@@ -200,7 +208,7 @@ def reverse_sense(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*bat
 
 def _enter(
     network: StitcherNetwork, ends: Ends, frames: int, latents: Latents
-) -> tuple[Memory, Float[Tensor, "batch shared"], GroundPose]:
+) -> Generator[None, None, tuple[Memory, Float[Tensor, "batch shared"], GroundPose]]:
     """Walk through the frames before each end; returns the memory there, what is shared and where the ends are."""
     context = ends.features.shape[2]
     zero = torch.zeros_like(ends.place)
@@ -226,6 +234,7 @@ def _enter(
         latent = torch.cat([shared.expand(2, -1, -1), prior.mean], dim=-1)
         after = network.decode(seen, encoded, latent, situation, memory, encoder)[2]
         memory, before = after.keep(memory, there), there
+        yield
     if context > 1:
         memory = network.begin(first).keep(memory, 1 - before)
     return memory, shared, at

@@ -138,3 +138,46 @@ def test_a_command_without_an_order_is_steered_as_ever():
     one, two = steer.step(state, AHEAD), ARRIVER(state, AHEAD)
     assert torch.equal(one[1].motion.root_position, two[1].motion.root_position)
     assert Command(1.0, 0.0).arrival is None
+
+
+def test_the_first_frames_of_a_way_are_those_that_were_forecast_and_play_while_it_is_worked_out():
+    state, _ = begun()
+    for _ in range(2):
+        state, _ = ARRIVER(state, AHEAD)
+    order = replace(AHEAD, arrival=Arrival((0.4, 0.6), state.frames / PRIOR_FPS + 0.6))
+    after, frames = ARRIVER(state, order)
+    count = state.settings.commit
+    joints = frames.motion.joint_positions()
+    torch.testing.assert_close(joints.float(), state.committed.forecast[:count], atol=1e-4, rtol=0)
+    assert after.approach.rest is not None
+
+
+def test_a_way_that_is_worked_out_in_slices_is_the_same():
+    state, _ = begun()
+    state, _ = ARRIVER(state, AHEAD)
+    order = replace(AHEAD, arrival=Arrival((0.4, 0.6), state.frames / PRIOR_FPS + 0.6))
+    found = []
+    for seconds in (None, 0.0, 0.002, 10.0):
+        now, pieces = state, []
+        for _ in range(6):
+            now, frames = ARRIVER(now, order, seconds=seconds)
+            pieces.append(frames.motion.root_position)
+        found.append(torch.cat(pieces))
+    assert all(torch.equal(found[0], other) for other in found[1:])
+
+
+def test_a_new_order_on_the_way_plays_what_was_planned_meanwhile():
+    state, _ = begun()
+    state, _ = ARRIVER(state, AHEAD)
+    first = replace(AHEAD, arrival=Arrival((0.4, 0.6), state.frames / PRIOR_FPS + 0.7))
+    for _ in range(2):
+        state, _ = ARRIVER(state, first)
+    on, undisturbed = ARRIVER(state, first)
+    place = (0.1, 0.7)
+    second = replace(AHEAD, arrival=Arrival(place, state.frames / PRIOR_FPS + 0.7))
+    now, frames = ARRIVER(state, second)
+    assert torch.equal(frames.motion.root_position, undisturbed.motion.root_position)
+    while now.approach.rest is not None or len(now.approach.planned):
+        now, frames = ARRIVER(now, second)
+    assert math.dist(frames.motion.root_position[-1, ::2].tolist(), place) < 1e-3
+    assert on.frames < now.frames

@@ -101,6 +101,10 @@ class Live(PriorTable):
     """How long each number of characters is steered."""
     characters: Annotated[str, arg(metavar="N,N,...")] = "1,2,4"
     """How many at once, one number after the other."""
+    orders: options.MaybeNumber = None
+    """Order one character to be somewhere every so many seconds instead, and measure how it obeys."""
+    stitcher: options.Name = "stitcher"
+    """Who makes the ways to these places: the bundled stitcher, or the file or run folder of a trained one."""
 
 
 @dataclass(frozen=True, kw_only=True)

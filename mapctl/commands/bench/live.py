@@ -4,23 +4,44 @@ import functools
 
 import priors
 from controllers.benchmarks.live import benchmark_live
+from controllers.benchmarks.live_orders import benchmark_orders
 from mapctl.commands.bench import Live
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 
 _MAX_MINUTES, _MAX_CHARACTERS = 24 * 60, 64
+_LEAST_ORDERS = 2.5  # seconds: the longest way to a place, and a little after it
 
 
 def run(table: Live) -> int:
     """Measure and print."""
     if not 0 < table.minutes <= _MAX_MINUTES:
         raise RequestError(f"--minutes must be more than 0 and at most a day, got {table.minutes:g}")
+    if table.orders is not None:
+        return _run_orders(table, table.orders)
     rows, load = [], functools.partial(priors.load, table.prior)
     for count in _parse_counts(table.characters):
         with show_progress(f"{count} at once") as progress:
             rows.append(benchmark_live(load, characters=count, minutes=table.minutes, progress=progress))
     return print_rows(table, rows)
+
+
+def _run_orders(table: Live, orders: float) -> int:
+    if not _LEAST_ORDERS <= orders < 60 * table.minutes:
+        raise RequestError(
+            f"--orders must be {_LEAST_ORDERS:g} seconds or more, and less than --minutes, got {orders:g}"
+        )
+    load = functools.partial(priors.load, table.prior)
+    with show_progress("orders") as progress:
+        row = benchmark_orders(
+            load,
+            functools.partial(priors.load_stitcher, table.stitcher),
+            minutes=table.minutes,
+            every=orders,
+            progress=progress,
+        )
+    return print_rows(table, [row])
 
 
 def _parse_counts(text: str) -> list[int]:

@@ -1,0 +1,33 @@
+"""Work that is done a step at a time, in between what has a deadline."""
+
+import time
+from collections.abc import Generator
+from typing import Generic, TypeVar
+
+Result = TypeVar("Result")
+
+
+class StepwiseWork(Generic[Result]):
+    """Work whose steps a generator takes; what comes of it depends on nothing but the generator."""
+
+    def __init__(self, steps: Generator[None, None, Result]):
+        self._steps = steps
+        self._result: list[Result] = []
+
+    def advance(self, seconds: float) -> None:
+        """Take steps for so long, or to the end; a step that was begun is finished."""
+        end = time.perf_counter() + seconds
+        while not self._result and time.perf_counter() < end:
+            self._step()
+
+    def finish(self) -> Result:
+        """Take all steps that are left, and return what came of them."""
+        while not self._result:
+            self._step()
+        return self._result[0]
+
+    def _step(self) -> None:
+        try:
+            next(self._steps)
+        except StopIteration as end:
+            self._result.append(end.value)

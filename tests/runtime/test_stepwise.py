@@ -1,0 +1,34 @@
+"""Work a step at a time: the same result however it is sliced."""
+
+import pytest
+
+from mapctl.runtime.stepwise import StepwiseWork
+
+
+def count_to(number, steps):
+    for step in range(number):
+        steps.append(step)
+        yield
+    return number
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 0.0, 1e-4, 10.0])
+def test_what_comes_of_it_depends_on_no_deadline(seconds):
+    steps = []
+    work = StepwiseWork(count_to(5, steps))
+    work.advance(seconds)
+    assert len(steps) == 0 if seconds <= 0 else len(steps) > 0
+    assert work.finish() == 5
+    assert work.finish() == 5
+    work.advance(1.0)
+    assert steps == list(range(5))
+
+
+def test_an_error_is_raised_where_it_happens():
+    def fail():
+        yield
+        raise ValueError("broken")
+
+    work = StepwiseWork(fail())
+    with pytest.raises(ValueError, match="broken"):
+        work.finish()
