@@ -8,6 +8,7 @@ import tiny_stitcher
 import tiny_transformer
 from helpers import run, walk
 from tiny_infiller import save_tiny_infiller
+from tiny_prior import save_tiny_prior
 
 from mapctl import retarget
 from priors import checkpoints
@@ -71,6 +72,25 @@ def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
         assert by[f"{name}, best of 8 by truth"]["l2p"] <= by[f"{name}, one draw"]["l2p"]
         assert by[f"{name}, one draw"]["spread_cm"] > 0
         assert by[f"{name}, calm, raw"]["apart_cm"] > 0
+
+
+def test_with_a_density_there_are_its_rollouts_and_the_best_draw_by_its_energy(folder, capsys):
+    held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
+    names = []
+    for number in range(2):
+        network = tiny_stitcher.network(config=LONG, seed=number)
+        card = replace(tiny_stitcher.card(LONG), data={"held_out": held})
+        checkpoints.save(network.state_dict(), card, folder / f"stitch-{number}.safetensors")
+        names.append(str(folder / f"stitch-{number}.safetensors"))
+    prior = save_tiny_prior(folder / "prior.safetensors")
+    words = ("--count", "1", "--past", "1", "--raw", "--stitcher", ",".join(names), "--prior", prior)
+    rows = measure(folder, capsys, *words)
+    methods = {row["method"] for row in rows}
+    assert {"rollouts", *(f"{name}, best of 8 by {which}" for name in names for which in ("truth", "energy"))} < methods
+    by = {row["method"]: row for row in rows if row["frames"] == 15 and row["kind"] == "mean of kinds"}
+    for name in names:
+        nearest, likeliest = (by[f"{name}, best of 8 by {which}"]["l2p"] for which in ("truth", "energy"))
+        assert nearest <= likeliest
 
 
 def test_a_stitcher_that_saw_the_clips_is_refused(folder, capsys):

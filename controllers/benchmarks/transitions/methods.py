@@ -5,11 +5,16 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from controllers.common.score import score
 from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.inbetweening.refine import INFILL_REFINEMENT
+from mapctl.contacts import detect_contacts
+from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.retrieval import MotionCollection, bend_to_ends
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
+from mapctl.skeleton import CANONICAL, TOES
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +31,8 @@ Method = Callable[[Motion, int, int], Filled]
 """Fills frames start to stop of a canonical motion, whose values there are the truth and must not be looked at."""
 Sampler = Callable[[Motion, int, int, int], Sequence[Filled]]
 """Fills them in as many ways as are asked for."""
+Energy = Callable[[Motion], float]
+"""Energy of a motion, nats a frame."""
 
 
 def of_inbetweener(inbetweener: Inbetweener, densities: Sequence[Density] = (), *, finish: bool = True) -> Method:
@@ -49,6 +56,17 @@ def of_draws(number: Callable[[int], Inbetweener], *, finish: bool = False) -> S
         return [of_inbetweener(number(each), finish=finish)(part, start, stop) for each in range(count)]
 
     return sampler
+
+
+def of_density(density: Density) -> Energy:
+    """Return the energy by which `mapctl tween --best-of` picks: under a density, with footing, clearance and jerk."""
+
+    def measure(motion: Motion) -> float:
+        planted = detect_contacts(motion.joint_positions()[:, CANONICAL.indices(TOES)], PRIOR_FPS)
+        ledger = score(motion, planted, density, INFILL_REFINEMENT)
+        return sum(float(entry.energy.mean()) for entry in ledger.entries)
+
+    return measure
 
 
 def hold_last_pose(part: Motion, start: int, stop: int) -> Filled:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
-from controllers.benchmarks.transitions.methods import Filled, Method, Sampler
+from controllers.benchmarks.transitions.methods import Energy, Filled, Method, Sampler
 from controllers.benchmarks.transitions.twins import measure_twins
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics import body, feet, transitions, worst_frame
@@ -74,6 +74,7 @@ def benchmark_transitions(
     std: Float[Tensor, "joints 3"],
     baseline: str,
     samplers: Mapping[str, Sampler] | None = None,
+    energy: Energy | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Measure every method by kind of clip and length of gap; clips are canonical, of canonical bones, at PRIOR_FPS.
@@ -84,10 +85,11 @@ def benchmark_transitions(
     frames from mocap; milliseconds for each filled frame.
 
     Of `samplers` there are two rows: the first of DRAWS answers, with the distance of all of them from each other
-    (beside mocap's, that of its twins: `measure_twins`), and the one of them that is nearest to the truth.
+    (beside mocap's, that of its twins: `measure_twins`), and the one of them that is nearest to the truth; with
+    `energy` a third, the one that has the least of it.
     """
     samplers, rows = samplers or {}, []
-    names = [*methods, *(name for sampler in samplers for name in _name_draws(sampler))]
+    names = [*methods, *(name for sampler in samplers for name in _name_draws(sampler, energy))]
     total = len(LENGTHS) * len(kinds) * (len(methods) + len(samplers))
     done = 0
     for length in LENGTHS:
@@ -103,7 +105,7 @@ def benchmark_transitions(
             made = [_Made("mocap", truth, {**_measure_motion(truth), **twins})]
             for task in (
                 *(partial(_run_method, name, method) for name, method in methods.items()),
-                *(partial(_run_sampler, name, sampler) for name, sampler in samplers.items()),
+                *(partial(_run_sampler, name, sampler, energy) for name, sampler in samplers.items()),
             ):
                 made += task(gaps, std)
                 done += 1
@@ -135,7 +137,7 @@ def _run_method(name: str, method: Method, gaps: Sequence[_Gap], std: Tensor) ->
     return [_Made(name, motions, {**_compare(motions, gaps, std), **_measure_motion(motions), **cost, **_tell(filled)})]
 
 
-def _run_sampler(name: str, sampler: Sampler, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
+def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
     began = time.process_time()
     draws = [sampler(gap.part, gap.start, gap.stop, DRAWS) for gap in gaps]
     cost = _count_ms(began, gaps)
@@ -145,15 +147,20 @@ def _run_sampler(name: str, sampler: Sampler, gaps: Sequence[_Gap], std: Tensor)
     spread = {key: sum(each[key] for each in spreads) / len(spreads) for key in spreads[0]}
     one = [each[0] for each in motions]
     best = [_pick_nearest(each, gap, std) for each, gap in zip(motions, gaps, strict=True)]
-    first, nearest = _name_draws(name)
-    return [
+    first, nearest, *likeliest = _name_draws(name, energy)
+    made = [
         _Made(first, one, {**_compare(one, gaps, std), **_measure_motion(one), **cost, **_tell(firsts), **spread}),
         _Made(nearest, best, {**_compare(best, gaps, std), **_measure_motion(best)}),
     ]
+    if energy is not None:
+        least = [min(each, key=energy) for each in motions]
+        made.append(_Made(likeliest[0], least, {**_compare(least, gaps, std), **_measure_motion(least)}))
+    return made
 
 
-def _name_draws(sampler: str) -> tuple[str, str]:
-    return f"{sampler}, one draw", f"{sampler}, best of {DRAWS} by truth"
+def _name_draws(sampler: str, energy: Energy | None) -> list[str]:
+    names = [f"{sampler}, one draw", f"{sampler}, best of {DRAWS} by truth"]
+    return names if energy is None else [*names, f"{sampler}, best of {DRAWS} by energy"]
 
 
 def _count_ms(began: float, gaps: Sequence[_Gap]) -> Row:
@@ -281,3 +288,4 @@ def _add_realism(rows: list[Row], made: Mapping[str, Sequence[Tensor]]) -> None:
                 made[row["method"]], mocap, generator=torch.Generator().manual_seed(0), settings=_REALISM
             )
             row |= {"told_apart": found.accuracy, "mocap_told_apart": found.floor_accuracy, "frechet": found.frechet}
+            row |= {"mocap_frechet": found.floor_frechet}

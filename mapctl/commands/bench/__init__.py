@@ -229,8 +229,11 @@ class Transitions(Table):
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
     """Other in-betweeners to compare, bundled or trained."""
     stitcher: str = ""
-    """A stitcher, by file or run folder: its calm answer, one draw and the best of 8 by the truth, beside 8 of
-    retrieval's, and how far they are from each other, beside mocap's twins."""
+    """Stitchers, bundled, by file or run folder, with commas between: calm answer, one draw and the best of 8 by the
+    truth, beside 8 of retrieval's, and how far they are from each other, beside mocap's twins."""
+    prior: options.MaybeName = None
+    """A density, bundled or trained: its rollouts too, and the best of 8 by the energy that --best-of picks by. Takes a
+    second a gap."""
     raw: bool = False
     """Leave out the rows that a MAP stage finishes."""
     auto: bool = False

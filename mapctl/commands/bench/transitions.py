@@ -15,11 +15,12 @@ from controllers.benchmarks.transitions import (
     benchmark_transitions,
     draw_retrieved,
     hold_last_pose,
+    of_density,
     of_draws,
     of_inbetweener,
     of_retrieval,
 )
-from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from mapctl.commands.bench import Transitions
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
@@ -57,10 +58,15 @@ def run(table: Transitions) -> int:
     if table.auto:
         methods["auto"] = of_inbetweener(AutoInbetweener(network, priors.load_choice("auto")))
     samplers: dict[str, Sampler] = {}
-    if table.stitcher:
-        stitcher = _load_unseeing(table.stitcher, held_out)
-        methods |= _name_methods(f"{table.stitcher}, calm", stitcher, raw=table.raw)
-        samplers = {table.stitcher: of_draws(stitcher.drawing().numbered), "retrieval": draw_retrieved(collection)}
+    for name in filter(None, table.stitcher.split(",")):
+        stitcher = _load_unseeing(name, held_out)
+        methods |= _name_methods(f"{name}, calm", stitcher, raw=table.raw)
+        samplers[name] = of_draws(stitcher.drawing().numbered)
+    if samplers:
+        samplers["retrieval"] = draw_retrieved(collection)
+    density = None if table.prior is None else priors.load(table.prior)
+    if density is not None:
+        methods["rollouts"] = of_inbetweener(RolloutInbetweener([density], network), finish=False)
     past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:
         rows = benchmark_transitions(
@@ -70,6 +76,7 @@ def run(table: Transitions) -> int:
             std=compute_position_std(train),
             baseline="slerp",
             samplers=samplers,
+            energy=None if density is None else of_density(density),
             progress=progress,
         )
     return print_rows(table, rows)
