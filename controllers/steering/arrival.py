@@ -87,7 +87,7 @@ class Arriver:
         if approach.planned is not None and len(approach.planned):
             delivered = _deliver(state, approach, plain)
             if approach.rest is not None and seconds is not None:
-                approach.rest.advance(seconds - (time.perf_counter() - began))
+                approach.rest.proceed(seconds - (time.perf_counter() - began))
             return delivered
         there = approach.refused or approach.planned is not None
         led = approach.held if there else _lead_to(state, plain, order, left)

@@ -14,7 +14,7 @@ class StepwiseWork(Generic[Result]):
         self._steps = steps
         self._result: list[Result] = []
 
-    def advance(self, seconds: float) -> None:
+    def proceed(self, seconds: float) -> None:
         """Take steps for so long, or to the end; a step that was begun is finished."""
         end = time.perf_counter() + seconds
         while not self._result and time.perf_counter() < end:

@@ -52,9 +52,11 @@ class Stitcher(Inbetweener):
         """Frames of the longest gap that it fills."""
         return self.network.config.longest - 1
 
-    def drawing(self, seed: int = 0, temperature: float = 1.0) -> "Stitcher":
-        """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others."""
-        return replace(self, draws=Draws(seed, temperature), number=0)
+    def drawing(self, seed: int = 0, temperature: float | None = None) -> "Stitcher":
+        """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others. The
+        `temperature`, the standard deviation of the noise, is that of the weights unless it is given; a higher one
+        makes draws differ more, and come less near to what is likely."""
+        return replace(self, draws=Draws(seed, self._pick_temperature(temperature)), number=0)
 
     def numbered(self, number: int) -> "Stitcher":
         """Return the in-betweener that proposes the draw of a number, from 0 on."""
@@ -62,19 +64,22 @@ class Stitcher(Inbetweener):
 
     @torch.no_grad()
     def draw(
-        self, ends: Ends, frames: int, *, count: int, generator: torch.Generator, temperature: float = 1.0
+        self, ends: Ends, frames: int, *, count: int, generator: torch.Generator, temperature: float | None = None
     ) -> Joined:
         """Draw so many answers to one pair of poses, `frames` from the one to the other; the first ones do not depend
-        on the count."""
-        rows = [self._draw_chunk(ends, frames, generator, temperature) for _ in range(-(-count // CHUNK))]
+        on the count. The `temperature` is as `drawing` takes it."""
+        heat = self._pick_temperature(temperature)
+        rows = [self._draw_chunk(ends, frames, generator, heat) for _ in range(-(-count // CHUNK))]
         return Joined(
             *(torch.cat([getattr(row, name) for row in rows])[:count] for name in Joined.__dataclass_fields__)
         )
 
+    def _pick_temperature(self, temperature: float | None) -> float:
+        return float(self.network.temperature) if temperature is None else temperature
+
     def _draw_chunk(self, ends: Ends, frames: int, generator: torch.Generator, temperature: float) -> Joined:
         config, made = self.network.config, count_made(self.network, frames)
-        latents = DrawnLatents.sample(config, CHUNK, made, generator)
-        latents = DrawnLatents(temperature * latents.shared, temperature * latents.slow)
+        latents = DrawnLatents.sample(config, CHUNK, made, generator).scale(temperature)
         ends = _repeat(ends, CHUNK)
         return join_sides(walk_sides(self.network, ends, frames, latents))
 

@@ -37,6 +37,10 @@ class DrawnLatents:
         drawn = (~rows).float()
         return DrawnLatents(self.shared * drawn[:, None], self.slow * drawn[:, None, None])
 
+    def scale(self, temperature: float) -> "DrawnLatents":
+        """Return the same with noise of another standard deviation."""
+        return DrawnLatents(temperature * self.shared, temperature * self.slow)
+
     def rows(self, index: Int[Tensor, " rows"]) -> "DrawnLatents":
         """Return some rows."""
         return DrawnLatents(self.shared[index], self.slow[:, index])

@@ -6,8 +6,8 @@ by the phase makes the next frame. Departures from what is printed; with `Stitch
 
 - The paper's encoder sees the two frames and never what comes between, so that its latent can tell nothing of it. Here
   a posterior, in training alone, sees the true in-between, and the paper's encoder is the prior that it is held to.
-- Half of the latent belongs to the whole transition and is the same for both sides, so that they agree on which foot
-  goes first by construction; the other half, a frame's, changes slowly.
+- Most of the latent belongs to the whole transition and is the same for both sides, so that they agree on which foot
+  goes first by construction; the rest, a frame's, changes slowly.
 - What the network makes is added to a step between the one that led to the frame, where that is known, and the one that
   would lead to the target at an even pace. Untrained, it interpolates bare poses.
 - The decoder is given the offset and the encoder's output too, not the embeddings and the latent alone; the experts
@@ -54,11 +54,11 @@ class StitcherConfig(NetworkConfig):
     """Layers of the encoders of state, offset and target; the last is even."""
     encoder: int = 192
     """Width of the encoder LSTM."""
-    head: int = 176
+    head: int = 128
     """Width of the layer before the distributions."""
-    shared: int = 8
+    shared: int = 16
     """Numbers of the latent that both sides share over a transition."""
-    own: int = 8
+    own: int = 4
     """Numbers of the latent of each frame."""
     decoder: int = 256
     """Width of the decoder LSTM."""
@@ -182,6 +182,7 @@ class StitcherNetwork(nn.Module):
     mean: Tensor
     std: Tensor
     change: Tensor
+    temperature: Tensor
     waves: Tensor
 
     def __init__(self, config: StitcherConfig):
@@ -216,6 +217,7 @@ class StitcherNetwork(nn.Module):
         self.register_buffer("mean", torch.zeros(LAYOUT.size))
         self.register_buffer("std", torch.ones(LAYOUT.size))
         self.register_buffer("change", torch.ones(LAYOUT.size))
+        self.register_buffer("temperature", torch.ones(()))  # standard deviation of the noise of draws
         waves = _WAVE_BASE ** (-torch.arange(0, last, 2) / last)
         self.register_buffer("waves", waves, persistent=False)
 

@@ -16,11 +16,11 @@ def count_to(number, steps):
 def test_what_comes_of_it_depends_on_no_deadline(seconds):
     steps = []
     work = StepwiseWork(count_to(5, steps))
-    work.advance(seconds)
+    work.proceed(seconds)
     assert len(steps) == 0 if seconds <= 0 else len(steps) > 0
     assert work.finish() == 5
     assert work.finish() == 5
-    work.advance(1.0)
+    work.proceed(1.0)
     assert steps == list(range(5))
 
 

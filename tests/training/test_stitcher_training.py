@@ -2,16 +2,19 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tiny_stitcher
 import torch
-from helpers import corpus
+from helpers import corpus, write_corpus
 
+import priors
 from mapctl.errors import RequestError
 from mapctl.rotations import rotate_ground
+from priors.stitching.joining import join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import POSE
-from priors.stitching.sides import Ends, Sides, walk_sides
+from priors.stitching.sides import Ends, Sides, count_made, walk_sides
 from priors.training.adversaries.sliding_windows import (
     LONG,
     SHORT,
@@ -21,10 +24,13 @@ from priors.training.adversaries.sliding_windows import (
     compute_slope,
 )
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
-from priors.training.recipes.stitcher import PAPER, StitcherSettings, StitcherTrainer
+from priors.training.quality.stitcher import TEMPERATURES, calibrate_temperature, place
+from priors.training.recipes import stitcher as recipe_module
+from priors.training.recipes.stitcher import PAPER, StitcherRecipe, StitcherSettings, StitcherTrainer
 from priors.training.recipes.stitcher_critics import CriticSettings, show_sides, show_truth
 from priors.training.recipes.stitcher_latents import TRIES, sample_nearest
-from priors.training.recipes.stitcher_losses import Shares, find_stitcher_losses
+from priors.training.recipes.stitcher_losses import Shares, find_stitcher_losses, interpolate
+from priors.training.run import train
 
 SETTINGS = StitcherSettings(steps=10, batch=6, window=24, critics=CriticSettings(begin=0.3, head_start=2))
 
@@ -93,8 +99,8 @@ def test_the_slope_is_that_of_finite_differences():
         return sum(float(scores.detach().mean()) for scores in critics(at))
 
     slope, step = 0.0, 1e-4
-    for place in range(rows.numel()):
-        off = torch.zeros_like(rows).flatten().index_fill(0, torch.tensor([place]), step).view_as(rows)
+    for column in range(rows.numel()):
+        off = torch.zeros_like(rows).flatten().index_fill(0, torch.tensor([column]), step).view_as(rows)
         slope += ((score(rows + off) - score(rows - off)) / (2 * step)) ** 2
     assert float(compute_slope(critics, rows).detach()) == pytest.approx(slope, rel=1e-3)
 
@@ -236,6 +242,33 @@ def test_as_printed_training_makes_errors_smaller():
     for _ in range(8):
         trainer.train_step()
     assert measure() < before
+
+
+def test_the_temperature_is_the_largest_at_which_the_best_draw_is_as_near_as_any():
+    """By numpy, of answers that are drawn and placed anew, in the one gap that these clips have room for."""
+    network = tiny_stitcher.network(drawn=0.3)
+    windows = TransitionWindows(corpus(2, 60), kinds=(), evenness=0.0)
+    found = calibrate_temperature(network, windows)
+    truth = windows.draw(96, 16, BARE, torch.Generator().manual_seed(15))
+    places = interpolate(truth)[0].joints_world()[:, :-1].numpy()
+    made, scores = count_made(network, 16), {}
+    for temperature in TEMPERATURES:
+        draws, generator = [], torch.Generator().manual_seed(0)
+        for _ in range(8):
+            noise = DrawnLatents.sample(network.config, 96, made, generator)
+            scaled = DrawnLatents(temperature * noise.shared, temperature * noise.slow)
+            draws.append(place(join_sides(walk_sides(network, truth.ends(), 16, scaled))).numpy())
+        away = np.stack([np.linalg.norm(draw - places, axis=-1).mean(axis=(1, 2)) for draw in draws])
+        scores[temperature] = away.min(axis=0).mean()
+    assert found == max(each for each, score in scores.items() if score <= 1.01 * min(scores.values()))
+
+
+def test_a_run_writes_the_temperature_that_it_finds(tmp_path, monkeypatch):
+    monkeypatch.setattr(recipe_module, "calibrate_temperature", lambda network, windows: 2.5)
+    data = write_corpus(tmp_path / "data")
+    settings = replace(SETTINGS, steps=2)
+    train(StitcherRecipe(data, tmp_path / "run", config=tiny_stitcher.CONFIG, settings=settings))
+    assert float(priors.load_stitcher(str(tmp_path / "run")).network.temperature) == 2.5
 
 
 @pytest.mark.parametrize("shares", [Shares(-0.1, 0.5, 0.2), Shares(0.6, 0.4, 0.1), Shares(0.0, 0.0, 0.0)])

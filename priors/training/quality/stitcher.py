@@ -18,8 +18,11 @@ from priors.training.recipes.stitcher_losses import interpolate
 
 VALIDATED_GAPS = (5, 15, 30, 45)
 """Frames between the two poses."""
+TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
+"""Of draws, that are tried."""
 _WINDOWS, _DRAWS = 96, 8
 _DRAWN_GAP = 30
+_AS_NEAR = 1.01  # of the least error of the best draw
 _ACTIVE = 0.01  # variance of a posterior's mean from which on a dimension is in use
 
 
@@ -38,7 +41,7 @@ def measure_transitions(
     row: dict[str, float] = {}
     for name, known in (("bare", Known()), ("past", Known(before=10))):
         for gap in VALIDATED_GAPS:
-            if gap + 13 > max(windows.picker.lengths.tolist()) or gap + 1 > network.config.longest:
+            if not _has_room(network, windows, gap):
                 continue
             truth = windows.draw(_WINDOWS, gap + 1, known, torch.Generator().manual_seed(gap))
             places, guess = _true_places(truth)
@@ -50,6 +53,24 @@ def measure_transitions(
             if known == Known() and gap == _DRAWN_GAP:
                 row |= _measure_draws(network, posterior, truth, places)
     return row
+
+
+@torch.no_grad()
+def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) -> float:
+    """Return the largest standard deviation of draws' noise with which the best of eight still comes as near to the
+    truth as with any, within a hundredth: as different as can be without wandering off. In gaps between bare poses,
+    which count by their calm answer's error."""
+    scores = torch.zeros(len(TEMPERATURES))
+    for gap in VALIDATED_GAPS[1:]:
+        if not _has_room(network, windows, gap):
+            continue
+        truth = windows.draw(_WINDOWS, gap + 1, Known(), torch.Generator().manual_seed(gap))
+        places = _true_places(truth)[0]
+        unit = (place(answer(network, truth, make_calm(network, truth))) - places).norm(dim=-1).mean()
+        for number, temperature in enumerate(TEMPERATURES):
+            errors = (_draw(network, truth, temperature) - places).norm(dim=-1).mean(dim=(2, 3))
+            scores[number] += errors.amin(dim=0).mean() / unit
+    return TEMPERATURES[int((scores <= _AS_NEAR * scores.min()).nonzero().max())]
 
 
 def answer(network: StitcherNetwork, truth: Transition, latents: Latents) -> Joined:
@@ -78,23 +99,15 @@ def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
 def _measure_draws(
     network: StitcherNetwork, posterior: PosteriorNetwork | None, truth: Transition, places: Tensor
 ) -> dict[str, float]:
-    generator = torch.Generator().manual_seed(0)
-    batch, made = len(truth.features), count_made(network, truth.frames)
     calm = place(answer(network, truth, make_calm(network, truth)))
-    draws = torch.stack(
-        [
-            place(answer(network, truth, DrawnLatents.sample(network.config, batch, made, generator)))
-            for _ in range(_DRAWS)
-        ]
-    )
+    draws = _draw(network, truth, float(network.temperature))
     errors = (draws - places).norm(dim=-1).mean(dim=(2, 3))
-    pairs = [(a - b).norm(dim=-1).mean() for n, a in enumerate(draws) for b in draws[:n]]
     shares = walk_sides(network, truth.ends(), truth.frames, make_calm(network, truth)).shares
     return {
         "calm_cm": 100 * float((calm - places).norm(dim=-1).mean()),
         "draw_cm": 100 * float(errors[0].mean()),
         "best_cm": 100 * float(errors.amin(dim=0).mean()),
-        "spread_cm": 100 * float(torch.stack(pairs).mean()),
+        "spread_cm": 100 * float(_measure_spread(draws)),
         "jitter": float(_measure_acceleration(draws[0]) / _measure_acceleration(places)),
         "calm_jitter": float(_measure_acceleration(calm) / _measure_acceleration(places)),
         "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
@@ -116,6 +129,25 @@ def _measure_posterior(
         "shared_nats": float(latents.count_nats()[0].sum(dim=1).mean()),
         "own_nats": float(latents.count_nats()[1].sum(dim=1).mean()),
     }
+
+
+def _has_room(network: StitcherNetwork, windows: TransitionWindows, gap: int) -> bool:
+    return gap + 13 <= max(windows.picker.lengths.tolist()) and gap + 1 <= network.config.longest
+
+
+def _draw(
+    network: StitcherNetwork, truth: Transition, temperature: float
+) -> Float[Tensor, "draws batch frames joints 3"]:
+    """Draw answers; those of one temperature have the noise of those of another, scaled."""
+    generator, batch, made = torch.Generator().manual_seed(0), len(truth.features), count_made(network, truth.frames)
+    latents = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
+    return torch.stack([place(answer(network, truth, each.scale(temperature))) for each in latents])
+
+
+def _measure_spread(draws: Float[Tensor, "draws batch frames joints 3"]) -> Tensor:
+    """Mean distance of draws from each other."""
+    pairs = [(one - other).norm(dim=-1).mean() for number, one in enumerate(draws) for other in draws[:number]]
+    return torch.stack(pairs).mean()
 
 
 def _measure_acceleration(places: Float[Tensor, "batch frames joints 3"]) -> Tensor:

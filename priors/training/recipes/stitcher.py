@@ -17,7 +17,7 @@ from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.corpus import Corpus, Split
-from priors.training.quality.stitcher import measure_transitions
+from priors.training.quality.stitcher import calibrate_temperature, measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
 from priors.training.recipes.stitcher_critics import CriticSettings, StitcherCritics
 from priors.training.recipes.stitcher_losses import LossWeights, Shares, find_stitcher_losses
@@ -218,7 +218,9 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
         return trainer
 
     def export(self, trainer: StitcherTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """What is written at the end: the average of the weights."""
+        """What is written at the end: the average of the weights, and how wide its draws are."""
+        windows = TransitionWindows(gathered.parts.validation, kinds=self.settings.kinds, evenness=1.0)
+        trainer.average.temperature.fill_(calibrate_temperature(trainer.average, windows))
         return replace(super().export(trainer, gathered, curve), tensors=trainer.average.state_dict())
 
     def format_shape(self) -> list[str]:
