@@ -24,6 +24,7 @@ _SPEEDS = (0.7, 1.5)  # m/s, of the ways and of the walks after them
 _WITHIN = (1.0, 1.8)  # seconds
 _AHEAD = math.radians(60)  # to either side of where it goes
 _SPEED_TOLERANCE, _SPEED_TOLERANCE_SHARE = 0.3, 0.25  # m/s or share of the speed, the larger of the two
+_MEASURED = ("seen_s", "off_s", "place_cm", "facing_deg")
 _EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
 
 
@@ -53,7 +54,8 @@ class _Order:
         facing = float(rotations.split_heading(torch.from_numpy(last.quats[-1:, 0]))[0])
         return {
             "seen_s": self.chunks[1].due - self.sent,
-            "off_s": end - first.due - self.within,
+            # Counted from when it was asked, one step before its first frames are due.
+            "off_s": end - (first.due - len(first.root) / PRIOR_FPS + self.within) - 1 / PRIOR_FPS,
             "place_cm": 100 * math.dist(last.root[-1, ::2].tolist(), self.place),
             "facing_deg": math.degrees(abs(math.remainder(facing - self.facing, 2 * math.pi))),
         }
@@ -140,10 +142,7 @@ def _summarise(log: _Log, minutes: float) -> Row:
         "carried_out": len(done),
         "frames": len(root),
         "late_frames": sum(chunk.late_frames for chunk in log.chunks if chunk.seconds > 1.0),
-        "seen_s_most": max(each["seen_s"] for each in done),
-        "off_s_most": max(abs(each["off_s"]) for each in done),
-        "place_cm_most": max(each["place_cm"] for each in done),
-        "facing_deg_most": max(each["facing_deg"] for each in done),
+        **{f"{name}_most": max((abs(each[name]) for each in done), default=math.nan) for name in _MEASURED},
         "speeds_reached": sum(log.speeds),
         "step_cm": 100 * peaks.step,
         "acceleration_m_s2": peaks.acceleration,

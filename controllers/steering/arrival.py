@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
-from controllers.steering.way import LEAST_FRAMES, TransitionMaker, begin_way, commit_frames
+from controllers.steering.way import LEAST_FRAMES, TransitionMaker, begin_way, commit_frames, needed_speed
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
@@ -72,7 +72,7 @@ class Arriver:
         if order is None:
             return step(replace(state, approach=Approach(None, plain)), plain, seconds=seconds)
         left, new = _arrival_frame(order) - state.frames + 1, approach is None or approach.order is not order
-        ahead = None if approach is None else approach.ahead()
+        old = approach
         if approach is None or new:
             refusal = _refuse(state, order)
             before = approach.held if approach and refusal else plain
@@ -80,7 +80,8 @@ class Arriver:
         # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
         most = self.transitions.longest + 1 if new else _STITCHED_FRAMES
         if approach.planned is None and not approach.refused and left <= most:
-            held, rest = begin_way(self.transitions, state, command, order, left, planned=ahead)
+            ahead, told = (None, plain.told) if old is None else (old.ahead(), old.held.told)
+            held, rest = begin_way(self.transitions, state, command, order, left, planned=ahead, told=told)
             approach = replace(approach, planned=held, rest=rest)
         if approach.rest is not None and approach.planned is not None and not len(approach.planned):
             approach = replace(approach, planned=approach.rest.finish(), rest=None)
@@ -106,12 +107,12 @@ def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
     if frames < LEAST_FRAMES:
         reason = f"an arrival in {left:.2f} s is not obeyed: nobody comes anywhere in less than {least:.2f} s"
         return Refusal(order, reason)
-    away = math.dist(order.place, (state.committed.place.position_xz * scale).tolist())
-    fastest = state.prior.limits.max_steering_speed * scale
-    if away / left <= fastest:
+    needs, fastest = needed_speed(state, order, frames) * scale, state.prior.limits.max_steering_speed * scale
+    if needs <= fastest:
         return None
+    away = needs * left
     where = f"{order.place[0]:.2f}, {order.place[1]:.2f} m, {away:.1f} m away"
-    needed = f"it needs {away / left:.1f} m/s, and {fastest:.1f} m/s is the fastest"
+    needed = f"it needs {needs:.1f} m/s, and {fastest:.1f} m/s is the fastest"
     return Refusal(order, f"an arrival at {where}, in {left:.1f} s is not obeyed: {needed}")
 
 

@@ -1,7 +1,7 @@
 """The way to a place: frames that were forecast play while it is worked out, a frame at a time between deadlines."""
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from controllers.steering.steer import KEPT_FRAMES, SteerState, condition_prior
 from mapctl import rotations
-from mapctl.features import LAYOUT, GroundPose, encode, integrate_root, reversed_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, reversed_features
 from mapctl.intent.steering import Arrival, Command
 from mapctl.motion import Motion
 from mapctl.pose import decode
@@ -57,18 +57,22 @@ def begin_way(
     frames: int,
     *,
     planned: Float[Tensor, "ahead size"] | None = None,
+    told: Sequence[str] = (),
 ) -> tuple[Float[Tensor, "held size"], StepwiseWork[Float[Tensor, "rest size"]]]:
     """Begin the way to a place, so many frames away: return features of the first frames, which play meanwhile, and
     the work that makes the others.
 
-    The first are those of the next step as they were `planned` before, or else as the last window forecast them; there
-    are none where nothing is forecast, or no time is left.
+    The first are those of the next step as they were `planned` before, or else as the last window forecast them under
+    the labels that were `told`; there are none where nothing is forecast, and where no time is left for the rest of the
+    way after them.
     """
-    ahead = _forecast(state) if planned is None or not len(planned) else planned
+    ahead = _forecast(state, told) if planned is None or not len(planned) else planned
     held = ahead[: state.settings.commit]
     if frames - len(held) < LEAST_FRAMES:
         held = held[:0]
     there = replace(state, committed=commit_frames(state, held)) if len(held) else state
+    if len(held) and needed_speed(there, order, frames - len(held)) > state.prior.limits.max_steering_speed:
+        there, held = state, held[:0]
     return held, StepwiseWork(_plan(transitions, there, command, order, frames - len(held)))
 
 
@@ -90,11 +94,17 @@ def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> Commi
     ).discard_history(KEPT_FRAMES)
 
 
+def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
+    """Return the mean speed that a place needs, m/s of a body of unit size."""
+    here = state.committed.place.position_xz * state.character.scale
+    return math.dist(order.place, here.tolist()) / state.character.scale * PRIOR_FPS / frames
+
+
 @torch.no_grad()
-def _forecast(state: SteerState) -> Float[Tensor, "ahead size"]:
-    """Roll out what the last window found for the frames that come next."""
-    committed, prior = state.committed, state.prior
-    noise = committed.warm_start[None]
+def _forecast(state: SteerState, told: Sequence[str]) -> Float[Tensor, "ahead size"]:
+    """Roll out what the last window found for the next step, under the labels that were told then."""
+    committed, prior = state.committed, condition_prior(state.prior, tuple(told)) if told else state.prior
+    noise = committed.warm_start[None, : state.settings.commit]
     if not noise.shape[1]:
         return committed.features[:0]
     return prior.rollout(committed.state, noise, prior.plan(committed.state, noise))[0][0]  # pyright: ignore[reportArgumentType]

@@ -13,6 +13,7 @@ class StepwiseWork(Generic[Result]):
     def __init__(self, steps: Generator[None, None, Result]):
         self._steps = steps
         self._result: list[Result] = []
+        self._error: BaseException | None = None
 
     def proceed(self, seconds: float) -> None:
         """Take steps for so long, or to the end; a step that was begun is finished."""
@@ -27,7 +28,12 @@ class StepwiseWork(Generic[Result]):
         return self._result[0]
 
     def _step(self) -> None:
+        if self._error is not None:
+            raise self._error
         try:
             next(self._steps)
         except StopIteration as end:
             self._result.append(end.value)
+        except BaseException as error:  # a generator that was broken off would end with nothing
+            self._error = error
+            raise

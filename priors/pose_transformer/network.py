@@ -49,9 +49,9 @@ class PoseTransformerConfig(NetworkConfig):
     kernel: int = 5
     """Frames of each layer's convolution, one number at a time, before its attention; odd, 0 for none."""
     detail: int = 0
-    """Layers of attention of a second stage, which corrects what the first proposes; the first then looks at frames of
-    which something is known, alone (Qin et al. 2022, "Motion In-betweening via Two-stage Transformers": context and
-    detail transformer, here with this network's tokens, rotary positions and losses). 0 for none."""
+    """Layers of attention of a second stage, which corrects what the first proposes; the attention of the first is then
+    to frames alone in which a rotation, the hips' place or a target is known (context and detail transformer of Qin et
+    al. 2022, here with this network's tokens, rotary positions and losses). 0 for none."""
 
     def __post_init__(self):
         if min(self.width, self.layers, self.heads) < 1 or self.width % (2 * self.heads):
@@ -115,6 +115,7 @@ class PoseTransformerNetwork(nn.Module):
         if self.detail is None:
             return self._propose(motion, shown, self)
         seen = motion.known.rotations.any(dim=-1) | motion.known.ground | motion.known.effectors.any(dim=-1)
+        seen = seen | ~seen.any(dim=1, keepdim=True)
         rough = self._propose(motion, shown, self, seen)
         # Rotations are shown from the interpolated heading.
         hips = _about_y(-motion.heading) @ rough.local_matrix[..., 0, :, :]
@@ -193,7 +194,7 @@ class PoseTransformerNetwork(nn.Module):
         # Of hips of which either heading or tilt is known, that is kept, and the other proposed.
         turn = _heading_of(torch.where((free == faced)[..., None, None], tilt, torch.eye(3, device=tilt.device)))
         tilted = _about_y(-turn) @ tilt
-        turned = _about_y(turn) @ shown[..., 0, :, :]
+        turned = _about_y(turn - _heading_of(shown[..., 0, :, :])) @ shown[..., 0, :, :]
         hips = torch.where((free & faced)[..., None, None], tilted, tilt)
         hips = torch.where((~free & ~faced)[..., None, None], turned, hips)
         hips = torch.where((~free & faced)[..., None, None], shown[..., 0, :, :], hips)

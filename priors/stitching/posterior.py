@@ -13,7 +13,7 @@ from priors.stitching.network import SEEN_FUTURE, Gaussian, StitcherConfig
 
 _WIDTH = 128
 _MOMENTS = 8  # at which a side is looked at, its ends among them
-_LEAST_SIGMA = 0.3  # of what is shared: more than a nat and a half of each number is not told
+_LEAST_SIGMA = 0.3  # of what is shared: more than a nat and a quarter of each number is not told
 
 
 class PosteriorNetwork(nn.Module):

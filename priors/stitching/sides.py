@@ -43,10 +43,6 @@ class Ends:
         """1 where step, turn and contacts of the end are known: not of a bare pose, without a frame before it."""
         return self.present[:, :, -2] if self.present.shape[2] > 1 else torch.zeros_like(self.present[:, :, 0])
 
-    def rows(self, index: Tensor) -> "Ends":
-        """Return those of some transitions."""
-        return Ends(self.features[:, index], self.present[:, index], self.place[index], self.turn[index])
-
 
 @runtime_checkable
 class Latents(Protocol):
@@ -67,19 +63,19 @@ class Sides:
 
     frames: int
     """From one pose to the other."""
-    features: Float[Tensor, "2 batch made size"]
+    features: Float[Tensor, "sides batch made size"]
     """In each side's own sense of time; contacts are probabilities."""
-    logits: Float[Tensor, "2 batch made 2"]
+    logits: Float[Tensor, "sides batch made 2"]
     """Of the contacts."""
-    place: Float[Tensor, "2 batch made 2"]
+    place: Float[Tensor, "sides batch made 2"]
     """Of the hips over the ground, metres, seen from the first end."""
-    heading: Float[Tensor, "2 batch made"]
+    heading: Float[Tensor, "sides batch made"]
     """Of the hips, radians, likewise."""
-    phases: Float[Tensor, "2 batch made 4"]
+    phases: Float[Tensor, "sides batch made 4"]
     """Of the frames made."""
-    shares: Float[Tensor, "2 batch made experts"]
+    shares: Float[Tensor, "sides batch made experts"]
     """Of the experts."""
-    at_ends: Float[Tensor, "2 batch 4"]
+    at_ends: Float[Tensor, "sides batch 4"]
     """Phases of the ends themselves."""
     alone: bool = False
     """Whether the forward side walks the whole way, and the other counts nothing: without the bi-directional scheme."""
@@ -92,7 +88,7 @@ class Sides:
         made = self.features.shape[2]
         return self.frames - made, made
 
-    def place_joints(self) -> Float[Tensor, "2 batch made joints 3"]:
+    def place_joints(self) -> Float[Tensor, "sides batch made joints 3"]:
         """Place the joints, metres, seen from the first end."""
         shape = self.features.shape[:2]
         return compute_joints_world(

@@ -174,13 +174,17 @@ class Recipe(ABC, Generic[C, S, T]):
         """Options of the command that the network's shape needs; those that are the defaults are left out."""
         return []
 
+    def usual_settings(self) -> S:
+        """Settings of which the command needs no options."""
+        return type(self.settings)()
+
     def format_command(self) -> str:
         """What to type for the same run, for the card; options that are the defaults are left out."""
         told = [name for name in _TOLD if hasattr(self.settings, name)]
         parts = [f"mapctl train {self.kind} --data DATA -o RUN"]
         parts += [f"--match '{self.match}'"] if self.match else []
         parts += ["--skip-first"] * self.skip_first + self.format_shape()
-        return " ".join(parts + self.format_changed(type(self.settings)(), *told))
+        return " ".join(parts + self.format_changed(self.usual_settings(), *told))
 
     def format_changed(self, usual: Any, *names: str, **renamed: str) -> list[str]:
         """Options for settings that are not the `usual` ones; `renamed` are those whose option is called otherwise."""

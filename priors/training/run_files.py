@@ -95,11 +95,12 @@ def unflatten_optimiser(
     """For `load_state_dict`, from what `flatten_optimiser` gave; KeyError unless it is whole."""
     state: dict[int, dict[str, torch.Tensor]] = {}
     kept = select_prefixed(f"{prefix}.", tensors)
-    moved = int(kept.pop(_MOVED))
+    groups = optimiser.state_dict()["param_groups"]
+    everything = sum(len(group["params"]) for group in groups)
+    moved = int(kept.pop(_MOVED, everything))
     for name, tensor in kept.items():
         number, key = name.split(".", 1)
         state.setdefault(int(number), {})[key] = tensor
-    groups = optimiser.state_dict()["param_groups"]
     # Torch takes a partial state, and fails at the next step or begins anew.
     if len(state) != moved or len(set(map(frozenset, state.values()))) > 1:
         raise KeyError("the optimiser's state is not whole")

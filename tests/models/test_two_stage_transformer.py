@@ -45,8 +45,17 @@ def test_untrained_both_stages_interpolate_and_what_is_known_stays():
     assert float((made.poses(hidden.offsets)[0] - truth)[:, 10:20].norm(dim=-1).mean()) > 0.02
 
 
-def test_the_second_stage_adds_to_what_the_first_proposes():
-    hidden = with_gap(windows(), 10, 20)
+def with_tilt_alone(motion):
+    """Of hips in a gap the tilt is known, and not the heading."""
+    hidden = with_gap(motion, 10, 20)
+    rotations = hidden.known.rotations.clone()
+    rotations[:, 10:20, 0] = True
+    return replace(hidden, known=replace(hidden.known, rotations=rotations))
+
+
+@pytest.mark.parametrize("hide_parts", [lambda motion: with_gap(motion, 10, 20), with_tilt_alone])
+def test_the_second_stage_adds_to_what_the_first_proposes(hide_parts):
+    hidden = hide_parts(windows())
     # The first stage's head is drawn; the second's is still nil.
     made = network(drawn=0.2, config=TWO)
     proposed = made(hide(made, hidden))

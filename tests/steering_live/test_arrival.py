@@ -181,3 +181,19 @@ def test_a_new_order_on_the_way_plays_what_was_planned_meanwhile():
         now, frames = ARRIVER(now, second)
     assert math.dist(frames.motion.root_position[-1, ::2].tolist(), place) < 1e-3
     assert on.frames < now.frames
+
+
+def test_nobody_hurries_for_what_was_forecast():
+    """Behind the character and as fast as it can: nothing is shown first that leads the other way."""
+    state, _ = begun()
+    for _ in range(3):
+        state, _ = ARRIVER(state, AHEAD)
+    here, most = state.committed.place.position_xz.tolist(), state.prior.limits.max_steering_speed
+    frames = 8
+    place = (here[0], here[1] - 0.97 * most * frames / PRIOR_FPS)
+    order = replace(AHEAD, arrival=Arrival(place, (state.frames - 1 + frames) / PRIOR_FPS))
+    after, shown = ARRIVER(state, order)
+    assert shown.refusal is None
+    assert after.approach.rest is None  # all of it is planned already
+    speeds = torch.cat([shown.motion.root_position[:, ::2]]).diff(dim=0).norm(dim=-1) * PRIOR_FPS
+    assert float(speeds.mean()) < 2 * most

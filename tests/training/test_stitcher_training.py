@@ -1,5 +1,6 @@
 """What a stitcher is taught with: latents that come nearest, critics that join late, and processes that all learn."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,12 @@ import torch
 from helpers import corpus, write_corpus
 
 import priors
+from mapctl import cli
 from mapctl.errors import RequestError
 from mapctl.rotations import rotate_ground
 from priors.stitching.joining import join_sides
 from priors.stitching.latents import DrawnLatents
-from priors.stitching.network import POSE
+from priors.stitching.network import PARTS, POSE, Gaussian
 from priors.stitching.sides import Ends, Sides, count_made, walk_sides
 from priors.training.adversaries.sliding_windows import (
     LONG,
@@ -28,7 +30,7 @@ from priors.training.quality.stitcher import TEMPERATURES, calibrate_temperature
 from priors.training.recipes import stitcher as recipe_module
 from priors.training.recipes.stitcher import PAPER, StitcherRecipe, StitcherSettings, StitcherTrainer
 from priors.training.recipes.stitcher_critics import CriticSettings, show_sides, show_truth
-from priors.training.recipes.stitcher_latents import TRIES, sample_nearest
+from priors.training.recipes.stitcher_latents import TRIES, PrintedLatents, sample_nearest
 from priors.training.recipes.stitcher_losses import Shares, find_stitcher_losses, interpolate
 from priors.training.run import train
 
@@ -225,23 +227,44 @@ def test_as_printed_losses_count_by_what_they_are_before_training():
     assert make_trainer().untrained == {}
 
 
-def test_as_printed_training_makes_errors_smaller():
+def test_as_printed_critics_learn_from_the_first_update_on():
     trainer = make_printed()
-    first = trainer.train_step()
-    assert first["told"] == 0.5 or first["critic"] != 1.0  # the critics are there from the first step on
-    truth, shares = transitions(), trainer.settings.shares
-
-    def measure():
-        with torch.no_grad():
-            return float(find_stitcher_losses(trainer.network, None, truth, shares, 0.0, seeded())[0]["places"])
-
-    before = measure()
-    for group in trainer.optimisers()["optimiser"].param_groups:
-        group["lr"] = 3e-3
-    trainer.learning_rate = 3e-3
-    for _ in range(8):
+    before = [weight.clone() for weight in trainer.critics.network.parameters()]
+    for _ in range(3):  # the shortest transitions have no window to judge
         trainer.train_step()
-    assert measure() < before
+    assert not all(map(torch.equal, before, trainer.critics.network.parameters()))
+    assert trainer.settings.critics.ramp(0) == 1.0
+
+
+@pytest.mark.parametrize("without", [(), *((part,) for part in PARTS)])
+def test_as_printed_every_part_can_be_left_out(without):
+    config = replace(tiny_stitcher.CONFIG, shared=0, own=4, printed=True, without=without)
+    settings = replace(PAPER[1], steps=4, batch=4, window=24)
+    assert math.isfinite(StitcherTrainer(config, settings, corpus(1, 80)).train_step()["loss"])
+
+
+def test_as_printed_the_divergence_counts_the_side_that_steps():
+    latents = PrintedLatents(torch.zeros(3, 0), torch.zeros(2, 3, 4, 2))
+    far = Gaussian(torch.tensor([2.0, 4.0])[:, None, None].expand(2, 3, 2), torch.zeros(2, 3, 2))
+    for _ in range(2):
+        latents.own(far, torch.zeros(2, 3, 1), 0)
+    assert [float(each) for each in latents.nats] == [4.0, 16.0]  # half the square, of two numbers
+
+
+def test_critics_say_nothing_of_a_batch_at_the_mean():
+    trainer = make_trainer()
+    truth = transitions()
+    heard = trainer.critics.hear(follow_truth(truth, 12), truth.ends(), torch.zeros(6, dtype=torch.bool))
+    assert float(heard) == 0.0
+    assert trainer.critics.learn(truth, 1) == {}
+
+
+@pytest.mark.parametrize("words", [[], ["--paper"], ["--paper", "--steps", "12000"]])
+def test_the_command_on_the_card_is_the_one_that_was_typed(words, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("priors.training.run.train", lambda recipe, *_, **__: asked.append(recipe) or tmp_path / "x")
+    cli.main(["train", "stitcher", "--data", str(tmp_path), "-o", str(tmp_path / "run"), *words])
+    assert asked[0].format_command().split()[7:] == words
 
 
 def test_the_temperature_is_the_largest_at_which_the_best_draw_is_as_near_as_any():

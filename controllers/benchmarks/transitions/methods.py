@@ -59,7 +59,7 @@ def of_draws(number: Callable[[int], Inbetweener], *, finish: bool = False) -> S
 
 
 def of_density(density: Density) -> Energy:
-    """Return the energy by which `mapctl tween --best-of` picks: under a density, with footing, clearance and jerk."""
+    """Return the energy by which `mapctl tween --best-of` picks: likelihood, footing, clearance, support and jerk."""
 
     def measure(motion: Motion) -> float:
         planted = detect_contacts(motion.joint_positions()[:, CANONICAL.indices(TOES)], PRIOR_FPS)

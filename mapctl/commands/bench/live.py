@@ -28,10 +28,9 @@ def run(table: Live) -> int:
 
 
 def _run_orders(table: Live, orders: float) -> int:
-    if not _LEAST_ORDERS <= orders < 60 * table.minutes:
-        raise RequestError(
-            f"--orders must be {_LEAST_ORDERS:g} seconds or more, and less than --minutes, got {orders:g}"
-        )
+    if not _LEAST_ORDERS <= orders < 20 * table.minutes:
+        least = f"{_LEAST_ORDERS:g} seconds or more, and less than a third of --minutes"
+        raise RequestError(f"--orders must be {least}, got {orders:g}")
     load = functools.partial(priors.load, table.prior)
     with show_progress("orders") as progress:
         row = benchmark_orders(

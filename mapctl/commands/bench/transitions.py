@@ -29,6 +29,7 @@ from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.retrieval import MotionCollection
 from mapctl.pose import decode
 from mapctl.protocols import Inbetweener
+from priors.checkpoints import Card
 from priors.stitching.inbetweener import Stitcher
 from priors.training.corpus import read_corpus
 from priors.training.transition_statistics import compute_position_std
@@ -66,6 +67,8 @@ def run(table: Transitions) -> int:
         samplers["retrieval"] = draw_retrieved(collection)
     density = None if table.prior is None else priors.load(table.prior)
     if density is not None:
+        _check_unseen(str(table.prior), density.card, held_out)
+    if density is not None:
         methods["rollouts"] = of_inbetweener(RolloutInbetweener([density], network), finish=False)
     past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:
@@ -89,10 +92,15 @@ def _name_methods(name: str, inbetweener: Inbetweener, *, raw: bool) -> dict[str
 
 
 def _load_unseeing(name: str, held_out: Mapping[str, Sequence[str]]) -> Stitcher:
-    """Load a stitcher; RequestError where its training saw clips that the other's did not."""
+    """Load a stitcher that has not seen the clips that are measured."""
     stitcher = priors.load_stitcher(name)
-    own = {clip for clips in stitcher.card.data.get("held_out", {}).values() for clip in clips}
+    _check_unseen(name, stitcher.card, held_out)
+    return stitcher
+
+
+def _check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) -> None:
+    """RequestError where a model's training saw clips that are kept for measuring."""
+    own = {clip for clips in card.data.get("held_out", {}).values() for clip in clips}
     seen = [clip for clips in held_out.values() for clip in clips if clip not in own]
     if seen:
         raise RequestError(f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed")
-    return stitcher

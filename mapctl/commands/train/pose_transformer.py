@@ -25,7 +25,7 @@ class TrainPoseTransformer(ParallelOptions):
     plain: bool = False
     """The plainest network of the kind, to compare: no convolutions, AdamW for all weights."""
     two_stage: bool = False
-    """Two networks in turn after Qin et al. 2022, for gaps of up to 60 frames between whole poses alone, to compare;
+    """Two networks in turn after Qin et al. 2022, for gaps of up to 70 frames between whole poses alone, to compare;
     width and layers are its own."""
 
     def recipe(self) -> "PoseTransformerRecipe":

@@ -18,8 +18,8 @@ class TrainStitcher(ParallelOptions):
     used_by = "use it with --stitcher"
 
     paper: bool = False
-    """Scheme, losses and batches as the paper prints them, at our widths (the printed ones are seven times ours); other
-    options still hold."""
+    """Scheme, losses and batches as the paper prints them, at our widths (the printed ones have eight times the
+    weights); other options still hold."""
     without: str = ""
     """Parts of Ren et al. 2024, table 6, to leave out, with commas between: bs (bi-directional scheme), sl (stitching
     loss), li (latent interpolation), ba (bi-directional aligning), pm (phase modulation), d (critics), lstm (the

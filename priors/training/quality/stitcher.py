@@ -31,7 +31,7 @@ def measure_transitions(
     network: StitcherNetwork, posterior: PosteriorNetwork | None, windows: TransitionWindows
 ) -> dict[str, float]:
     """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
-    distance of joints; and in a gap of 30 frames what the latents do.
+    distance of joints; and in a gap of 30 frames what the latents do, draws at the weights' temperature.
 
     Distances are in cm: `apart` of the sides before they are joined, `spread` of 8 draws from each other. `calm`,
     `informed`, `draw` and `best` are errors of an answer with latents at the prior's mean, with the posterior's, of one

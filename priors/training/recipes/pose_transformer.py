@@ -91,7 +91,7 @@ TWO_STAGE = (
     ),
 )
 """The two-stage transformer of Qin et al. 2022, of about the stitcher's weights, trained on the stitcher's question
-alone: gaps of up to 60 frames between whole poses with up to 10 frames on either side."""
+alone: gaps of up to 70 frames between whole poses with up to 10 frames on either side."""
 
 
 class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
@@ -183,6 +183,10 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
         wanted = f"{self.kind} of {self.config.as_card()}, or a smaller one with heads as wide"
         raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
 
+    def usual_settings(self) -> PoseTransformerSettings:
+        """Those of the two-stage network, where it is trained."""
+        return TWO_STAGE[1] if self.config.detail else PoseTransformerSettings()
+
     def format_shape(self) -> list[str]:
         """Width, layers and plainness, where they are not the usual ones."""
         usual, plain = PoseTransformerConfig(), self.config.kernel == 0 and self.settings.optimiser == "adam"
@@ -265,7 +269,7 @@ def compute_losses(
     proposed = network(shown)
     losses = _compare(proposed, truth, shown, settings)
     if proposed.rough is not None:
-        losses["loss"] = losses["loss"] + _compare(proposed.rough, truth, shown, settings)["loss"]
+        losses["loss"] = losses["loss"] + _compare(proposed.rough, truth, shown, replace(settings, spread=0.0))["loss"]
     return losses
 
 

@@ -176,7 +176,8 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
                     self.network, self.posterior, truth, settings.shares, settings.weights.ease, generator
                 )[0]
             )
-        return {name: sum(float(parts[name]) for parts in found) / len(found) for name in _RELATIVE}
+        means = {name: sum(float(parts[name]) for parts in found) / len(found) for name in _RELATIVE}
+        return {name: mean for name, mean in means.items() if mean > 0}  # what is left out is nothing
 
     def _in_bfloat16(self) -> AbstractContextManager[None]:
         networks = [network for network in (self.network, self.posterior) if network is not None]
@@ -223,6 +224,10 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
         trainer.average.temperature.fill_(calibrate_temperature(trainer.average, windows))
         return replace(super().export(trainer, gathered, curve), tensors=trainer.average.state_dict())
 
+    def usual_settings(self) -> StitcherSettings:
+        """The paper's, where its scheme is trained."""
+        return PAPER[1] if self.config.printed else StitcherSettings()
+
     def format_shape(self) -> list[str]:
         """The parts that are left out."""
         parts = ["--paper"] if self.config.printed else []
@@ -238,7 +243,7 @@ PAPER = (
         weights=LossWeights(
             places=0.5, pace=0.0, state=1.0, contacts=0.1, feet=0.0, stitching=0.5, own=1.0, ease=0.0, relative=True
         ),
-        critics=CriticSettings(begin=0.0, head_start=0),
+        critics=CriticSettings(begin=0.0, head_start=0, penalty=0.0, noise=0.0),
     ),
 )
 """Scheme, losses, weights and batches as Ren et al. 2024 print them (sections 3.2 to 4.3), at our widths."""

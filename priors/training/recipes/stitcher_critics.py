@@ -40,7 +40,7 @@ class CriticSettings:
 
     def ramp(self, updates: int) -> float:
         """Return the share of their weight, so many updates after they joined."""
-        return min(1.0, max(0.0, updates / max(1, self.head_start) - 1))
+        return min(1.0, max(0.0, updates / self.head_start - 1)) if self.head_start else 1.0
 
 
 class StitcherCritics:
@@ -55,7 +55,7 @@ class StitcherCritics:
     def hear(self, sides: Sides, ends: Ends, rows: Bool[Tensor, " batch"]) -> Tensor:
         """Return what the stitcher wants to make smaller (Eq. 8), and keep what it made for the next update."""
         shown = show_sides(sides, ends)[:, rows].flatten(0, 1)
-        if shown.shape[1] < SHORT:
+        if shown.shape[1] < SHORT or not len(shown):
             self.made = None
             return shown.new_zeros(())
         self.made = shown.detach()

@@ -43,7 +43,8 @@ class LossWeights:
     prior: float = 0.02
     """Divergence of that posterior, as it is, from its prior, which is to learn it, nats."""
     own: float = 0.02
-    """Divergence of the frames' latents from their prior, nats a transition."""
+    """Divergence of the frames' latents from their prior, nats a transition; as printed of the prior from a standard
+    normal distribution, nats a frame."""
     phase: float = 0.3
     """Absolute error of the phases."""
     critics: float = 0.1
