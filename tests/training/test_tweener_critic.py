@@ -69,12 +69,15 @@ def test_losses_are_the_papers():
 
 
 def test_the_penalty_is_the_squared_slope():
-    critic, rows = BodyMotionCritic().double(), body_motion.show(moving(), still_way(moving())).double()
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        critic = BodyMotionCritic().double()
+    rows = body_motion.show(moving(), still_way(moving())).double()
     found = float(body_motion.compute_gradient_penalty(critic, rows).detach())
     towards = torch.randn(rows.shape, generator=generator(3), dtype=torch.float64)
     rows = rows.requires_grad_()
     (slope,) = torch.autograd.grad(critic(rows)[0].sum(), rows)
-    step = 1e-5 * towards
+    step = 1e-7 * towards  # few of its kinks are so near
     with torch.no_grad():
         change = float(critic(rows + step)[0].sum() - critic(rows - step)[0].sum()) / 2
     assert change == pytest.approx(float((slope * step).sum()), rel=1e-3)
